@@ -2,19 +2,26 @@
 
 from __future__ import annotations
 
+import io
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 from click.testing import CliRunner
+from rich.console import Console
 
 from rtloop.cli import main
 from rtloop.configuration.cautions import cautions
 from rtloop.configuration.file import parse
 from rtloop.configuration.prepare import prepare
+from rtloop.drivers.base import Channel
+from rtloop.workbench.axis_judgement import AxisJudgement
+from rtloop.workbench.check_text import print_axis
 from tests.asked import answer, run
 from tests.one_axis import one_axis, wired
 from tests.paper_configuration import PAPER, RATE, TEXT
+from tests.unequal_stage import HIGHEST_V, LOWEST_V, STAGE, Plays, curve
 
 RAW = (RATE, f'{RATE}mode = "raw"\n')
 LIMITS, INTERLOCKS = "command_um = 42.0", "[axis.interlocks]"
@@ -127,12 +134,37 @@ def test_a_rig_on_which_the_loop_is_unstable_is_named_by_check_and_run(
         assert said in stepped.stderr
 
 
+def test_a_level_below_the_remanence_is_named() -> None:
+    """The position that the plays keep at 0 V after 35 µm, by a search sample by sample."""
+    plays = Plays()
+    plays.drive_to(35.0)
+    remanence_um = plays.move(0.0)
+
+    def warnings(*levels_um: float) -> list[str]:
+        reference = f'[axis.reference]\nkind = "steps"\nlevels = {list(levels_um)}\ndwell_s = 0.1\n'
+        text = STAGE.replace(f"drive_min_v = {LOWEST_V}", "drive_min_v = 0.0").replace("command_um = 60.0", "command_um = 39.0")
+        lines = cautions(prepare(parse(text + reference, "stage", Path(), "stage")))
+        return [line for line in lines if line.startswith("axis.x.reference")]
+
+    highest_um = curve([HIGHEST_V])[0]
+    allowed = f"0 V … 10 V, allow only {remanence_um:.4g} … {highest_um:.4g} µm"
+    because = " after 35 µm, because the hysteresis keeps the rest"
+    assert remanence_um > 2.0
+    for levels in ((35.0, 0.0), (0.0, 35.0)):
+        assert warnings(*levels) == [f"axis.x.reference: 0 … 35 µm; the drive's limits, {allowed}{because}"]
+    assert warnings(35.0, -5.0) == [f"axis.x.reference: -5 … 35 µm; the drive's limits, {allowed}"]
+    assert warnings(35.0, remanence_um - 0.1) != []
+    assert warnings(35.0, remanence_um + 0.1) == []
+    assert warnings(0.0) == []
+    assert warnings(38.0) == []
+
+
 def test_an_amplifier_of_one_side_is_shown_as_one(tmp_path: Path) -> None:
     config = tmp_path / "stage.toml"
     text = changed((LIMITS, f"{LIMITS}\ndrive_min_v = 0.0")).replace('specification = "paper-spec.toml"', "")
     config.write_text(text)
     result = CliRunner().invoke(main, ["check", str(config)])
-    assert "drive 0 … 10 V" in result.stdout
+    assert "drive 0 … 10 V, command 0 … 42 µm" in result.stdout
     assert "paper: 1 axis at 10000 Hz" not in result.stdout
     assert "stage: 1 axis at 10000 Hz" in result.stdout
 
@@ -166,3 +198,21 @@ def test_weights_far_beyond_the_sensor_are_not_judged_on_hardware(tmp_path: Path
         assert result.exit_code == 0, result.output
         assert sentence in result.stdout.replace("\n", " ")
         assert ("allowed: up to 299.7 µm" in result.stderr) == (um_per_v > 30.0)
+
+
+@pytest.mark.parametrize(
+    ("low_v", "high_v", "said"),
+    [
+        (-10.0, 10.0, " or -9.99 … 9.99 V at the sensor"),
+        (0.0, 10.0, " or above 9.99 V at the sensor, which reads 0 … 10 V"),
+        (-10.0, 5.0, " or below -9.99 V at the sensor, which reads -10 … 5 V"),
+        (0.0, 5.0, ", never at the sensor, which reads 0 … 5 V"),
+    ],
+)
+def test_limits_that_the_input_cannot_read_are_not_shown(low_v: float, high_v: float, said: str) -> None:
+    prepared = prepare(parse(TEXT, "paper", PAPER.parent, "paper.toml"))
+    (axis,), (check,) = prepared.configuration.axes, prepared.checks
+    out = Console(file=io.StringIO(), width=300)
+    judgement = AxisJudgement(axis, replace(check, law=None, on_model=None), {}, None, None, None)
+    print_axis(out, judgement, Channel("adc0", low_v, high_v))
+    assert f"trips beyond ±60 µm{said}\n" in out.file.getvalue()

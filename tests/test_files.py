@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from rtloop.configuration.axis import TableOptions
 from rtloop.configuration.file import load
+from rtloop.configuration.reference_options import TableOptions
 from rtloop.configuration.references import MAX_TABLE_BYTES, TableOfSamples, generator_values
 from rtloop.configuration.text_files import InputFileError
 from rtloop.design.identification.model_sections import read_feedforward

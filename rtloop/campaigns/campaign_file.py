@@ -39,7 +39,7 @@ class CampaignOptions(Options):
     seed: int = Field(default=0, ge=0)
     """Seed of all samples and of each rig's noise."""
     sampling: Sampling = "random"
-    """How the values of the keys are drawn: "random" for a yield, "sobol" and "latin_hypercube" to spread the rigs
+    """Rule that draws the values of the keys: "random" for a yield, "sobol" and "latin_hypercube" to spread the rigs
     evenly, "saltelli" for Sobol's indices, which need 64 rigs or more for each key and two."""
     axis: str = ""
     """Axis that the experiments move; the first one by default."""

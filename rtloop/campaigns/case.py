@@ -84,10 +84,10 @@ class CaseRunner:
         if rig == NOMINAL:
             return {key: self._builder.nominal_value(key) for key in dict.fromkeys((SEED_KEY, *self.keys))}
         shares = unit_samples(options.sampling, self.keys, rig - 1, 1, options.rigs, options.seed)[0]
-        return self.values_at(rig, shares)
+        return self.quantile_values(rig, shares)
 
-    def values_at(self, rig: int, shares: Real) -> dict[str, Any]:
-        """Return the values of rig number `rig` at `shares` (keys,) of its distributions, with noise of its own."""
+    def quantile_values(self, rig: int, shares: Real) -> dict[str, Any]:
+        """Return the values of rig number `rig` at `shares` (keys,) of its distributions, and the seed of its noise."""
         values = {key: self.quantile_value(key, float(share)) for key, share in zip(self.keys, shares, strict=True)}
         return {SEED_KEY: noise_seed(self.options.seed, rig), **values}
 

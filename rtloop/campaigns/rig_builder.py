@@ -29,7 +29,7 @@ from rtloop.signals import Mode
 
 ROTATION = ("rotate_mib", "rotate_s", "around", "keep_gib")
 """Keys of [recording] that a campaign leaves out: a rig's recording is one whole file."""
-HARDWARE_SWITCHES = ("enable_input", "hold_input", "hold_min_v")
+HARDWARE_SWITCHES = ("enable_input", "hold_input", "hold_min_v", "hold_while")
 """Keys of [loop] that a campaign leaves out."""
 
 
@@ -124,7 +124,7 @@ class RigBuilder:
 
 
 def _present(values: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the values without those that are None, which a configuration expresses by leaving the key out."""
+    """Return the values that are not None: a configuration has no key for a value None."""
     return {key: value for key, value in values.items() if value is not None}
 
 
@@ -153,7 +153,7 @@ def _tables_at_rest(campaign: Campaign) -> dict[str, Any]:
 def experiment_plan(plan: Plan, axis: str, experiment: Experiment, seed: int) -> tuple[Plan, int]:
     """Return a plan whose axis plays the reference of an experiment, and its number of ticks.
 
-    `seed` is that of the rig, with which the lateness of its ticks is drawn. Raises ValueError for a duration or
+    `seed` is the rig's seed, with which the lateness of its ticks is drawn. Raises ValueError for a duration or
     frequency that the rate does not allow.
     """
     table, generators = TableOfSamples(), plan.generators.copy()

@@ -11,7 +11,7 @@ from typing import Annotated, Any, Literal, NamedTuple, Self
 import numpy as np
 from pydantic import Field, model_validator
 
-from rtloop.configuration.axis import HoldOptions, ReferenceOptions, StepsOptions, WaveOptions
+from rtloop.configuration.reference_options import HoldOptions, ReferenceOptions, StepsOptions, WaveOptions
 from rtloop.foundation.arrays import Real
 from rtloop.foundation.options import Numbers, Options
 from rtloop.recording.views.steps import measure_step
@@ -46,7 +46,7 @@ class ExperimentOptions(Options):
     """Base of all experiments: a name, with which the names of its figures begin, a reference and figures."""
 
     name: Annotated[str, Field(pattern=f"^{NAME}$")] = ""
-    """Name with which those of the experiment's figures begin; by default its kind."""
+    """Prefix of the names of the experiment's figures; by default the experiment's kind."""
 
     @property
     def label(self) -> str:
@@ -92,7 +92,7 @@ class StepsExperiment(ExperimentOptions):
     dwell_s: float = Field(default=0.1, gt=0, le=100)
     """Duration of each level, rounded to whole ticks."""
     cycles: int = Field(default=1, ge=1, le=1000)
-    """How often the levels are played."""
+    """Number of times that the levels are played."""
 
     @model_validator(mode="after")
     def _check(self) -> Self:
@@ -103,7 +103,7 @@ class StepsExperiment(ExperimentOptions):
 
     @property
     def duration_s(self) -> float:
-        """One dwell at 0 µm, then one at each level in every cycle."""
+        """Duration of one dwell at 0 µm, and of one at each level in every cycle."""
         return self.dwell_s * (1 + self.cycles * len(self.levels_um))
 
     def ticks(self, rate_hz: float) -> int:
@@ -142,7 +142,7 @@ class WaveExperiment(ExperimentOptions):
     frequency_hz: float = Field(gt=0)
     """Frequency of the wave; half of the loop's rate or more is refused."""
     periods: float = Field(default=5.0, gt=0, le=1e5)
-    """Duration of the experiment in periods of the wave, those of `settle_periods` included."""
+    """Duration of the experiment in periods of the wave, `settle_periods` included."""
     settle_periods: float = Field(default=1.0, ge=0)
     """Periods at the beginning that no figure counts; fewer than `periods`."""
 

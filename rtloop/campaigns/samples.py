@@ -1,6 +1,6 @@
 """Samples: a number in (0, 1) for each rig and each uncertain key, which does not depend on worker or order.
 
-The number of rig i and key K comes from a stream of its own: it depends on seed, i and K alone. Rigs added later leave
+Each rig i and key K has a separate stream, so that its number depends on seed, i and K alone. Rigs added later leave
 those before as they are, except with Latin hypercubes; a key added at the end leaves the other keys' numbers.
 """
 

@@ -88,7 +88,7 @@ def find_worst(
     from scipy.optimize import differential_evolution
 
     _check_search(runner, figure)
-    best: list[tuple[float, CaseResult]] = []
+    worst_cases: list[tuple[float, CaseResult]] = []  # one, the worst so far; none before the first generation
     count = 0
 
     def run_generation(_: Any, candidates: Any) -> list[float]:
@@ -97,13 +97,13 @@ def find_worst(
         numbered = []
         for shares in candidates:
             count += 1
-            numbered.append((count, runner.values_at(count, np.clip(shares, 1e-9, 1 - 1e-9))))
+            numbered.append((count, runner.quantile_values(count, np.clip(shares, 1e-9, 1 - 1e-9))))
         heights = []
         for case in evaluate(numbered):
             height = _height(case, figure)
             heights.append(height)
-            if not best or height > best[0][0]:
-                best[:] = [(height, case)]
+            if not worst_cases or height > worst_cases[0][0]:
+                worst_cases[:] = [(height, case)]
         return [-height for height in heights]
 
     keys = len(runner.keys)
@@ -122,7 +122,7 @@ def find_worst(
         "callback": lambda intermediate_result: -intermediate_result.fun >= target,
     }
     differential_evolution(lambda shares: 0.0, [(0.0, 1.0)] * keys, **settings)
-    height, case = best[0]
+    height, case = worst_cases[0]
     return SearchResult(case, math.inf if height == TRIP_RATIO else height, count)
 
 
@@ -165,19 +165,19 @@ def find_boundary(runner: CaseRunner, key: str, evaluate: Evaluate, tolerance: f
 
 
 def _bisect(
-    failure: Callable[[float], str], good: float, bad: float, cause: str, tolerance: float
+    failure: Callable[[float], str], passing: float, failing: float, cause: str, tolerance: float
 ) -> tuple[float, str]:
-    """Return the last value that passes between a good and a bad one, and the cause of the nearest failure."""
+    """Return the last value that passes between a passing and a failing one, and the cause of the nearest failure."""
     for _ in range(BISECTIONS):
-        if abs(bad - good) <= tolerance:
+        if abs(failing - passing) <= tolerance:
             break
-        middle = (good + bad) / 2
+        middle = (passing + failing) / 2
         middle_cause = failure(middle)
         if middle_cause:
-            bad, cause = middle, middle_cause
+            failing, cause = middle, middle_cause
         else:
-            good = middle
-    return good, cause
+            passing = middle
+    return passing, cause
 
 
 def _check_search(runner: CaseRunner, figure: str) -> None:

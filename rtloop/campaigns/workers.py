@@ -164,10 +164,10 @@ class DaskWorkers:
             "the scheduler": self._client.run_on_scheduler(version_there, "rtloop.version"),
             **self._client.run(version_there, "rtloop.campaigns.unit"),
         }
-        others = [f"{place} has {text}" for place, text in versions.items() if text != f"rtloop {__version__}"]
-        if others:
+        mismatches = [f"{place} has {text}" for place, text in versions.items() if text != f"rtloop {__version__}"]
+        if mismatches:
             self.close()
-            raise UnavailableError(f"{self.name}: {'; '.join(others)}; install rtloop {__version__} there")
+            raise UnavailableError(f"{self.name}: {'; '.join(mismatches)}; install rtloop {__version__} there")
 
     def submit(self, function: Callable[..., Any], *arguments: Any) -> Future[Any]:
         """Run a function of a module in one of the scheduler's workers."""
@@ -195,7 +195,7 @@ class DaskWorkers:
 
 
 def _require_reachable(address: str) -> None:
-    """Raise UnavailableError for an address of another form, and for a host and port where nobody listens."""
+    """Raise UnavailableError for an address of another form, and for a host and port where no process listens."""
     form = re.fullmatch(r"(?:tcp|tls)://(\[[^\]]+\]|[^:/]+):(\d{1,5})", address)
     if form is None:
         raise UnavailableError(f"scheduler: {address}; allowed: tcp://HOST:PORT or tls://HOST:PORT")

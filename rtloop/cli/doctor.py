@@ -19,6 +19,7 @@ from rtloop.workbench.tables import console, escape, table
 
 if TYPE_CHECKING:
     from rtloop.doctor.examine import Examination, Latency
+    from rtloop.doctor.node_line import NetworkLine, SerialLine
     from rtloop.doctor.remedy import SettingWrite
     from rtloop.doctor.verdict import AxisDelay
     from rtloop.engine.plan import Pacing
@@ -50,6 +51,7 @@ def doctor(config: Path | None, seconds: float, change: bool, png: Path | None, 
     """
     from rtloop.configuration.file import load
     from rtloop.configuration.prepare import prepare
+    from rtloop.doctor.node_line import find_line
     from rtloop.doctor.remedy import apply_remedies
     from rtloop.doctor.verdict import axis_delays, reasons_unsuitable
     from rtloop.engine.plan import Pacing
@@ -57,10 +59,11 @@ def doctor(config: Path | None, seconds: float, change: bool, png: Path | None, 
 
     prepared = None if config is None else prepare(load(config))
     pacing = Pacing(DEFAULT_RATE_HZ) if prepared is None else prepared.plan.pacing
-    examination, writes = _examine(pacing, seconds), []
+    line = None if prepared is None else find_line(prepared.configuration)
+    examination, writes = _examine(pacing, seconds, line), []
     if change:
         writes = apply_remedies(examination.findings)
-        examination = _examine(pacing, seconds)
+        examination = _examine(pacing, seconds, line)
     delays = []
     if prepared is not None:
         store_host_delay(prepared.configuration, lateness_us=examination.latency.quantile_us(0.99))
@@ -78,12 +81,12 @@ def doctor(config: Path | None, seconds: float, change: bool, png: Path | None, 
     return 1 if objections else 0
 
 
-def _examine(pacing: Pacing, seconds: float) -> Examination:
-    """Examine the host, with a status line while the loop's clock runs."""
+def _examine(pacing: Pacing, seconds: float, line: NetworkLine | SerialLine | None) -> Examination:
+    """Examine the host, and the line to a node, with a status line while the loop's clock runs."""
     from rtloop.doctor.examine import examine
 
     with StatusLine(f"the loop's clock runs for {seconds:g} s at {pacing.rate_hz:g} Hz", sys.stderr):
-        return examine(pacing, seconds)
+        return examine(pacing, seconds, line=line)
 
 
 def _print_examination(

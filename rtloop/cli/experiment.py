@@ -360,7 +360,8 @@ def _print_report(content: Mapping[str, Any], skipped: Mapping[str, str]) -> Non
             rows.add_row(f"  {row['quantity']}", *cells, f"[{COLOURS[row['mark']]}]{escape(row['verdict'])}[/]")
         out.print(rows)
         is_explained = any(row["mark"] not in ("good", "") for row in section["rows"])
-        for note in section["notes"] if is_explained else section["notes"][: len(section["reduced"])]:
+        setup_notes = len(section["reduced"]) + bool(section["middle_um"])
+        for note in section["notes"] if is_explained else section["notes"][:setup_notes]:
             out.print(f"  {escape(note)}")
     for name, reason in skipped.items():
         out.print(f"[bold]{name}[/] skipped: {escape(reason)}")

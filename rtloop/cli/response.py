@@ -15,6 +15,7 @@ from rtloop.cli.exit_codes import report_errors
 from rtloop.cli.identify import AXIS, PLOT
 from rtloop.cli.options import JSON, OUTPUT
 from rtloop.cli.output import echo_json
+from rtloop.values import to_jsonable
 from rtloop.workbench.tables import console, format_number, table
 
 TIMEOUT_FACTOR, TIMEOUT_EXTRA_S = 3.0, 60.0
@@ -155,7 +156,7 @@ def _report_response(content: dict[str, Any], out: Path | None, plot: Path | Non
     from rtloop.design.identification.plot_response import plot_response
 
     if out is not None:
-        write_new_file(out, json.dumps(content) + "\n")
+        write_new_file(out, json.dumps(to_jsonable(content), allow_nan=False) + "\n")
     if plot is not None:
         plot_response(content, plot)
     if as_json:

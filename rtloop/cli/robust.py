@@ -176,8 +176,8 @@ def print_taps(tap_design: TapDesign, subject: Subject, *, to_stderr: bool = Tru
         f"worst of {tap_design.proved_count} plants, between ticks too: settling {proof.settling_ms:.4g} ms, "
         f"overshoot {100 * proof.overshoot:.3g} %, undershoot {100 * proof.undershoot:.3g} %, "
         f"v {proof.lowest_command:.4g} … {proof.highest_command:.4g} per unit step",
-        f"steps by up to {subject.bounds.step_um:g} µm between {subject.bounds.lowest_um:g} and "
-        f"{subject.bounds.step_um:g} µm keep v within "
+        f"steps by up to {subject.bounds.step_um:g} µm between {subject.bounds.lowest_um:.4g} and "
+        f"{subject.bounds.highest_um:.4g} µm keep v within "
         f"{subject.bounds.low_um:.4g} … {subject.bounds.high_um:.4g} µm",
     ):
         click.echo(line, err=to_stderr)

@@ -142,7 +142,7 @@ def _print_verification(name: str, verification: Verification) -> None:
         out.print(escape(note))
     if verification.together is not None:
         out.print("\nAll axes of this controller together, as they run")
-        out.print(_table([("", ""), *text.together(verification.together)]))
+        out.print(_table([("", ""), *text.simultaneous_rows(verification.together)]))
     if verification.robustness.shifts:
         out.print("\nThe resonance may move by")
         out.print(_table([("", ""), *text.shifts(verification)]))

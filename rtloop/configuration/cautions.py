@@ -25,6 +25,7 @@ from rtloop.configuration.simulated import (
     drive_ends_um,
     sensor_ends_um,
 )
+from rtloop.hysteresis.reach import can_hold, reachable_range
 from rtloop.kernel.reference import Generator
 from rtloop.signals import Mode
 
@@ -162,12 +163,31 @@ def _unreachable(axis: AxisOptions, lowest_um: float, highest_um: float, ends_um
     ):
         if is_beyond:
             yield f"reaches {reached_um:g} µm, beyond the end of the sensor's range, {end_um:.4g} µm, which trips"
+    yield from _beyond_drive(axis, lowest_um, highest_um)
+
+
+def _beyond_drive(axis: AxisOptions, lowest_um: float, highest_um: float) -> Iterator[str]:
+    """Yield a line for a reference from `lowest_um` to `highest_um` that the drive cannot hold.
+
+    A reference that changes comes back to its nearer end after its farther end, whose memory the actuator then has.
+    """
+    limits, actuator = axis.limits, axis.feedforward.actuator()
+    ends_v = limits.lowest_v, limits.drive_v
     down_um, up_um = drive_ends_um(axis)
-    if lowest_um < down_um or highest_um > up_um:
-        yield (
-            f"{lowest_um:g} … {highest_um:g} µm; the drive's limits, {limits.lowest_v:g} V … {limits.drive_v:g} V, "
-            f"allow only {down_um:.4g} … {up_um:.4g} µm"
-        )
+    positions_um = sorted((lowest_um, highest_um), key=lambda end_um: end_um * (down_um + up_um), reverse=True)
+    if can_hold(actuator, positions_um, *ends_v):
+        return
+    is_virgin = lowest_um == highest_um
+    low_um, high_um = (down_um, up_um) if is_virgin else reachable_range(actuator, *ends_v, abs(positions_um[0]))
+    is_upward = down_um + up_um > 0
+    if not is_virgin and down_um != -up_um:  # the farther end itself does not limit the other direction
+        low_um, high_um = (low_um, up_um) if is_upward else (down_um, high_um)
+    is_within_ends = down_um <= lowest_um <= highest_um <= up_um
+    memory = f" after {positions_um[0]:g} µm, because the hysteresis keeps the rest" if is_within_ends else ""
+    yield (
+        f"{lowest_um:g} … {highest_um:g} µm; the drive's limits, {limits.lowest_v:g} V … {limits.drive_v:g} V, "
+        f"allow only {low_um:.4g} … {high_um:.4g} µm{memory}"
+    )
 
 
 def _reach(configuration: Configuration, axis: AxisOptions) -> Iterator[str]:

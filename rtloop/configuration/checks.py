@@ -330,10 +330,10 @@ def _coupled_plant(axes: Sequence[AxisOptions], delays: Sequence[int], findings:
             continue
         for other_name in axis.model.coupling:
             if other_name not in names or other_name == axis.name:
-                others = ", ".join(name for name in names if name != axis.name)
+                allowed_names = ", ".join(name for name in names if name != axis.name)
                 findings.faults.append(
                     f"axis.{axis.name}.model.coupling.{other_name}: unknown; allowed: the controller's other axes"
-                    f" ({others or 'it has none'})"
+                    f" ({allowed_names or 'it has none'})"
                 )
     if len(models) < len(axes):
         return None

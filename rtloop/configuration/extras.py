@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, Literal, Self
+
+from pydantic import model_validator
 
 from rtloop import signals
 from rtloop.configuration.axis import AxisOptions
 from rtloop.drivers.base import Facts, Wiring, channel_index
 from rtloop.foundation.options import Options
-from rtloop.kernel.extras import ExtraOutput, Extras
+from rtloop.kernel.extras import ExtraOutput, Extras, Mark
 from rtloop.kernel.layout import MAX_EXTRAS
 from rtloop.laws.contract import Law
 
@@ -24,17 +26,29 @@ class ExtraInputOptions(Options):
 
 
 class ExtraOutputOptions(Options):
-    """A channel set by the controller of an axis; without a command it has its safe voltage."""
+    """A channel set by the controller of an axis, or by the axis itself as a mark; else it has its safe voltage."""
 
     channel: str
     """Name of one of the driver's output channels that neither an axis nor another output uses, such as `dac1`."""
     axis: str
-    """Name of the axis whose controller sets the channel."""
+    """Name of the axis whose controller sets the channel, or whose reference or position the mark follows."""
+    mark: Literal["rising", "moving", "position"] | None = None
+    """Condition under which the channel has `max_v`: the reference rises, the reference changes, or the position is at
+    `level_um` or above it. By default the controller sets the channel."""
+    level_um: float | None = None
+    """Position in µm from which on a channel with mark = "position" is high; no other mark takes it."""
     min_v: float | None = None
     """Lowest voltage that the controller can set, by default the channel's lowest."""
     max_v: float | None = None
     """Ends of the allowed range, the channel's by default. The channel's safe voltage lies between, as parking sets it
     under any configuration."""
+
+    @model_validator(mode="after")
+    def _check_level(self) -> Self:
+        """Require `level_um` with mark = "position", and only there."""
+        if (self.mark == "position") != (self.level_um is not None):
+            raise ValueError(f"level_um: {self.level_um}; allowed: a position with mark = 'position', and only there")
+        return self
 
 
 def extra_faults(
@@ -93,7 +107,9 @@ def build_extras(
                 f"outputs.{name}: {lowest_v:g} … {highest_v:g} V; allowed: a range within the channel's "
                 f"{channel.minimum_v:g} … {channel.maximum_v:g} V that includes its safe voltage, {safe_v:g} V"
             )
-        extra_outputs.append(ExtraOutput(name, list(axes).index(options.axis), lowest_v, highest_v, safe_v))
+        mark = Mark[options.mark.upper()] if options.mark else Mark.NONE
+        number = list(axes).index(options.axis)
+        extra_outputs.append(ExtraOutput(name, number, lowest_v, highest_v, safe_v, int(mark), options.level_um or 0.0))
     return Extras(tuple(inputs), tuple(extra_outputs))
 
 
@@ -113,7 +129,7 @@ def connect(law: Law, owned: Sequence[str], inputs: Sequence[str], outputs: Mapp
     """
     numbers = {name: number for number, name in enumerate(inputs)}
     numbers |= {name: number for number, name in enumerate(outputs)}
-    axis_outputs = [name for name, output in outputs.items() if output.axis in owned]
+    axis_outputs = [name for name, output in outputs.items() if output.axis in owned and output.mark is None]
     for kind, names, available in (("input", law.inputs, list(inputs)), ("output", law.outputs, axis_outputs)):
         for name in names:
             if name not in available:

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field, replace
 from difflib import get_close_matches
 from functools import cached_property
 from pathlib import Path
-from typing import Annotated, Any, Self
+from typing import Annotated, Any, Literal, Self
 
 from pydantic import Field, TypeAdapter, ValidationError, model_validator
 
@@ -64,14 +64,16 @@ class LoopOptions(Options):
     heartbeat_timeout_s: float = Field(default=1.0, gt=0)
     """Silence of the supervisor after which the loop parks itself."""
     hold_input: str | None = None
-    """An input of [inputs]; while it is at `hold_min_v` or above, references stand still."""
+    """An input of [inputs] that holds the references: they stand still while it is high, or low by `hold_while`."""
     hold_min_v: float = 2.5
-    """Voltage of `hold_input` from which on references stand still."""
+    """Voltage from which on `hold_input` is high."""
+    hold_while: Literal["high", "low"] = "high"
+    """State of `hold_input` in which references stand still. With "low", a gate that goes high starts them."""
     simulated_lateness_us: Annotated[
         tuple[Annotated[float, Field(ge=0, le=LARGEST_LATENESS_US)], ...],
         Field(strict=False, max_length=MAX_LATENESS_SAMPLES),
     ] = ()
-    """In virtual time, each tick wakes late by one of these, drawn at random with equal probability."""
+    """Delays of the ticks in virtual time: each tick is late by one of them, drawn at random with equal probability."""
     laws: Annotated[tuple[str, ...], Field(strict=False)] = ()
     """Further laws, kinds or files, loaded so that they may be swapped in while the loop runs."""
 
@@ -102,13 +104,13 @@ class FileOptions(Options):
     loop: LoopOptions
     """Rate of the loop, mode of its first tick, and its scheduling by the host."""
     axis: Annotated[tuple[AxisOptions, ...], Field(strict=False, min_length=1)]
-    """The controlled axes, at least one; their order is that of their signals in a recording."""
+    """The controlled axes, at least one; a recording has their signals in the same order."""
     inputs: dict[Annotated[str, Field(pattern=NAME)], ExtraInputOptions] = {}  # noqa: RUF012
     """Channels that are read besides the sensors, each by the name that laws and recordings use."""
     outputs: dict[Annotated[str, Field(pattern=NAME)], ExtraOutputOptions] = {}  # noqa: RUF012
     """Channels that controllers set besides the drives, each by the name that laws and recordings use."""
     schedule: Annotated[tuple[ScheduleOptions, ...], Field(strict=False)] = ()
-    """Changes of mode and reference at given ticks; those of one tick take effect in the file's order."""
+    """Changes of mode and reference at given ticks; changes at one tick take effect in the file's order."""
     recording: RecordingOptions = RecordingOptions()
     """Place, size and contents of the recordings; by default every tick is recorded."""
     service: ServiceOptions = ServiceOptions()

@@ -32,8 +32,8 @@ class Library:
         """Return the law that a table names by `kind`, `file` or neither.
 
         `kind` beside `file` picks a law within the file. `default` is the kind where neither is named. Raises
-        ValueError for a wrong type, an unreadable file, and a law that is missing, invalid, or not among those that a
-        running loop has loaded.
+        ValueError for a wrong type, an unreadable file, and a law that is missing, invalid, or not loaded by a running
+        loop.
         """
         kind, file = named.get("kind") or None, named.get("file")
         for value, key in ((kind, "kind"), (file, "file")):

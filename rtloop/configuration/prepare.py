@@ -22,7 +22,7 @@ from rtloop.drivers.errors import DriverError
 from rtloop.drivers.registry import driver_class
 from rtloop.drivers.sim import SimDriver
 from rtloop.engine.messages import ALL_AXES, MESSAGE, Kind, Origin, message
-from rtloop.engine.plan import Pacing, Plan, require_facts
+from rtloop.engine.plan import Hold, Pacing, Plan, require_facts
 from rtloop.errors import ConfigError
 from rtloop.kernel.extras import Extras
 from rtloop.kernel.layout import Records
@@ -105,7 +105,9 @@ def prepare(configuration: Configuration, *, duration_s: float | None = None, pa
         },
         hold=None
         if configuration.loop.hold_input is None
-        else (configuration.loop.hold_input, configuration.loop.hold_min_v),
+        else Hold(
+            configuration.loop.hold_input, configuration.loop.hold_min_v, configuration.loop.hold_while == "high"
+        ),
         enable_input=configuration.loop.enable_input,
     )
     faults = event_recording_faults(configuration.recording.around, plan.columns, plan.pacing.rate_hz)

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from rtloop.configuration.axis import (
+from rtloop.configuration.reference_options import (
     ChirpOptions,
     HoldOptions,
     InputOptions,

@@ -10,7 +10,8 @@ from typing import Literal, Self
 
 from pydantic import Field, model_validator
 
-from rtloop.configuration.axis import AxisOptions, HoldOptions, ReferenceOptions
+from rtloop.configuration.axis import AxisOptions
+from rtloop.configuration.reference_options import HoldOptions, ReferenceOptions
 from rtloop.foundation.options import Options
 
 ModeName = Literal["off", "raw", "feedforward", "closed_loop"]

@@ -98,11 +98,11 @@ def _foreign(shipped: Iterable[str]) -> Schema:
 
 def _models_within(models: Iterable[type[BaseModel]]) -> Iterator[type[BaseModel]]:
     """Yield models and all models of their fields, at any depth, each once."""
-    pending, known = list(models), set()
+    pending, visited = list(models), set()
     while pending:
         model = pending.pop()
-        if model not in known:
-            known.add(model)
+        if model not in visited:
+            visited.add(model)
             yield model
             pending += [part for field in model.model_fields.values() for part in _models_in(field.annotation)]
 

@@ -32,7 +32,7 @@ from rtloop.laws.shipped.transfer import TransferController
 from rtloop.linear.options import TransferOptions
 
 Matrices = tuple[Any, Any, Any, Any]
-"""A, B, C and D."""
+"""Matrices A, B, C and D of a state space."""
 library: Any = control  # its annotations do not describe its functions
 POLE_TOLERANCE, STEP_TOLERANCE, MARGIN_TOLERANCE = 1e-6, 1e-6, 1e-3
 """Largest distance of a pole in z, largest difference of a unit step, and largest relative difference of a margin."""
@@ -109,8 +109,8 @@ def _coupled_faults(prepared: Prepared, check: AxisCheck, shared: SharedLoop) ->
     ]
     coupling = np.array(
         [
-            [1.0 if name == other else 0.0 if model is None else model.coupling.get(other, 0.0) for other in models]
-            for name, model in models.items()
+            [1.0 if row == column else 0.0 if model is None else model.coupling.get(column, 0.0) for column in models]
+            for row, model in models.items()
         ]
     )
     opinion = coupled_opinion(axes, coupling, shared.place)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Self
+from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
@@ -16,9 +16,30 @@ class DepolariseOptions(Options):
     amplitude_v: float = Field(gt=0)
     """Amplitude of the sine at its beginning; it falls to 0 in a straight line. Limits of the drive apply."""
     frequency_hz: float = Field(default=10.0, gt=0)
-    """Frequency of the sine."""
+    """Frequency of the sine that erases the memory."""
     cycles: int = Field(default=20, ge=2, le=1000)
     """Number of cycles until the amplitude is 0."""
+
+
+Cause = Literal["stale", "driver", "late", "heartbeat"]
+"""Causes of a trip that lie outside the loop: link, hardware, host, supervisor."""
+
+
+class RecoverOptions(Options):
+    """Return to the former mode after a trip whose cause lies outside the loop, once the readings are sound again."""
+
+    causes: Annotated[tuple[Cause, ...], Field(strict=False, min_length=1)] = ("stale", "driver", "late")
+    """Causes of a trip after which the service returns; a trip with any other cause stays latched."""
+    wait_s: float = Field(default=1.0, ge=0.1, le=60.0)
+    """Time from the trip to the first confirmation, and between two starts of a loop whose driver fails."""
+    confirmations: int = Field(default=5, ge=1, le=1000)
+    """Number of successive confirmations before the return; an unsound reading begins them anew."""
+    confirmation_s: float = Field(default=0.2, ge=0.01, le=5.0)
+    """Duration of a confirmation: the readings of all its ticks must be sound."""
+    max_per_hour: int = Field(default=3, ge=1, le=60)
+    """Largest number of recoveries in any hour; the next trip stays latched."""
+    depolarise: bool = False
+    """Erase the actuator's memory before the return, with the sine of [service.depolarise]."""
 
 
 class ServiceOptions(Options):
@@ -42,14 +63,18 @@ class ServiceOptions(Options):
     """Duration whose mean reading, outputs at safe, becomes position 0."""
     depolarise: DepolariseOptions | None = None
     """Sine that erases the actuator's memory at the start; not allowed with a schedule, and not played with `arm`."""
+    recover: RecoverOptions | None = None
+    """Return after a trip from outside, such as a lost link; without this table a trip stays latched until `reset`."""
     can: BusOptions | None = None
     """A CAN bus on which the service reports its state and receives setpoints and modes."""
 
     @model_validator(mode="after")
     def _check(self) -> Self:
-        """Require a socket_mode without access for others."""
+        """Require a socket_mode without access for others, and a sine for a recovery that depolarises."""
         if int(self.socket_mode, 8) & 0o007:
             raise ValueError(
                 f"socket_mode: {self.socket_mode}; allowed: a mode without access for others, such as 0660"
             )
+        if self.recover is not None and self.recover.depolarise and self.depolarise is None:
+            raise ValueError("recover.depolarise: true; allowed: with the sine of [service.depolarise]")
         return self

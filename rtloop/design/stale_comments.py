@@ -19,11 +19,11 @@ def split_schema_line(text: str) -> tuple[str, str]:
 
 
 def remove_first_comments(text: str) -> str:
-    """Return a configuration without the comments of its first paragraph, which describe what it was made for."""
+    """Return a configuration without the comments of its first paragraph, which describe its former purpose."""
     schema_line, text = split_schema_line(text)
-    first, gap, rest = text.partition("\n\n")
-    is_comment = all(line.startswith("#") for line in first.splitlines())
-    return schema_line + (rest if gap and is_comment else text)
+    paragraph, gap, remainder = text.partition("\n\n")
+    is_comment = all(line.startswith("#") for line in paragraph.splitlines())
+    return schema_line + (remainder if gap and is_comment else text)
 
 
 def remove_stale_comments(text: str, values: Mapping[str, Any], rewritten: Collection[str]) -> str:
@@ -33,7 +33,7 @@ def remove_stale_comments(text: str, values: Mapping[str, Any], rewritten: Colle
     Comments behind a value stay. Raises TOMLDecodeError for a text that is not TOML.
     """
     old_values = tomllib.loads(text)
-    kept: list[str] = []
+    cleaned_lines: list[str] = []
     pending: list[str] = []
     counts: dict[str, int] = {}
     is_stale = False
@@ -48,10 +48,10 @@ def remove_stale_comments(text: str, values: Mapping[str, Any], rewritten: Colle
                 pending.pop()
         elif is_stale:
             pending = []
-        kept += [*pending, line]
+        cleaned_lines += [*pending, line]
         pending = []
-    cleaned = "".join([*kept, *pending])
-    return cleaned if _same_values(cleaned, old_values) else text
+    cleaned = "".join([*cleaned_lines, *pending])
+    return cleaned if _has_values(cleaned, old_values) else text
 
 
 def _heading(line: str, values: Mapping[str, Any], counts: dict[str, int]) -> list[str | int] | None:
@@ -70,18 +70,18 @@ def _heading(line: str, values: Mapping[str, Any], counts: dict[str, int]) -> li
         path.append(name)
         if ".".join(names[:end]) in counts:
             path.append(counts[".".join(names[:end])] - 1)
-    return path if isinstance(_value_at(values, path), Mapping) else None
+    return path if isinstance(_find_value(values, path), Mapping) else None
 
 
 def _is_rewritten(
     path: list[str | int], old: Mapping[str, Any], new: Mapping[str, Any], rewritten: Collection[str]
 ) -> bool:
     """Whether the section at a path is missing in `new`, or differs and lies in a table named in `rewritten`."""
-    old_table, new_table = _value_at(old, path), _value_at(new, path)
+    old_table, new_table = _find_value(old, path), _find_value(new, path)
     return new_table is None or (old_table != new_table and not set(rewritten).isdisjoint(map(str, path)))
 
 
-def _value_at(values: Any, path: list[str | int]) -> Any:
+def _find_value(values: Any, path: list[str | int]) -> Any:
     """Return the value at a path of keys and indices, or None where there is none."""
     for part in path:
         try:
@@ -91,7 +91,7 @@ def _value_at(values: Any, path: list[str | int]) -> Any:
     return values
 
 
-def _same_values(text: str, values: Mapping[str, Any]) -> bool:
+def _has_values(text: str, values: Mapping[str, Any]) -> bool:
     """Whether a text is TOML of exactly these values."""
     try:
         return tomllib.loads(text) == values

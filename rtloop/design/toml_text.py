@@ -40,8 +40,8 @@ def edit_text(
 ) -> str:
     """Return `text` changed to hold `values` and no other keys, with its old comments, below new `comments`.
 
-    A first line `#:schema` stays the first. Comments go with what they describe: with sections and values that are
-    removed, with values that change, and with tables named in `rewritten` that differ. If the form of `text` cannot be
+    A first line `#:schema` stays the first. A comment is removed with its section or value, with a value that changes,
+    and with a table named in `rewritten` that differs. If the form of `text` cannot be
     changed in place, the values are written without the old comments.
     """
     heading = "".join(f"# {comment}".rstrip() + "\n" for comment in comments)
@@ -80,19 +80,19 @@ def _update_table(table: Any, values: Mapping[str, Any]) -> None:
             added.trivia.comment_ws = added.trivia.comment = ""  # behind the old value
             if isinstance(added, Table):
                 added.add(tomlkit.nl())
-    _last_body(table).extend(last_lines)
+    _find_last_entries(table).extend(last_lines)
 
 
 def _take_last_lines(table: Any) -> list[Any]:
     """Remove comments and empty lines behind the last key of a table and its tables; return them."""
-    body = _last_body(table)
+    body = _find_last_entries(table)
     first = next((i for i in range(len(body), 0, -1) if body[i - 1][0] is not None), 0)
     lines = body[first:]
     del body[first:]
     return lines
 
 
-def _last_body(table: Any) -> list[Any]:
+def _find_last_entries(table: Any) -> list[Any]:
     """Return the entries, (key or None, item), of the last table within a table or document, or of itself."""
     while True:
         if isinstance(table, AoT):

@@ -6,11 +6,9 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
-import numpy as np
-
 from rtloop.configuration.axis import LimitsOptions
 from rtloop.hysteresis.play_model import PlayModel
-from rtloop.hysteresis.plays import model_output
+from rtloop.hysteresis.reach import reachable_range
 
 STEP_PART, LEAST_DWELL_S, DWELL_SWINGS = 0.25, 0.1, 50
 """Step as a fraction of the largest command, and the least duration of each level, in s and in periods of the slowest
@@ -38,9 +36,9 @@ def describe_reference(values: Mapping[str, Any]) -> str:
 
 def _levels_um(limits: LimitsOptions, actuator: PlayModel) -> list[float]:
     """Return both levels of the square wave in µm, the farther first."""
-    rest_um = float(model_output(actuator, [limits.drive_v, limits.lowest_v])[-1])
-    sign = float(np.sign(actuator.weights.sum()))
-    if sign * rest_um <= 0:
+    low_um, high_um = reachable_range(actuator, limits.lowest_v, limits.drive_v)
+    if low_um <= 0 <= high_um:
         return [float(f"{STEP_PART * limits.command_um:.1g}"), 0.0]
-    step_um = STEP_PART * (sign * limits.command_um - rest_um)
+    rest_um = low_um if low_um > 0 else high_um
+    step_um = STEP_PART * (math.copysign(limits.command_um, rest_um) - rest_um)
     return [float(f"{rest_um + count * step_um:.2g}") for count in (2, 1)]

@@ -10,9 +10,10 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from rtloop.doctor import machine, permissions, software
+from rtloop.doctor import machine, node_conditions, permissions, software
 from rtloop.doctor.findings import Finding
 from rtloop.doctor.host import Host
+from rtloop.doctor.node_line import NetworkLine, SerialLine
 from rtloop.engine import latency
 from rtloop.engine.plan import Pacing
 from rtloop.errors import RtloopError
@@ -62,8 +63,11 @@ class Examination:
     findings: tuple[Finding, ...]
 
 
-def examine(pacing: Pacing, seconds: float, root: Path = Path("/")) -> Examination:
-    """Run the loop's clock for `seconds` in another process, then check every condition below `root`.
+def examine(
+    pacing: Pacing, seconds: float, root: Path = Path("/"), line: NetworkLine | SerialLine | None = None
+) -> Examination:
+    """Run the loop's clock for `seconds` in another process, then check every condition below `root`, and the `line`
+    to a node.
 
     Raises RtloopError where that process fails or does not end.
     """
@@ -85,13 +89,14 @@ def examine(pacing: Pacing, seconds: float, root: Path = Path("/")) -> Examinati
     grants, lateness_us, missed = latency.decode_results(process.stdout)
     host = Host(grants, root)
     measurement = Latency(pacing, lateness_us, missed, host.stolen_s() - before_s)
-    return Examination(measurement, check_conditions(host, pacing))
+    return Examination(measurement, check_conditions(host, pacing, line))
 
 
-def check_conditions(host: Host, pacing: Pacing) -> tuple[Finding, ...]:
+def check_conditions(host: Host, pacing: Pacing, line: NetworkLine | SerialLine | None = None) -> tuple[Finding, ...]:
     """Return the finding on each condition of a host for a loop with this pacing.
 
-    The conditions are the CONDITIONS of `machine`, then of `permissions`, then of `software`.
+    The conditions are the CONDITIONS of `machine`, then of `permissions`, then of `software`, and those of the line to
+    a node if there is one.
     """
     checks = (*machine.CONDITIONS, *permissions.CONDITIONS, *software.CONDITIONS)
-    return tuple(check(host, pacing) for check in checks)
+    return (*(check(host, pacing) for check in checks), *node_conditions.check_line(line, host, pacing))

@@ -16,9 +16,10 @@ from typing import Any
 
 import numpy as np
 
-from rtloop.configuration.axis import AxisOptions, PrefilterOptions, StepsOptions
+from rtloop.configuration.axis import AxisOptions, PrefilterOptions
 from rtloop.configuration.file import Configuration
 from rtloop.configuration.prepare import Prepared, build_driver, prepare
+from rtloop.configuration.reference_options import StepsOptions
 from rtloop.configuration.schedule import ModeName
 from rtloop.doctor.loopback import ChannelPair, measure_pair
 from rtloop.drivers.base import Channel, channel_index

@@ -102,9 +102,10 @@ class Assembly:
         loop.observed_count = len(facts.observed)
         loop.enable_index = -1 if plan.enable_input is None else channel_index(facts.inputs, plan.enable_input)
         names = plan.extras.inputs
-        loop.hold_index, loop.hold_min_v = (
-            (-1, np.inf) if plan.hold is None else (names.index(plan.hold[0]), plan.hold[1])
-        )
+        loop.hold_index = -1
+        if plan.hold is not None:
+            loop.hold_index, loop.hold_min_v = names.index(plan.hold.input), plan.hold.min_v
+            loop.hold_while_high = plan.hold.while_high
         wiring = [plan.wiring[axis] for axis in axes]
         wired = {
             "input_index": (facts.inputs, [wire.input for wire in wiring]),

@@ -37,6 +37,7 @@ _SETTINGS = (
     ("enable_index", np.int64),
     ("hold_index", np.int64),
     ("hold_min_v", np.float64),
+    ("hold_while_high", np.int64),
     ("period_s", np.float64),
     ("period_us", np.float64),
     ("heartbeat_timeout_ns", np.float64),

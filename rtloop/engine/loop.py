@@ -275,17 +275,21 @@ def _evaluate_law(loop, status, now_ns, lateness_us):
 
 @jit_rare
 def _read_extras(loop, inputs):
-    """Copy the extra inputs for the law; delay references by a tick while the hold input is high."""
+    """Copy the extra inputs for the law; delay references by a tick while the hold input holds them.
+
+    A reference that begins in this tick shows its first sample.
+    """
     law, read = law_record(loop), extra_inputs(law_record(loop))
     index = int_array(loop.extra_input_index, law.extra_input_count)
     for k in range(law.extra_input_count):
         read[k] = inputs[index[k]]
-    if loop.hold_index >= 0 and read[loop.hold_index] >= loop.hold_min_v:
+    if loop.hold_index >= 0 and (read[loop.hold_index] >= loop.hold_min_v) == (loop.hold_while_high != 0):
         generators = axis_generators(loop)
         for a in range(loop.axis_count):
-            generators[a].start_tick += 1
-            if generators[a].held_until < FOR_EVER:
-                generators[a].held_until += 1
+            if generators[a].start_tick < loop.tick:
+                generators[a].start_tick += 1
+                if generators[a].held_until < FOR_EVER:
+                    generators[a].held_until += 1
 
 
 @jit_rare

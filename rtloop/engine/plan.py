@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -16,6 +16,14 @@ from rtloop.kernel.extras import Extras
 from rtloop.kernel.memory import NO_EXTRAS, Layout
 from rtloop.laws.registry import LawReference, law_layout
 from rtloop.signals import Mode, column_names
+
+
+class Hold(NamedTuple):
+    """Extra input that holds the references while it is high, at `min_v` or above, or else while it is low."""
+
+    input: str
+    min_v: float
+    while_high: bool = True
 
 
 @dataclass(frozen=True)
@@ -69,8 +77,8 @@ class Plan:
     extras: Extras = NO_EXTRAS
     extra_channels: Mapping[str, str] = field(default_factory=dict)
     """Channel of each extra input and output."""
-    hold: tuple[str, float] | None = None
-    """Extra input and threshold in V: at or above it, the references are held."""
+    hold: Hold | None = None
+    """Extra input that holds the references."""
     spare_samples: int = 0
     """Samples reserved behind `table` for waveforms loaded while the loop runs."""
 

@@ -51,6 +51,7 @@ def derive_configuration(
         "axis": axis,
         "may_trip": run.may_trip,
         "ticks": timeline.ticks,
+        "middle_um": timeline.middle.um,
         "parameters": parameters,
         "asked": specification,
         "beside": is_comparison,
@@ -87,7 +88,7 @@ def read_metadata(configuration: str) -> dict[str, Any] | None:
     """Return the description of the run in the first line of a configuration's text; None where it holds none.
 
     Keys, as `derive_configuration` writes them and unchecked: name (of the experiment), run (its label), runs (their
-    number), axis, may_trip, ticks, parameters, asked (the axis's specification), beside (whether the run is one of the
+    number), axis, may_trip, ticks, middle_um (the middle of its motion; missing: 0), parameters, asked (the axis's specification), beside (whether the run is one of the
     second configuration), reduced (sentences on reduced defaults), segments (each a list of the fields of Segment).
     """
     first_line = configuration.partition("\n")[0].removeprefix("# ")
@@ -103,7 +104,7 @@ def read_metadata(configuration: str) -> dict[str, Any] | None:
 def _change_plant(driver: dict[str, Any], axis: str, changes: Any) -> None:
     """Merge `changes`, section by section, into the axis's plant in `driver`.
 
-    An axis without a plant of its own gets a copy of `plant` first.
+    An axis without an entry in `plants` gets a copy of `plant` first.
     """
     plants = driver.setdefault("plants", {})
     plant = plants.setdefault(axis, copy.deepcopy(driver.get("plant", {})))

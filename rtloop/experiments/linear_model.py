@@ -135,7 +135,7 @@ class LinearModel:
     def step_reversal(self) -> float | None:
         """Largest command beyond 0, per height, of a step of the reference from 0 or back to it; None without a loop.
 
-        The command of a step up may begin below 0, and that of a step back passes 0 by the overshoot of the step up.
+        The command of a step up may begin below 0. The command of a step back passes 0 by the overshoot of the step up.
         """
         if self.loop is None:
             return None

@@ -31,7 +31,7 @@ class Stage(NamedTuple):
 
 
 class PlannedRun(NamedTuple):
-    """One run with its configuration.
+    """Run of an experiment, with its options and its configuration.
 
     `plan_next` takes the paths of the recordings so far, returns the run that follows from them, and None at the end;
     it is None itself where no run follows.

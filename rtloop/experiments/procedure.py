@@ -24,7 +24,7 @@ class UnsuitableLoop(Exception):
 
 
 LEAST_SHARE = 1e-3
-"""Least share of its default to which an option is reduced: with less the experiment shows nothing."""
+"""Least share of its default to which an option is reduced: with a smaller signal the experiment shows no result."""
 
 
 @dataclass(frozen=True)
@@ -49,9 +49,7 @@ class Experiment:
     limits: Mapping[str, Callable[[Setting], Bound]] = field(default_factory=dict)
     """Largest magnitude of an option, by the option's key."""
     lower_limits: Mapping[str, Callable[[Setting], Bound]] = field(default_factory=dict)
-    """Largest magnitude of its negative numbers, by the key; without an entry, that of `limits`."""
-    is_bipolar: bool = True
-    """Whether it drives to both sides of 0 V."""
+    """Largest magnitude of an option's negative numbers, by its key; `limits` is used for a key without an entry."""
     needs_controller: bool = True
     needs_rig: bool = False
     """Whether it changes the simulated rig."""
@@ -66,8 +64,6 @@ class Experiment:
         axis_index = [axis_options.name for axis_options in configuration.axes].index(axis.name)
         if self.needs_controller and configuration.axes[configuration.owners[axis_index]].controller is None:
             return f"axis.{axis.name}.controller: missing; this experiment needs a closed loop"
-        if self.is_bipolar and axis.limits.lowest_v == 0.0:
-            return f"axis.{axis.name}.limits.drive_min_v: 0 V; this experiment needs a drive below 0 V"
         if self.needs_rig and not is_rig:
             kind = configuration.driver_kind
             return f"driver.kind: {kind!r}; this experiment changes the rig, which only the driver 'sim' allows"
@@ -139,7 +135,7 @@ def _scale_down(value: Any, limits: Sequence[float]) -> Any:
     numbers = np.atleast_1d(np.asarray(value, dtype=float))
     rounded = [_round_down(limit) for limit in limits]
     largest = [float(np.max(sign * numbers, initial=0.0)) for sign in (1, -1)]
-    factors = [min(limit / most, 1.0) if most else 1.0 for limit, most in zip(rounded, largest, strict=True)]
+    factors = [min(limit / peak, 1.0) if peak else 1.0 for limit, peak in zip(rounded, largest, strict=True)]
     if math.isclose(*limits, rel_tol=1e-6):
         factors = 2 * [min(factors)]
     scaled = tuple((factors[0] if number > 0 else factors[1]) * number for number in numbers.tolist())

@@ -16,13 +16,16 @@ from rtloop.design.synthesis.specification import SpecificationOptions
 from rtloop.design.verification.judgement import required_limits
 from rtloop.experiments.derive import read_metadata
 from rtloop.experiments.linear_model import LinearModel, linear_model
-from rtloop.experiments.timeline import Segment
+from rtloop.experiments.timeline import APPROACH, Segment
 from rtloop.experiments.verdict import Row
 from rtloop.foundation.arrays import Real
 from rtloop.hysteresis.play_model import PlayModel
 from rtloop.recording.errors import RecordingError
 from rtloop.recording.load import Recording
 from rtloop.signals import Flag
+
+CENTRED = ("reference_um", "position_um", "command_um")
+"""Signals that are read relative to the middle of a run's motion."""
 
 
 class RecordedRun:
@@ -49,6 +52,7 @@ class RecordedRun:
         self.specification = SpecificationOptions.model_validate(metadata.get("asked", {}))
         self.is_comparison: bool = metadata.get("beside", False)
         self.reductions: list[str] = metadata.get("reduced", [])
+        self.middle_um: float = metadata.get("middle_um", 0.0)
         self._may_trip: bool = metadata["may_trip"]
 
     @property
@@ -131,7 +135,7 @@ class RecordedRun:
                 f"{self.planned_ticks / self.rate_hz:g} s; "
                 "not analysed"
             )
-        if not self._may_trip and (clipping := clipping_text(self.recording["flags"])):
+        if not self._may_trip and (clipping := clipping_text(self._flags())):
             raise UnsuitableData(
                 f"{self._label_prefix}{clipping}; the recording shows the limit and not the loop; not analysed. "
                 "Use a smaller amplitude"
@@ -141,13 +145,31 @@ class RecordedRun:
                 f"{self._label_prefix}{missing_ticks} ticks are missing from the recording; not analysed"
             )
 
+    def _flags(self) -> Real:
+        """Return the recorded flags (ticks,), 0 before the run is at its middle: at 0 V noise alone clips a drive of
+        one sign.
+        """
+        flags = self.recording["flags"].copy()
+        if approaches := self.segments_labelled(APPROACH):
+            flags[: approaches[-1].tick_slice.stop] = 0
+        return flags
+
     def signal(self, name: str) -> Real:
-        """Return a signal (ticks,) of the axis; `name` is without the axis."""
-        return self.recording[f"{self.axis}_{name}"]
+        """Return a signal (ticks,) of the axis, as `read`; `name` is without the axis."""
+        return self.read(name)[0]
 
     def read(self, *names: str) -> list[Real]:
-        """Return several signals (ticks,) of the axis, read in one pass; `names` are without the axis."""
-        return self.recording.read(*(f"{self.axis}_{name}" for name in names))
+        """Return several signals (ticks,) of the axis, read in one pass; `names` are without the axis.
+
+        Reference, position and command are relative to the middle of the run's motion.
+        """
+        signals = self.recording.read(*(f"{self.axis}_{name}" for name in names))
+        if self.middle_um:
+            signals = [
+                signal - self.middle_um if name in CENTRED else signal
+                for name, signal in zip(names, signals, strict=True)
+            ]
+        return signals
 
     def segments_labelled(self, *labels: str) -> list[Segment]:
         """Return the segments with these labels, in order."""

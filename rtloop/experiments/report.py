@@ -92,9 +92,10 @@ def _experiment_section(
 ) -> tuple[dict[str, Any], dict[str, bytes]]:
     """Return the section of one experiment for JSON, and its pictures by theme.
 
-    Keys: name, title, about, parameters, reduced (a sentence for each default that limits reduced), recordings (file
-    names), periods_missed, problem, rows, tables, notes (which begin with those sentences). The problem is None, or
-    says why pictures, and possibly rows, are missing. Raises MissingExtra without matplotlib.
+    Keys: name, title, about, parameters, middle_um (the middle of the motion), reduced (a sentence for each default
+    that limits reduced), recordings (file names), periods_missed, problem, rows, tables, notes (which begin with the
+    middle, unless it is 0, and those sentences). The problem is None, or says why pictures, and possibly rows, are
+    missing. Raises MissingExtra without matplotlib.
     """
     comparison: Analysis | None = None
     analysis: Analysis | None = None
@@ -115,6 +116,7 @@ def _experiment_section(
         "title": experiment.title,
         "about": experiment.description,
         "parameters": runs[0].parameters,
+        "middle_um": runs[0].middle_um,
         "reduced": runs[0].reductions,
         "recordings": [path.name for run in [*runs, *comparison_runs] for path in run.paths],
         "periods_missed": sum(int(run.recording["periods_missed"][1:].sum()) for run in [*runs, *comparison_runs]),
@@ -123,9 +125,20 @@ def _experiment_section(
         if analysis
         else [],
         "tables": analysis.tables if analysis else (),
-        "notes": [*(f"Reduced: {text}." for text in runs[0].reductions), *(analysis.notes if analysis else ())],
+        "notes": [*_middle_notes(runs[0]), *(f"Reduced: {text}." for text in runs[0].reductions),
+                  *(analysis.notes if analysis else ())],  # fmt: skip
     }
     return section, files
+
+
+def _middle_notes(run: RecordedRun) -> list[str]:
+    """Return a sentence on the middle of a run's motion; [] for a motion about 0."""
+    if not run.middle_um:
+        return []
+    return [
+        f"The drive has one sign: the experiment moves about {run.middle_um:g} µm, the middle of the positions that it "
+        "reaches in any order. Reference, command and position are relative to it."
+    ]
 
 
 def _analyse(experiment: Experiment, runs: Sequence[RecordedRun]) -> Analysis:

@@ -9,6 +9,10 @@ from typing import Any, NamedTuple
 from rtloop.configuration.schedule import ModeName
 
 Reference = Mapping[str, Any]
+APPROACH = "approach"
+"""Label of the segments that lead from 0 to the middle."""
+APPROACH_S, APPROACH_REST_S = 0.2, 0.3
+"""Durations of the way from 0 to the middle about which a run moves, and of the rest there."""
 DEPOLARISING_CYCLES, DEPOLARISING_HZ = 100, 25.0
 """Number of cycles and their frequency. From 10 V, each cycle is 0.1 V smaller: the
 remaining memory is about as small."""
@@ -34,12 +38,35 @@ class Segment(NamedTuple):
         return slice(end - ticks, end)
 
 
+class Middle(NamedTuple):
+    """Middle about which a run moves: the command in µm, and the drive in V that holds it after a slow rise from 0."""
+
+    um: float = 0.0
+    v: float = 0.0
+
+    def shifted(self, reference: Reference, mode: ModeName) -> Reference:
+        """Return a reference of kind hold, sine or steps, given about 0, about the middle.
+
+        Samples of a table are in a file: they stay as they are.
+        """
+        offset = self.v if mode == "raw" else self.um
+        if not offset or reference["kind"] == "table":
+            return reference
+        if reference["kind"] == "steps":
+            return {**reference, "levels": [level + offset for level in reference["levels"]]}
+        key = "value" if reference["kind"] == "hold" else "offset"
+        return {**reference, key: reference[key] + offset}
+
+
 class Timeline:
     """Segments of one run, in order, and the reference of each."""
 
-    def __init__(self, rate_hz: float) -> None:
-        """Begin without segments; `rate_hz` converts their durations in s to ticks."""
-        self._rate_hz = rate_hz
+    def __init__(self, rate_hz: float, middle: Middle = Middle()) -> None:
+        """Begin without segments; `rate_hz` converts their durations in s to ticks.
+
+        References of added segments are about `middle`, to which a slow half cycle leads first.
+        """
+        self._rate_hz, self.middle = rate_hz, middle
         self.segments: list[Segment] = []
         self.references: list[Reference] = []
 
@@ -50,6 +77,14 @@ class Timeline:
 
     def add(self, label: str, mode: ModeName, reference: Reference, duration_s: float, **values: Any) -> None:
         """Append a segment of `duration_s`, at least one tick; `values` are facts for the analysis."""
+        if any(self.middle) and not any(segment.label == APPROACH for segment in self.segments):
+            half = (self.middle.v if mode == "raw" else self.middle.um) / 2
+            self._append(APPROACH, mode, sine(half, 0.5 / APPROACH_S, half, -90.0), APPROACH_S)
+            self._append(APPROACH, mode, self.middle.shifted(hold(0.0), mode), APPROACH_REST_S)
+        self._append(label, mode, self.middle.shifted(reference, mode), duration_s, **values)
+
+    def _append(self, label: str, mode: ModeName, reference: Reference, duration_s: float, **values: Any) -> None:
+        """Append a segment whose reference is about 0."""
         ticks = max(1, round(duration_s * self._rate_hz))
         self.segments.append(Segment(label, mode, self.ticks, ticks, values))
         self.references.append(reference)
@@ -61,12 +96,12 @@ class Timeline:
         """
         half_s, half_v = 0.5 / DEPOLARISING_HZ, middle_v / 2
         if middle_v:
-            self.add("depolarise", "raw", sine(half_v, DEPOLARISING_HZ, half_v, -90.0), half_s)
+            self._append("depolarise", "raw", sine(half_v, DEPOLARISING_HZ, half_v, -90.0), half_s)
         for remaining in range(DEPOLARISING_CYCLES, 0, -1):
             reference = sine(amplitude_v * remaining / DEPOLARISING_CYCLES, DEPOLARISING_HZ, middle_v)
-            self.add("depolarise", "raw", reference, 1 / DEPOLARISING_HZ)
+            self._append("depolarise", "raw", reference, 1 / DEPOLARISING_HZ)
         if middle_v:
-            self.add("depolarise", "raw", sine(half_v, DEPOLARISING_HZ, half_v, 90.0), half_s)
+            self._append("depolarise", "raw", sine(half_v, DEPOLARISING_HZ, half_v, 90.0), half_s)
 
     def schedule(self, axis: str) -> list[dict[str, Any]]:
         """Return entries of [[schedule]] for all segments but the first: references of `axis`, and changes of mode.

@@ -4,7 +4,8 @@ After a peak u⁺ on the initial loading curve φ, the falling branch is lower b
 
     x(u) = φ(u⁺) − 2 φ((u⁺ − u)/2),     0 ≤ u⁺ − u ≤ 2 u⁺
 
-so that the memory takes a part of the shorter side: x(u⁻) ≥ −φ(−u⁻), and equal only for u⁻ = −u⁺.
+so that the memory takes a part of the shorter side: x(u⁻) ≥ −φ(−u⁻), and equal only for u⁻ = −u⁺. For u⁻ = 0 it leaves
+the remanence x(0) > 0.
 """
 
 from __future__ import annotations
@@ -41,8 +42,8 @@ class PositionRange(NamedTuple):
 def reachable_range(model: PlayModel, lowest_v: float, highest_v: float, largest_um: float = np.inf) -> PositionRange:
     """Return the positions that `model` takes in any order, from rest, with a drive of `lowest_v` ≤ 0 to `highest_v`.
 
-    They lie within ±`largest_um`. A drive of one sign alone gives a range with 0 as its other end, although an actuator
-    with memory does not return to 0 there. Raises ValueError for a model without inverse.
+    They lie within ±`largest_um`. With a drive of one sign alone, the remanence is the end next to 0: the actuator is
+    at 0 before its first peak, and does not return there. Raises ValueError for a model without inverse.
     """
     is_negative = model.weights.sum() < 0
     if is_negative or -lowest_v > highest_v:
@@ -52,11 +53,10 @@ def reachable_range(model: PlayModel, lowest_v: float, highest_v: float, largest
         mirrored = reachable_range(mirrored_model, *ends_v, largest_um)
         return PositionRange(-mirrored.high_um, -mirrored.low_um)
     high_um = min(float(loading_curve(model, highest_v)), largest_um)
-    if lowest_v == 0.0:
-        return PositionRange(0.0, high_um)
     peak_v = min(highest_v, _outermost_drives(model, [high_um])[1])
     return_um = 2 * float(loading_curve(model, (peak_v - lowest_v) / 2))
-    return PositionRange(max(high_um - return_um, -largest_um), high_um)
+    low_um = max(high_um - return_um, -largest_um)
+    return PositionRange(low_um if abs(low_um) > TOLERANCE * high_um else 0.0, high_um)
 
 
 def can_hold(model: PlayModel, positions_um: npt.ArrayLike, lowest_v: float, highest_v: float) -> bool:

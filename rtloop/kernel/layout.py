@@ -154,9 +154,14 @@ def control_dtype(axes: int) -> np.dtype[Any]:
 
 
 EXTRA_OUTPUT = np.dtype(
-    [*((name, np.float64) for name in ("value_v", "lowest_v", "highest_v", "safe_v")), ("axis", np.int64)], align=True
+    [
+        *((name, np.float64) for name in ("value_v", "lowest_v", "highest_v", "safe_v", "level_um")),
+        *((name, np.int64) for name in ("axis", "mark", "is_high")),
+    ],
+    align=True,
 )
-"""Extra output: present value, range and safe value in V, and the axis whose controller sets it."""
+"""Extra output: present value, range and safe value in V, and its axis, whose controller sets it unless it is a mark.
+`mark` is a Mark, `level_um` the level of Mark.POSITION; `is_high` is 1 in a tick in which the mark is high."""
 FUNCTIONS = np.dtype(
     [
         *((name, np.int64) for name in ("output", "update", "enter")),

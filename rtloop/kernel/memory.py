@@ -260,6 +260,7 @@ class LawMemory:
         for record, output in zip(self._arrays["extra_outputs"], extras.outputs, strict=False):
             record["value_v"] = record["safe_v"] = output.safe_v
             record["lowest_v"], record["highest_v"], record["axis"] = output.lowest_v, output.highest_v, output.axis
+            record["mark"], record["level_um"] = output.mark, output.level_um
         self.records: Any = new_records(LAW, 1)
         for name, array in self._arrays.items():
             self.records[name] = array.ctypes.data

@@ -30,7 +30,7 @@ from rtloop.kernel.access import (
     trip_record,
     unpack_law,
 )
-from rtloop.kernel.extras import collect_extra_outputs, pass_extra_inputs
+from rtloop.kernel.extras import collect_extra_outputs, pass_extra_inputs, set_marks
 from rtloop.kernel.interlocks import EVALUATED, NO_AXIS, axis_trip, count_ticks, loop_causes
 from rtloop.kernel.layout import COEFFICIENTS, CONTROL_SIGNALS, MAX_COUPLED, MAX_SECTIONS, MAX_TAPS, TAP_LANES
 from rtloop.kernel.limits import clip, is_usable, step_toward
@@ -158,6 +158,7 @@ def evaluate(record, adc_v, references, feeds_um, conditions):
     loop.pending = 0
     for a in range(law.axis_count):
         coefficients, state = coefficients_record(law, a), axis_state(law, a)
+        previous_um = state.position_um + state.error_um
         state.position_um = (adc_v[a] - coefficients.offset_v) * coefficients.um_per_v
         state.usable = 1 if is_usable(adc_v[a]) and is_usable(references[a]) and is_usable(feeds_um[a]) else 0
         count_ticks(coefficients, state, loop.mode, adc_v[a], conditions.lateness_us)
@@ -166,6 +167,8 @@ def evaluate(record, adc_v, references, feeds_um, conditions):
         if state.usable != 0:
             target_um, added_um = filter_reference(coefficients, state, references[a])
         state.error_um, state.feed_um = target_um - state.position_um, feeds_um[a] + added_um
+        if record.extra_output_count != 0:
+            set_marks(record, a, target_um - previous_um, state.position_um)
     loop.new_trip = causes & ~loop.trip
     if loop.new_trip != 0:
         _record_trip(law, adc_v, conditions, loop.new_trip)

@@ -29,7 +29,7 @@ Tick = Callable[[Real, Real, float], Real]
 
 
 class Return(NamedTuple):
-    """Return of a loop.
+    """Return of a loop from the edge of its limited range.
 
     Ticks until every axis had at most BACK_SHARE of the way left, and the largest overshoot as a fraction of the way.
     """

@@ -19,7 +19,7 @@ LEAST_PERIODS, LEAST_TICKS, MOST_TICKS = 2, 256, 400_000
 AGREEMENT = 1e-5
 """Relative change of the response from one window to the next at which it is settled."""
 LEAST_RESPONSE = 1e-9
-"""Response below which a change does not count, such as that at the zero of a notch without damping."""
+"""Response below which a change does not count, for example at the zero of a notch without damping."""
 
 
 def measure_response(
@@ -56,7 +56,7 @@ def _settled_response(
     Raises ValueError if they still change after MOST_TICKS.
     """
     window = max(LEAST_TICKS, math.ceil(LEAST_PERIODS / (frequency_hz * period_s)))
-    last = np.full(amplitudes_um.size, np.inf + 0j)
+    previous = np.full(amplitudes_um.size, np.inf + 0j)
     for first in range(0, max(MOST_TICKS, 3 * window), window):
         ticks = first + np.arange(window)
         phase = 2 * np.pi * frequency_hz * period_s * ticks
@@ -64,9 +64,9 @@ def _settled_response(
         ramp = np.linspace(-1.0, 1.0, window)
         parts = np.column_stack([np.sin(phase), np.cos(phase), np.ones(window), ramp, ramp**2])
         fit = np.linalg.lstsq(parts, commands_um, rcond=None)[0]
-        found = fit[0] + 1j * fit[1]
-        least_um = LEAST_RESPONSE * np.abs(amplitudes_um).max()
-        if np.all(np.abs(found - last) <= AGREEMENT * np.abs(found).max() + least_um):
-            return found
-        last = found
+        amplitudes = fit[0] + 1j * fit[1]
+        negligible_um = LEAST_RESPONSE * np.abs(amplitudes_um).max()
+        if np.all(np.abs(amplitudes - previous) <= AGREEMENT * np.abs(amplitudes).max() + negligible_um):
+            return amplitudes
+        previous = amplitudes
     raise ValueError(f"the response at {frequency_hz:g} Hz has not settled after {MOST_TICKS} ticks")

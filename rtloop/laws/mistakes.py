@@ -20,7 +20,7 @@ BASES = ("Controller", "CoupledController", "Feedforward")
 
 
 def find_mistakes(text: str, names: Mapping[str, Any]) -> Iterator[Mistake]:
-    """Yield the mistakes in the laws of a text, law by law: those of records, or else of options and then of functions.
+    """Yield the mistakes in the laws of a text, law by law: in records, or else in options and then in functions.
 
     `names` are the names that the text defines when it runs.
     """

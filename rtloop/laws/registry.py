@@ -111,7 +111,7 @@ def _laws_in(text: str, file: str) -> tuple[LawReference, ...]:
 def law_from_text(text: str, file: str, kind: str | None = None) -> LawReference:
     """Return the law that a text defines; `kind` selects one of several. The text is run once in a process.
 
-    Raises ValueError if it defines no law, or none of `kind`, if the choice is open, or if it cannot be run.
+    Raises ValueError if it defines no law, or no law `kind`, if the choice is open, or if it cannot be run.
     """
     announce(kind or Path(file).stem, file)
     laws = {law.kind: law for law in _laws_in(text, file)}

@@ -22,7 +22,7 @@ class TransferOptions(Options):
     """
 
     form: Literal["factors", "zpk", "transfer_function", "state_space"] = "factors"
-    """How the transfer function is written; each form takes its keys alone."""
+    """Notation of the transfer function; each form takes its own keys alone."""
     gain: float | None = None
     """Factor on the whole function, with the forms "factors" and "zpk", where it is required; it is not the gain at 0
     Hz."""

@@ -80,7 +80,7 @@ class Transfer:
     def from_state_space(cls, a: npt.ArrayLike, b: npt.ArrayLike, c: npt.ArrayLike, d: npt.ArrayLike) -> Transfer:
         """Return the transfer function of x' = A x + B u, y = C x + D u: `a` (n, n), `b` and `c` n values, `d` one.
 
-        All n poles stay, also those that zeros cancel; a system that is zero becomes gain 0 without roots. Raises
+        All n poles stay, also poles that zeros cancel; a system that is zero becomes gain 0 without roots. Raises
         ValueError for shapes that do not fit, values that are not finite, and an order above MAX_ORDER.
         """
         system = _system(a, b, c, d)
@@ -200,7 +200,7 @@ def _product(name: str, factors: Sequence[npt.ArrayLike]) -> tuple[Complex, floa
 def _roots(polynomial: npt.NDArray[np.float64]) -> Complex:
     """Return the roots (n,) of a polynomial, highest power first.
 
-    Those of a quadratic come from the closed form, which keeps a double root exactly double.
+    The roots of a quadratic come from the closed form, which keeps a double root exactly double.
     """
     if polynomial.size != 3:
         return np.roots(polynomial).astype(complex)

@@ -24,6 +24,7 @@ from rtloop.service.changing.building import builder_lifetime
 from rtloop.service.journal import Journal
 from rtloop.service.measuring.adaptation import run_adaptation
 from rtloop.service.measuring.quality import watch_quality
+from rtloop.service.recovering.worker import run_recovery
 from rtloop.service.service import Service
 from rtloop.supervision.paths import FOLDER_MODE, host_refusal, socket_path
 
@@ -53,7 +54,8 @@ def _serve(config: Path, duration_s: float | None, name: str | None) -> int:
     try:
         adaptation = run_adaptation(service, socket_path(service.configuration))
         quality_watch = watch_quality(service.quality, lambda: (service.supervisor, service.limits))
-        with builder_lifetime(), _api_server(service), can_supervision(service), adaptation, quality_watch:
+        recovery = run_recovery(service, service.recovery)
+        with builder_lifetime(), _api_server(service), can_supervision(service), adaptation, quality_watch, recovery:
             return service.run()
     finally:
         logging.getLogger().handlers[0].flush()

@@ -13,7 +13,7 @@ from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from contextvars import ContextVar
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
@@ -24,6 +24,7 @@ from rtloop.engine.ring import drain
 from rtloop.errors import RtloopError
 from rtloop.recording.capture.requester_names import RequesterNames
 from rtloop.recording.file.topics.events import OPERATOR
+from rtloop.recording.file.topics.recovery_steps import Note
 from rtloop.service.background import set_in_context
 from rtloop.signals import Mode
 
@@ -37,13 +38,15 @@ MAX_CHANGES = 1000
 
 @dataclass(frozen=True)
 class Requester:
-    """Sender of commands: name and origin as in the recording. `require_permission` raises Refusal once the sender has
-    lost the lock.
+    """Sender of commands: name and origin as in the recording. `require_permission` raises Refusal once the sender may
+    send no more, as after a loss of the lock; it must not wait.
     """
 
     name: str = OPERATOR
     origin: Origin = Origin.OPERATOR
     require_permission: Callable[[], None] = lambda: None
+    may_always_stop: bool = True
+    """Whether a stop and a reset need no permission."""
 
 
 UNNAMED_REQUESTER = Requester()
@@ -72,7 +75,7 @@ class RefusedByLoop(Refusal):
     writes. Coefficients that do not fit the loop are refused at any time.
     """
 
-    def __init__(self, kind: Kind, tick: int) -> None:
+    def __init__(self, kind: Kind | Note, tick: int) -> None:
         reason = (
             "the coefficients do not fit the loop's records; restart the service"
             if kind is Kind.LOAD_LAW
@@ -103,21 +106,21 @@ class Desk:
         return self._changes.get(identity)
 
     def submit(
-        self, kind: Kind, *, axis: int = ALL_AXES, values: Sequence[float] = (), change: str | None = None
+        self, kind: Kind | Note, *, axis: int = ALL_AXES, values: Sequence[float] = (), change: str | None = None
     ) -> int:
         """Send a command, wait until it took effect, and return its tick; `change` describes a change of a law.
 
         `axis` is a number from 0, by default all axes; `values` are those that `Kind` states for `kind`. Raises Refusal
-        if the requester has lost the lock (a stop and a reset need none), or without an acknowledgement in time (the
+        if the requester has no permission (a stop and a reset need none), or without an acknowledgement in time (the
         command is withdrawn); RefusedByLoop if the loop refuses it; UnconfirmedCommand if the loop took it and stands
         still; QueueFull.
         """
         requester = current_requester()
-        command = message(kind, axis=axis, origin=requester.origin, values=values)
+        command = message(cast(Kind, kind), axis=axis, origin=requester.origin, values=values)
         is_urgent = kind is Kind.RESET_TRIP or (kind is Kind.SET_MODE and values[0] == Mode.OFF)
-        if not is_urgent:
-            requester.require_permission()
-        with self._lock:  # The queue allows one producer.
+        with self._lock:  # The queue allows one producer. A permission that ends before a stop is sent ends here, too.
+            if not (is_urgent and requester.may_always_stop):
+                requester.require_permission()
             self._last_identity += 1
             command["identity"] = identity = self._last_identity
             cursor = int(self._block["events_head"][0])
@@ -130,7 +133,7 @@ class Desk:
             position = send(self._block, command, urgent=is_urgent)
         return self._answer(kind, identity, cursor, position)
 
-    def _answer(self, kind: Kind, identity: int, cursor: int, position: int) -> int:
+    def _answer(self, kind: Kind | Note, identity: int, cursor: int, position: int) -> int:
         """Wait for the acknowledgement of a command and return its tick; `position` is its place in the queue.
 
         `cursor` is the number of the first event to read. Raises Refusal for a command that the loop refused or that

@@ -28,17 +28,25 @@ def prepare_actuator(options: ServiceOptions, supervisor: Supervisor, live: Live
     """
     axes = range(len(live.prepared.plan.axes))
     if options.depolarise is not None:
-        sine_v = decaying_sine(options.depolarise, live.prepared.plan.pacing.rate_hz)
-        for axis in axes:
-            live.references.play_raw(axis, sine_v)
-        desk.submit(Kind.SET_MODE, values=[float(Mode.RAW)])
-        _await_ticks(supervisor, sine_v.size, live.prepared.plan.pacing.rate_hz)
-        desk.submit(Kind.SET_MODE, values=[float(Mode.OFF)])
-        _await_rest(supervisor)
+        depolarise(options.depolarise, supervisor, live, desk)
     if options.tare_s > 0:
         count = max(1, round(options.tare_s * live.prepared.plan.pacing.rate_hz))
         for axis, offset_v in enumerate(_mean_inputs_v(supervisor, count, len(axes))):
             live.tare(axis, offset_v)
+
+
+def depolarise(options: DepolariseOptions, supervisor: Supervisor, live: LiveLaw, desk: Desk) -> None:
+    """Erase the memory of all axes by the same sine, and wait until the outputs are at safe; raises as
+    `prepare_actuator`.
+    """
+    rate_hz = live.prepared.plan.pacing.rate_hz
+    sine_v = decaying_sine(options, rate_hz)
+    for axis in range(len(live.prepared.plan.axes)):
+        live.references.play_raw(axis, sine_v)
+    desk.submit(Kind.SET_MODE, values=[float(Mode.RAW)])
+    await_ticks(supervisor, sine_v.size, rate_hz)
+    desk.submit(Kind.SET_MODE, values=[float(Mode.OFF)])
+    _await_rest(supervisor)
 
 
 def decaying_sine(options: DepolariseOptions, rate_hz: float) -> npt.NDArray[np.float64]:
@@ -48,7 +56,7 @@ def decaying_sine(options: DepolariseOptions, rate_hz: float) -> npt.NDArray[np.
     return options.amplitude_v * (1 - phase) * np.sin(2 * np.pi * options.cycles * phase)
 
 
-def _await_ticks(supervisor: Supervisor, count: int, rate_hz: float) -> None:
+def await_ticks(supervisor: Supervisor, count: int, rate_hz: float) -> None:
     """Wait until `count` more ticks were executed. Raises Refusal after a trip or the time limit."""
     final_tick, limit_s = supervisor.ticks + count, 1.0 + TIMEOUT_FACTOR * count / rate_hz
     start_s = time.monotonic()
@@ -83,6 +91,6 @@ def _mean_inputs_v(supervisor: Supervisor, count: int, axis_count: int) -> list[
     Raises Refusal after a trip or the time limit.
     """
     count = min(count, len(supervisor.block["ticks_slots"]) // 2)
-    _await_ticks(supervisor, count, supervisor.prepared.plan.pacing.rate_hz)
+    await_ticks(supervisor, count, supervisor.prepared.plan.pacing.rate_hz)
     rows = supervisor.newest(count)
     return [float(np.mean(rows[:, signals.axis_column(axis, signals.ADC)])) for axis in range(axis_count)]

@@ -28,7 +28,7 @@ from rtloop.configuration.prepare import Prepared, prepare
 from rtloop.drivers.errors import DriverError
 from rtloop.engine.memory import Word
 from rtloop.engine.messages import MESSAGE, Kind
-from rtloop.errors import ConfigError, LoopFault, RtloopError
+from rtloop.errors import ConfigError, LoopFault, RtloopError, UnavailableError
 from rtloop.foundation.trusted import open_own
 from rtloop.recording.file.recover import find_leftovers, recover
 from rtloop.service.changing.building import prepare_builder, prepare_limited
@@ -40,6 +40,7 @@ from rtloop.service.measuring.measurement import MeasurementHistory
 from rtloop.service.measuring.quality import Quality
 from rtloop.service.notify import Notifier
 from rtloop.service.preparation import prepare_actuator
+from rtloop.service.recovering.recovery import Recovery
 from rtloop.service.second_opinion import SecondOpinion
 from rtloop.signals import Flag, Mode
 from rtloop.supervision.hardware import Hardware, write_note
@@ -84,6 +85,9 @@ class Service:
         if self.configuration.schedule and (options.tare_s > 0 or options.depolarise is not None):
             fault = "schedule: not allowed with service.tare_s or service.depolarise, which use the first ticks"
             raise ConfigError(str(config), [fault])
+        if self.configuration.schedule and options.recover is not None:
+            fault = "schedule: not allowed with service.recover, because its ticks do not come again after a trip"
+            raise ConfigError(str(config), [fault])
         self._duration_s = duration_s
         self.notifier = Notifier()
         self.lock = Lock()
@@ -96,6 +100,8 @@ class Service:
         self.current_measurement = CurrentMeasurement()
         self.quality = Quality()
         self.second_opinion = SecondOpinion()
+        self.recovery = Recovery(self)
+        self._is_preparing = False
         self._desk: Desk | None = None
         self._end_requested, self._reload_requested = threading.Event(), threading.Event()
         self._reload_lock = threading.Lock()
@@ -135,6 +141,11 @@ class Service:
     def _has_died(self) -> bool:
         """Whether the present loop's process has died; parking its outputs was tried, its files may be unfinished."""
         return self.supervisor is not None and self.supervisor.error is not None
+
+    @property
+    def is_moved(self) -> bool:
+        """Whether a measurement, or the preparation of the actuator, moves the loop."""
+        return self._is_preparing or self.current_measurement.for_json() is not None
 
     @property
     def limits(self) -> list[LimitsOptions]:
@@ -180,13 +191,15 @@ class Service:
         `mode` is the name of a Mode in lower case, such as "closed_loop". A reference in µm is meaningless in volts: on
         entry to and exit from mode raw, the present output is held. In a loop that is tripped or stops, mode off
         changes no output: all are safe, or ramp there. Raises Refusal while tripped or not armed (mode off is allowed
-        then, too), without a loop, where the driver refuses the writes of a ramp, and as `Desk.submit`.
+        then, too), without a loop, where the driver refuses the writes of a ramp, and as `Desk.submit`. Any accepted
+        mode, and off, end a recovery.
         """
         target_mode = Mode[mode.upper()]
         if target_mode is not Mode.OFF and self.state is State.TRIPPED:
             raise Refusal(f"mode {mode}: the service is tripped; use reset first ({self.ctl('reset')})")
         if target_mode is not Mode.OFF and not self.armed:
             raise Refusal(f"mode {mode}: the outputs are not armed; use arm first ({self.ctl('arm')})")
+        self.recovery.end()
         try:
             return self.desk.submit(Kind.SET_MODE, values=[float(target_mode), 0.0, 1.0])
         except RefusedByLoop as refusal:
@@ -216,8 +229,10 @@ class Service:
         """
         if self.state is not State.TRIPPED:
             raise Refusal(f"reset: there is no trip; the state of the service is {self.state}")
+        self.recovery.end()
         tick = self.desk.submit(Kind.RESET_TRIP)
         self.faults.clear()
+        self.recovery.clear()
         self.armed = not self.configuration.service.arm
         return tick
 
@@ -249,6 +264,9 @@ class Service:
             except (RtloopError, DriverError) as error:
                 if self._end_requested.is_set():
                     return 0  # The end was requested before the loop began.
+                if _is_driver_error(error) and self.recovery.accept_failed_start(str(error)):
+                    self._latch_and_wait(str(error))
+                    continue
                 if not self._latch_and_allow_restart(str(error)):
                     raise
                 continue
@@ -258,9 +276,11 @@ class Service:
                     log.error("%s", result.error)
                 log.info("stopped")
                 return result.exit_code
-            if not self._latch_and_allow_restart(result.error or f"the loop ended: {result.outcome}"):
+            fault, outputs_off = result.error or f"the loop ended: {result.outcome}", True
+            if self.recovery.accept_end(result.outcome, fault):
+                self._latch_and_wait(fault)
+            elif not self._latch_and_allow_restart(fault):
                 raise LoopFault(f"the loop ended too often and is not started again: {'; '.join(self.faults)}")
-            outputs_off = True
         return 0
 
     def _run_loop(self, outputs_off: bool) -> RunResult:
@@ -309,8 +329,7 @@ class Service:
         logged_state: State | None = None
         gaps, logged_removals = GapReporter(supervisor.block), 0
         while (result := supervisor.poll()) is None:
-            if self.live is not None:
-                self.live.references.follow()
+            self._follow_events()
             if self._duration_s is not None and supervisor.ticks >= self._duration_s * self.configuration.loop.rate_hz:
                 self.end()
             if self._end_requested.is_set() and not self._is_stopping:
@@ -342,9 +361,16 @@ class Service:
                     log.info("%s", state)
                 logged_state = state
             time.sleep(POLL_S)
+        self._follow_events()
         for note in result.notes:
             log.warning("%s", note)
         return result
+
+    def _follow_events(self) -> None:
+        """Read the loop's new events, for its references and for the recovery."""
+        if self.live is not None:
+            self.live.references.follow()
+            self.recovery.observe()
 
     def _notify_systemd(self, supervisor: Supervisor) -> None:
         """Send systemd the messages that are due; called at every poll.
@@ -391,6 +417,18 @@ class Service:
         time.sleep(RESTART_PAUSE_S)
         return True
 
+    def _latch_and_wait(self, reason: str) -> None:
+        """Latch a failure that a recovery covers as a fault, and wait for the recovery's pause or for `end`.
+
+        Such failures do not count for service.restarts: the next service would begin as at boot, and drive unproved.
+        """
+        if reason not in self.faults:
+            self.faults.append(reason)
+            log.error("%s", reason)
+        self._reported_ticks = 0
+        self.notifier.limit_watchdog(START_TIMEOUT_S)
+        self._end_requested.wait(self.recovery.pause_s)
+
     def _start_thread(self, work: Callable[[], None]) -> threading.Thread:
         """Start slow work in a separate thread, so that the watch continues. Returns the thread."""
         thread = threading.Thread(target=work, daemon=True)
@@ -412,6 +450,7 @@ class Service:
         supervisor, live, desk = self.supervisor, self.live, self._desk
         if supervisor is None or live is None or desk is None:
             return
+        self._is_preparing = True
         try:
             prepare_actuator(self.configuration.service, supervisor, live, desk)
             for number in range(len(live.prepared.plan.axes)):
@@ -420,6 +459,8 @@ class Service:
         except RtloopError as error:
             self.faults.append(str(error))
             log.error("%s", error)
+        finally:
+            self._is_preparing = False
 
     def _judge_loop(self, prepared: Prepared) -> None:
         """Compute the second opinion. A disagreement brings the outputs to safe, and is latched as a fault."""
@@ -468,3 +509,8 @@ class Service:
             self.configuration = configuration
         log.info("reloaded: %s", ", ".join(changed) or "nothing changed")
         return {"changed": changed}
+
+
+def _is_driver_error(error: Exception) -> bool:
+    """Return whether a loop did not start because its driver could not be opened, in this process or the loop's."""
+    return isinstance(error, DriverError) or getattr(error, "exit_code", None) == UnavailableError.exit_code

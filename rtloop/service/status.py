@@ -19,13 +19,13 @@ WINDOW_TICKS = 10_000
 
 
 def status(service: Service) -> dict[str, Any]:
-    """Return the content of `/status`: {name, state, armed, faults, lock: the lock's holder, measuring, ticks,
-    realtime, recording, recorder_replacements, restarts: number of ended runs}, and the keys of `timing` and
+    """Return the content of `/status`: {name, state, armed, faults, lock: the lock's holder, measuring, recovery,
+    ticks, realtime, recording, recorder_replacements, restarts: number of ended runs}, and the keys of `timing` and
     `newest_signals`, or in `no_signals` the reason why there are none.
 
-    `measuring` is as `CurrentMeasurement.for_json`; `recording` has the keys of `recording_state`, file and
-    written_ticks. `measured`, the results by axis, is present once there is one. Without a loop, `ticks` and
-    `recorder_replacements` are 0, and `realtime` and `recording` are {}.
+    `measuring` is as `CurrentMeasurement.for_json`, `recovery` as `Recovery.for_json`. `recording` has the keys of
+    `recording_state`, file and written_ticks. `measured`, the results by axis, is present once there is one. Without a
+    loop, `ticks` and `recorder_replacements` are 0, and `realtime` and `recording` are {}.
     """
     supervisor = service.supervisor
     report: dict[str, Any] = {
@@ -35,6 +35,7 @@ def status(service: Service) -> dict[str, Any]:
         "faults": list(service.faults),
         "lock": service.lock.holder,
         "measuring": service.current_measurement.for_json(),
+        "recovery": service.recovery.for_json(),
         "ticks": 0 if supervisor is None else supervisor.ticks,
         "realtime": {} if supervisor is None else supervisor.realtime,
         "recording": {}

@@ -1,6 +1,6 @@
 """A loop, a simulated board and the panel, without any file of the user: three processes that end together.
 
-    rtloop demo ──┬── board: `rtloop hil serve`, of a process group of its own, so that Ctrl-C does not reach it
+    rtloop demo ──┬── board: `rtloop hil serve`, in a separate process group, which Ctrl-C does not reach
                   ├── panel: `rtloop panel`
                   └── the service, in this process, with loop and recorder as its children
 

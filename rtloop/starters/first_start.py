@@ -9,7 +9,7 @@ FIRST_START = (
 
 
 def is_first_start() -> bool:
-    """Whether nothing is compiled yet for this version on this processor."""
+    """Whether the cache has no compiled code yet for this version on this processor."""
     from rtloop.foundation.native.cache import CACHE_FOLDER
 
     return not any(CACHE_FOLDER.iterdir())

@@ -79,7 +79,7 @@ def write_starter(starter: Starter, folder: Path) -> list[Path]:
     """
     from rtloop.configuration.schema import schema_text
 
-    texts = {name: _with_schema(name, text) for name, text in starter.texts.items()}
+    texts = {name: _add_schema_line(name, text) for name, text in starter.texts.items()}
     if not os.path.lexists(folder / SCHEMA):
         texts[SCHEMA] = schema_text()
     return write_new_files(folder, texts)
@@ -95,7 +95,7 @@ def _first_command(text: str) -> str:
     return next(line.removeprefix("#").strip() for line in text.splitlines() if line.startswith("#   rtloop "))
 
 
-def _with_schema(name: str, text: str) -> str:
+def _add_schema_line(name: str, text: str) -> str:
     """Return the text of a configuration below SCHEMA_LINE, or below its own such line; any other text unchanged."""
     is_configuration = name.endswith(".toml") and "\n[loop]\n" in text and not text.startswith("#:schema")
     return SCHEMA_LINE + text if is_configuration else text

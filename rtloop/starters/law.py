@@ -34,7 +34,7 @@ def class_name(name: str) -> str:
 def _stage_text(name: str, stage: Configuration) -> str:
     """Return a configuration with the law of NAME.py in its first axis, without the pre-filter for another law.
 
-    Gains are those of a shipped PI controller, else SLOW_KI_PER_S.
+    It takes the gains of the axis's shipped PI controller; in place of any other one, SLOW_KI_PER_S.
     """
     from rtloop.design.stale_comments import remove_first_comments
     from rtloop.design.toml_text import edit_text

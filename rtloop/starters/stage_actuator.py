@@ -16,7 +16,7 @@ import numpy as np
 THRESHOLDS = (0.0, 0.1, 0.2, 0.4, 0.6, 0.8)
 """Thresholds of the play operators, as fractions of half the drive's range."""
 WEIGHTS = (1.3, 0.3, 0.2, 0.3, 0.2, 0.2)
-"""Weights relative to one another where no hysteresis is given: the loop is as wide as that of a piezo stack."""
+"""Weights relative to one another where no hysteresis is given: the loop is as wide as a piezo stack's."""
 
 
 @dataclass(frozen=True)
@@ -30,14 +30,14 @@ class Actuator:
 
     def rise_um(self, drive_v: float) -> float:
         """Return the position at a drive ≥ 0 that is reached from rest."""
-        return _moved_um(self.weights_um_per_v, self.thresholds_v, drive_v)
+        return _travel_um(self.weights_um_per_v, self.thresholds_v, drive_v)
 
     def fall_um(self, change_v: float) -> float:
         """Return the distance by which the position falls, as the drive falls from `highest_v` by `change_v`.
 
         `change_v` is at most twice `highest_v`: no play with a threshold above `highest_v` moves.
         """
-        return _moved_um(self.weights_um_per_v, self._turns_v, change_v)
+        return _travel_um(self.weights_um_per_v, self._turns_v, change_v)
 
     @property
     def _turns_v(self) -> list[float]:
@@ -71,17 +71,17 @@ class Actuator:
 def make_actuator(lowest_v: float, highest_v: float, range_um: float, hysteresis_percent: float | None) -> Actuator:
     """Return an actuator whose position is `range_um` at `highest_v`, reached from rest.
 
-    `hysteresis_percent` is the width of the major loop in percent of its stroke, 0 to 30; None: that of WEIGHTS.
+    `hysteresis_percent` is the width of the major loop in percent of its stroke, 0 to 30; None: as WEIGHTS give it.
     """
     half_v = (highest_v - lowest_v) / 2
     thresholds_v = tuple(half_v * threshold for threshold in THRESHOLDS)
     shares = WEIGHTS if hysteresis_percent is None else _weights(hysteresis_percent / 100)
-    scale = range_um / _moved_um(shares, thresholds_v, highest_v)
+    scale = range_um / _travel_um(shares, thresholds_v, highest_v)
     return Actuator(lowest_v, highest_v, thresholds_v, tuple(scale * share for share in shares))
 
 
 def _weights(width: float) -> tuple[float, ...]:
-    """Return weights relative to one another with which h/H is `width`: 1, then multiples of those of WEIGHTS."""
+    """Return weights relative to one another with which h/H is `width`: 1, then WEIGHTS[1:] times one factor."""
     plays = list(zip(WEIGHTS[1:], THRESHOLDS[1:], strict=True))
     height = sum(weight * min(2 * threshold, 2 - 2 * threshold) for weight, threshold in plays)
     stroke = sum(weight * (2 - 2 * threshold) for weight, threshold in plays)
@@ -89,7 +89,7 @@ def _weights(width: float) -> tuple[float, ...]:
     return (1.0, *(factor * weight for weight in WEIGHTS[1:]))
 
 
-def _moved_um(weights: Sequence[float], dead_v: Sequence[float], change_v: float) -> float:
+def _travel_um(weights: Sequence[float], dead_v: Sequence[float], change_v: float) -> float:
     """Return the sum of the weights times the part of `change_v` beyond each play's dead range."""
     return sum(weight * max(0.0, change_v - dead) for weight, dead in zip(weights, dead_v, strict=True))
 

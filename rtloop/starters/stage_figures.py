@@ -44,9 +44,9 @@ class StageFigures:
         if self.hysteresis_percent is not None:
             _require("hysteresis-percent", self.hysteresis_percent, 0.0, LARGEST_HYSTERESIS_PERCENT, "%")
         if self.sensor_um_per_v is not None:
-            least, most = self.range_um / 20, 10 * self.range_um
+            lowest, highest = self.range_um / 20, 10 * self.range_um
             _require(
-                "sensor-um-per-v", self.sensor_um_per_v, least, most, "µm/V: ±10 V show half of the travel or more"
+                "sensor-um-per-v", self.sensor_um_per_v, lowest, highest, "µm/V: ±10 V show half of the travel or more"
             )
         for name, value in (
             ("sensor-noise-um", self.sensor_noise_um),
@@ -59,7 +59,7 @@ class StageFigures:
             _require("rate-hz", self.rate_hz, least_hz, RATES_HZ[-1], "Hz, from four samples in a period on")
 
 
-def _require(name: str, value: float, least: float, largest: float, unit: str) -> None:
-    """Raise ValueError for a value beyond `least` … `largest`, or NaN."""
-    if not least <= value <= largest:
-        raise ValueError(f"--{name}: value is {value:g}; allowed: {least:g} … {largest:g} {unit}".rstrip())
+def _require(name: str, value: float, lowest: float, highest: float, unit: str) -> None:
+    """Raise ValueError for a value beyond `lowest` … `highest`, or NaN."""
+    if not lowest <= value <= highest:
+        raise ValueError(f"--{name}: value is {value:g}; allowed: {lowest:g} … {highest:g} {unit}".rstrip())

@@ -11,6 +11,7 @@ from rtloop.configuration.cautions import cautions
 from rtloop.configuration.checks import AxisCheck
 from rtloop.configuration.file import Configuration
 from rtloop.configuration.prepare import Prepared, prepare
+from rtloop.drivers.base import channel_index
 from rtloop.drivers.errors import DriverError
 from rtloop.errors import ConfigError, UnavailableError
 from rtloop.supervision.host_delay import load_host_delay
@@ -59,8 +60,9 @@ class CheckResult(Result):
     def print_text(self, out: Console) -> None:
         """Print the plan, then limits, law, analyses and verdict of each axis; no warnings."""
         print_plan(out, self.prepared)
-        for judgement in self.axes.values():
-            print_axis(out, judgement)
+        inputs, channels = self.prepared.facts.inputs, self.prepared.configuration.channels
+        for name, judgement in self.axes.items():
+            print_axis(out, judgement, inputs[channel_index(inputs, channels[name].input)])
 
     def plot(self) -> Figure:
         """Return a picture with a column for each axis whose loop is known: |L|, |S|, and the step.

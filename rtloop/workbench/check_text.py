@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from rtloop.configuration.simulated import drive_ends_um
 from rtloop.supervision.recording_path import recordings_folder
 from rtloop.values import count_text
 from rtloop.workbench.tables import escape, format_figure, table
@@ -11,8 +12,10 @@ from rtloop.workbench.tables import escape, format_figure, table
 if TYPE_CHECKING:
     from rich.console import Console
 
+    from rtloop.configuration.axis import AxisOptions, InterlockOptions
     from rtloop.configuration.checks import AxisCheck
     from rtloop.configuration.prepare import Prepared
+    from rtloop.drivers.base import Channel
     from rtloop.workbench.axis_judgement import AxisJudgement
 
 ROWS = (
@@ -38,20 +41,20 @@ def print_plan(out: Console, prepared: Prepared) -> None:
     out.print(f"records into {escape(str(recordings_folder(prepared.configuration)))}", soft_wrap=True)
 
 
-def print_axis(out: Console, judgement: AxisJudgement) -> None:
-    """Print limits, law, analyses and verdict of one axis."""
+def print_axis(out: Console, judgement: AxisJudgement, sensor: Channel) -> None:
+    """Print limits, law, analyses and verdict of one axis; `sensor` is its input."""
     from rtloop.design.verification.text import answer
 
     axis = judgement.axis
-    limits, interlocks = axis.limits, axis.interlocks
+    limits = axis.limits
     drive = (
         f"±{limits.drive_v:g}" if limits.lowest_v == -limits.drive_v else f"{limits.lowest_v:g} … {limits.drive_v:g}"
     )
     slew = "no running slew limit" if limits.slew_v_per_s is None else f"slew {limits.slew_v_per_s:g} V/s"
     out.print(
-        f"\n[bold]axis {axis.name}[/]: drive {drive} V, command ±{limits.command_um:g} µm, {slew}, "
-        f"trip ramp {limits.trip_slew_v_per_s:g} V/s; trips beyond ±{interlocks.position_um:g} µm "
-        f"or {interlocks.sensor_min_v:g} … {interlocks.sensor_max_v:g} V at the sensor"
+        f"\n[bold]axis {axis.name}[/]: drive {drive} V, command {_command_text(axis)} µm, {slew}, "
+        f"trip ramp {limits.trip_slew_v_per_s:g} V/s; trips beyond ±{axis.interlocks.position_um:g} µm"
+        f"{_sensor_text(axis.interlocks, sensor)}"
     )
     _print_law(out, judgement.check)
     _print_analyses(out, judgement)
@@ -60,6 +63,27 @@ def print_axis(out: Console, judgement: AxisJudgement) -> None:
     if judgement.verification is not None:
         specification = escape(axis.specification)
         out.print(f"{specification}: {answer(judgement.verification)}; `rtloop design verify` shows all figures")
+
+
+def _command_text(axis: AxisOptions) -> str:
+    """Return the command's range in µm as text: "±40", or "0 … 40" for a drive of one sign."""
+    command_um = axis.limits.command_um
+    down_um, up_um = drive_ends_um(axis)
+    if down_um < 0 < up_um or down_um == up_um:
+        return f"±{command_um:g}"
+    return f"0 … {command_um:g}" if up_um > 0 else f"-{command_um:g} … 0"
+
+
+def _sensor_text(interlocks: InterlockOptions, sensor: Channel) -> str:
+    """Return the sensor's limits as text, without those that the input cannot read."""
+    low_v, high_v = interlocks.sensor_min_v, interlocks.sensor_max_v
+    has_low, has_high = low_v > sensor.minimum_v, high_v < sensor.maximum_v
+    if has_low and has_high:
+        return f" or {low_v:g} … {high_v:g} V at the sensor"
+    ends = f"which reads {sensor.minimum_v:g} … {sensor.maximum_v:g} V"
+    if not has_low and not has_high:
+        return f", never at the sensor, {ends}"
+    return f" or {f'below {low_v:g}' if has_low else f'above {high_v:g}'} V at the sensor, {ends}"
 
 
 def _print_law(out: Console, check: AxisCheck) -> None:
@@ -84,7 +108,7 @@ def _print_law(out: Console, check: AxisCheck) -> None:
 
 def _print_analyses(out: Console, judgement: AxisJudgement) -> None:
     """Print the figures of an axis's loop, with C(s) and as it runs; of a shared controller also those of all axes."""
-    from rtloop.design.verification.text import format_range, together
+    from rtloop.design.verification.text import format_range, simultaneous_rows
 
     check, shifts = judgement.check, judgement.shifts
     analyses = {"continuous C(s)": ("continuous", check.continuous), "as it runs": ("running", check.running)}
@@ -101,4 +125,4 @@ def _print_analyses(out: Console, judgement: AxisJudgement) -> None:
     out.print(table(heading, *analyses, rows=rows, words=(1, 2)))
     if check.together is not None and check.together.margins is not None and check.together.place == 0:
         heading = f"{' and '.join(check.together.axes)} together"
-        out.print(table(heading, "as they run", rows=together(check.together.margins), words=(1,)))
+        out.print(table(heading, "as they run", rows=simultaneous_rows(check.together.margins), words=(1,)))

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 from rtloop.recording.views.steps import SETTLING_BAND, StepMetrics
-from rtloop.workbench.step_figures import specification_rows
+from rtloop.workbench.step_figures import MISSED, specification_rows
 from rtloop.workbench.summary_text import print_summary
 from rtloop.workbench.tables import escape, format_figure, table
 
@@ -15,6 +15,13 @@ if TYPE_CHECKING:
 
     from rtloop.configuration.file import Configuration
     from rtloop.recording.views.summary import Summary
+
+SPECIFIED_STEP = (
+    "MISSED: the worst recorded step is beyond the limit. A specification is for the linear loop's step from rest at 0 "
+    "µm: between other levels the hysteresis acts, and a loop without integrator leaves its static error of the "
+    "position, not of the step."
+)
+"""Difference between a recorded step and the step that a specification limits."""
 
 
 def print_run(
@@ -34,6 +41,7 @@ def _print_steps(out: Console, configuration: Configuration, steps: Mapping[str,
 
     Limits and claims of the axis's specification follow.
     """
+    is_missed = False
     rows = table("steps", "overshoot %", "settling ms (5 %)", "static error %")
     for axis in configuration.axes:
         metrics = steps.get(axis.name)
@@ -49,7 +57,15 @@ def _print_steps(out: Console, configuration: Configuration, steps: Mapping[str,
         if metrics.unreached:
             rows.add_row(f"  [red]{metrics.unreached} of {metrics.steps} steps hardly moved, or ended more than "
                           f"{100 * SETTLING_BAND:g} % of their height from the reference[/]")  # fmt: skip
-        for row in specification_rows(configuration, axis):
+        for row in specification_rows(configuration, axis, metrics):
             label = escape(row.label) if row.error is None else f"[red]{escape(row.error)}[/]"
-            rows.add_row(f"  {label}", *map(escape, row.cells))
+            rows.add_row(f"  {label}", *(_red(cell) if cell.endswith(MISSED) else escape(cell) for cell in row.cells))
+            is_missed |= any(cell.endswith(MISSED) for cell in row.cells)
     out.print(rows)
+    if is_missed:
+        out.print(SPECIFIED_STEP)
+
+
+def _red(text: str) -> str:
+    """Return text in red."""
+    return f"[red]{escape(text)}[/]"

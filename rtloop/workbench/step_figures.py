@@ -16,6 +16,8 @@ from rtloop.signals import Mode
 
 STEP_QUANTITIES = ("overshoot_percent", "settling_ms", "static_error_percent")
 """Keys of a specification, in the order of the table's columns."""
+MISSED = ", MISSED"
+"""Mark behind a limit that is not met."""
 
 
 class SpecificationRow(NamedTuple):
@@ -44,22 +46,30 @@ def recorded_steps(recording: Recording) -> dict[str, StepMetrics]:
     return steps
 
 
-def specification_rows(configuration: Configuration, axis: AxisOptions) -> Iterator[SpecificationRow]:
+def specification_rows(
+    configuration: Configuration, axis: AxisOptions, steps: StepMetrics
+) -> Iterator[SpecificationRow]:
     """Yield the limits of an axis's specification, and the figures that it claims, if any.
 
-    Yields one row with the error for a specification that cannot be read.
+    A limit that the worst of the `steps` does not meet is marked MISSED. Yields one row with the error for a
+    specification that cannot be read.
     """
     if axis.specification is None:
         return
     from rtloop.design.synthesis.specification_file import load_specification  # slow, and seldom needed
+    from rtloop.design.verification.judgement import required_limits
 
     try:
         specification = load_specification(configuration.folder / axis.specification).design.specification
     except RtloopError as error:
         yield SpecificationRow(axis.specification, [], str(error))
         return
-    limits = [getattr(specification, key) for key in STEP_QUANTITIES]
-    limit_cells = ["–" if limit is None else f"≤ {limit:g}" for limit in limits]
+    limits = required_limits(specification)
+    worst_values = steps.overshoot_percent_worst, steps.settling_time_ms_worst, steps.static_error_percent_worst
+    limit_cells = ["–"] * len(STEP_QUANTITIES)
+    for place, (key, worst) in enumerate(zip(STEP_QUANTITIES, worst_values, strict=True)):
+        if (limit := limits.get(key)) is not None:
+            limit_cells[place] = f"≤ {limit.value:g}" + ("" if limit.accepts(worst) else MISSED)
     yield SpecificationRow(f"{axis.specification} asks", limit_cells)
     if specification.claims:
         claim_cells = [specification.claim_words(key) or "–" for key in STEP_QUANTITIES]

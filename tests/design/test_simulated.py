@@ -17,7 +17,8 @@ from rtloop.configuration.prepare import prepare
 from rtloop.design.synthesis.specification import DesignOptions, SensorOptions, SimulationOptions
 from rtloop.design.verification.bench import Bench, HardwareModel
 from rtloop.design.verification.judgement import loop_quantities
-from rtloop.design.verification.simulation import SimulatedStep, simulate, step_quantiles
+from rtloop.design.verification.simulated_steps import SimulatedStep
+from rtloop.design.verification.simulation import simulate, step_quantiles
 from rtloop.errors import ConfigError
 from rtloop.foundation.options import Options
 from rtloop.hysteresis.play_model import PlayModel

@@ -116,6 +116,26 @@ def test_a_required_margin_needs_a_known_delay_that_leaves_some() -> None:
         require_margins(replace(asking, checks=(replace(asking.checks[0], on_model=None),)))
 
 
+@pytest.mark.parametrize("exchange_us", [100.0, 300.0, 1000.0, MARGIN_US - 20.0, MARGIN_US + 20.0])
+def test_the_delay_of_an_exchange_is_spent_and_forbids_a_run_where_it_is_all(exchange_us: float) -> None:
+    """Delays that a network adds, as the self-test stores them."""
+    asking = prepare(configured(REQUIRED))
+    store_host_delay(asking.configuration, exchange_us=exchange_us)
+    host = load_host_delay(asking.configuration)
+    assert host is not None
+    spent = spent_margin(asking.checks[0], host)
+    assert spent is not None
+    assert (spent.exchange_us, spent.more_us, spent.more_ticks) == pytest.approx(
+        (exchange_us, exchange_us, exchange_us / 100.0)
+    )
+    assert spent.is_spent == (exchange_us > MARGIN_US)
+    if spent.is_spent:
+        with pytest.raises(ConfigError, match=r"require_margin: .* no margin is left"):
+            require_margins(asking)
+    else:
+        require_margins(asking)
+
+
 def test_the_page_of_a_verification_shows_the_delay_of_this_host(folder: Path) -> None:
     paper = ROOT / "deploy" / "paper.toml"
     store_host_delay(load(paper), lateness_us=40.0)

@@ -12,6 +12,7 @@ from rtloop.configuration.axis import LimitsOptions
 from rtloop.configuration.file import parse
 from rtloop.errors import ConfigError
 from rtloop.experiments.derive import derive_configuration
+from rtloop.experiments.largest_amplitudes import largest_step_down, largest_step_up
 from rtloop.experiments.planning import load_stage, plan_runs
 from rtloop.experiments.procedure import UnsuitableLoop
 from rtloop.experiments.registry import EXPERIMENTS, parse_parameters
@@ -136,7 +137,7 @@ def test_a_step_has_room_for_its_commands_and_those_of_the_step_back() -> None:
     assert model.step_peak is not None
     assert model.step_reversal is not None
     peak, reversal = max(model.step_peak, 1.1), max(model.step_reversal, 0.1)
-    up_um, down_um = stage.largest_step.magnitude, stage.largest_step_down.magnitude
+    up_um, down_um = largest_step_up(stage).magnitude, largest_step_down(stage).magnitude
     commands = [(peak * up_um, -reversal * up_um), (-peak * down_um, reversal * down_um)]
     plays = Plays()
     drives_v = [plays.drive_to(command) for pair in commands for command in pair]
@@ -147,12 +148,12 @@ def test_a_step_has_room_for_its_commands_and_those_of_the_step_back() -> None:
 def test_the_step_back_limits_a_step_where_the_other_side_is_short() -> None:
     """At -0.5 V: by plays, the command of the step back needs all of it, and the step itself less than 10 V."""
     stage = setting(drive_min_v=-0.5)
-    up_um = stage.largest_step.magnitude
+    up_um = largest_step_up(stage).magnitude
     plays = Plays()
     peak_v, back_v = plays.drive_to(1.1 * up_um), plays.drive_to(-0.1 * up_um)
     assert peak_v < 0.9 * HIGHEST_V
     assert back_v == pytest.approx(-0.5, abs=1e-6)
-    assert "step back goes 0.1 times as far beyond 0" in stage.largest_step.reason
+    assert "step back goes 0.1 times as far beyond 0" in largest_step_up(stage).reason
 
 
 def test_equal_sides_scale_all_levels_by_one_factor() -> None:
@@ -185,3 +186,85 @@ def test_the_plan_of_a_stage_stores_what_was_reduced(tmp_path: Path) -> None:
     (planned,), skipped = plan_runs(experiments, parse_parameters(experiments, []), stage, tmp_path)
     assert skipped == {}
     assert '"reduced": ["steps.levels_um: ' in planned.configuration.text.partition("\n")[0]
+
+
+ONE_SIDED = STAGE.replace(f"drive_min_v = {LOWEST_V}", "drive_min_v = 0.0")
+
+
+def middle_um() -> float:
+    """Middle of the positions that the plays reach again and again between 0 and 10 V."""
+    return float(np.mean(curve([HIGHEST_V, 0.0])))
+
+
+def recorded_one_sided(name: str, folder: Path, **options: Any) -> Path:
+    """The recording of an experiment on a drive of 0 … 10 V, fitted and planned as the command does."""
+    (folder / "stage.toml").write_text(ONE_SIDED, encoding="utf-8")
+    stage, experiment = load_stage(folder / "stage.toml", None), EXPERIMENTS[name]
+    (planned,), skipped = plan_runs([experiment], {name: experiment.options.model_validate(options)}, stage, folder)
+    assert skipped == {}
+    (path,) = record(folder / f"{name}.mcap", planned.configuration.text, planned.run.timeline.ticks)
+    return path
+
+
+@pytest.mark.parametrize("name", [name for name in EXPERIMENTS if name != "characterise"])
+def test_every_experiment_moves_within_a_drive_of_one_sign(name: str) -> None:
+    """By plays: each reference in µm needs a drive of 0 … 10 V, and those in V lie within it."""
+    experiment, stage = EXPERIMENTS[name], setting(drive_min_v=0.0)
+    options = experiment.options(**({"resonance_percent": 0.0} if name == "scan" else {}))
+    run = experiment.runs(experiment.fit_options(options, stage), stage)[-1]
+    plays, ends_v = Plays(), []
+    for segment, reference in zip(run.timeline.segments, run.timeline.references, strict=True):
+        middle, half = reference.get("value", reference.get("offset")), reference.get("amplitude", 0.0)
+        levels = reference.get("levels") or ([middle + half, middle - half] if middle is not None else [])
+        if reference["kind"] == "table":
+            levels = run.tables[reference["file"]][:, 0].tolist()
+        if segment.label == "approach":  # a half cycle, from 0 up
+            levels = levels[:1]
+        ends_v += levels if segment.mode == "raw" else [plays.drive_to(level) for level in levels]
+    assert min(ends_v) > -1e-6
+    assert max(ends_v) < HIGHEST_V + 1e-6
+    assert max(ends_v) > 4.0
+
+
+def test_the_way_to_the_middle_is_slow_and_ends_there() -> None:
+    stage = setting(drive_min_v=0.0)
+    assert stage.middle.um == pytest.approx(middle_um(), rel=0.005)
+    assert Plays().move(stage.middle.v) == pytest.approx(stage.middle.um)
+    (run,) = EXPERIMENTS["harmonic"].runs(EXPERIMENTS["harmonic"].options(frequencies_hz=(1.0,)), stage)
+    timeline = Timeline(RATE_HZ)
+    count = next(k for k, segment in enumerate(run.timeline.segments) if segment.mode != "raw")
+    timeline.segments, timeline.references = run.timeline.segments[:count], run.timeline.references[:count]
+    drive_v = drive(timeline)
+    assert drive_v[0] == pytest.approx(0.0, abs=1e-9)
+    assert np.abs(np.diff(drive_v)).max() < 0.01
+    assert drive_v.max() < 2 * stage.middle.v
+
+
+def test_steps_on_a_drive_of_one_sign_are_analysed_about_the_middle(tmp_path: Path) -> None:
+    path = recorded_one_sided("steps", tmp_path, dwell_s=0.05)
+    signals = load_recording(path)
+    assert signals["x_drive_v"].min() >= 0.0
+    (section,) = make_report(load_runs([path])).content["experiments"]
+    assert section["problem"] is None
+    rows = {row["quantity"]: row for row in section["rows"]}
+    assert rows["static error, median"]["run"] < 1.0
+    assert rows["settling time to 5 %, median"]["mark"] == "good"
+    assert section["middle_um"] == pytest.approx(middle_um(), rel=0.005)
+    assert section["notes"][0].startswith(f"The drive has one sign: the experiment moves about {section['middle_um']:g} µm")
+    (run,) = load_runs([path])
+    for name in ("reference_um", "position_um", "command_um"):
+        assert run.signal(name) + section["middle_um"] == pytest.approx(signals[f"x_{name}"])
+    assert run.signal("drive_v") == pytest.approx(signals["x_drive_v"])
+
+
+def test_compensation_on_a_drive_of_one_sign_agrees_with_its_model(tmp_path: Path) -> None:
+    """The rig has the plays of the inverse: nothing is left, and the model says so, memory of the way there included."""
+    path = recorded_one_sided("compensation", tmp_path, frequency_hz=4.0)
+    (section,) = make_report(load_runs([path])).content["experiments"]
+    assert section["problem"] is None
+    rows = {row["quantity"]: row for row in section["rows"]}
+    low_um, high_um = sorted(curve([HIGHEST_V, 0.0]))
+    assert section["parameters"]["amplitude_um"] > 0.9 * (high_um - low_um) / 2 / 1.02
+    assert rows["largest |v − y|"]["model"] < 0.01
+    assert rows["h/H after compensation"]["model"] < 0.01
+    assert rows["ρ, slope of y over v"]["run"] == pytest.approx(1.0, abs=0.01)

@@ -9,12 +9,12 @@ import sys
 from rich.console import Console
 from rich.table import Table
 
-from tests.faults import clock, hardware, laws, outputs, processes, requests, storage
+from tests.faults import clock, hardware, laws, outputs, processes, recovery, requests, storage
 from tests.faults.fault import Row, measure
 
 FAULTS = (
     *(*processes.FAULTS, *hardware.FAULTS, *storage.FAULTS),
-    *(*requests.FAULTS, *clock.FAULTS, *outputs.FAULTS, *laws.FAULTS),
+    *(*requests.FAULTS, *clock.FAULTS, *outputs.FAULTS, *laws.FAULTS, *recovery.FAULTS),
 )
 COLUMNS = ("fault", "what must happen", "safe after (host stalled)", "lost / executed",
            "largest |drive|; step, change in 1 ms (allowed)", "verdict")  # fmt: skip

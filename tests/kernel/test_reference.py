@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from pydantic import TypeAdapter
 
-from rtloop.configuration.axis import ReferenceOptions
+from rtloop.configuration.reference_options import ReferenceOptions
 from rtloop.configuration.references import TableOfSamples, extent, generator_values
 from rtloop.drivers.base import Channel
 from rtloop.foundation.native.compiled import jit

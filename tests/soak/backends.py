@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -20,11 +21,13 @@ from rtloop.recording.views.steps import step_metrics
 from rtloop.workbench.tables import table
 from tests.drivers.can_bench import GROUP, free_port
 from tests.drivers.installing import install
+from tests.drivers.node_bench import free_udp_port
 from tests.one_axis import one_axis
 
 ROOT = Path(__file__).resolve().parents[2]
 DURATION_S = 8.0
 WIDTH = 140
+PATIENT = "hold_ticks = 1000\nerror_limit = 1000000\nwatchdog_ms = 1000\nwait_s = 60\n"
 LAW = """
 [loop]
 rate_hz = {rate_hz}
@@ -46,10 +49,15 @@ class Backend(NamedTuple):
     channels: tuple[str, str] = ("adc0", "dac0")
     board: tuple[str, ...] | None = None
     rates_hz: tuple[int, ...] = (2_000, 10_000)
+    program: tuple[str, ...] | None = None
+    """A node with a rig of its own, in place of a board."""
 
 
 def backends(folder: Path) -> list[Backend]:
-    """The four kinds that can run on any machine."""
+    """The kinds that can run on any machine, and the node in C where there is a compiler.
+
+    A node on a busy machine answers late now and then: its limits are those at which a tick is lost.
+    """
     bus = f'interface = "udp_multicast"\nchannel = "{GROUP}"\nsettings = {{ port = {free_port()}, hop_limit = 0 }}\n'
     return [
         Backend("sim", 'kind = "sim"\n'),
@@ -57,19 +65,49 @@ def backends(folder: Path) -> list[Backend]:
         Backend("can", f'kind = "can"\n{bus}hold_ticks = 800\nwatchdog_ms = 1000\nwait_s = 60\n',
                 board=("hil", "serve", "--can"), rates_hz=(2_000,)),
         Backend("third party", 'kind = "bench_card"\n', channels=("in", "out")),
+        Backend("udp", f'kind = "udp"\n{address(free_udp_port())}{PATIENT}', board=("hil", "serve", "--udp"),
+                rates_hz=(2_000,)),
+        Backend("serial", f'kind = "serial"\ndevice = "{folder}/tty"\n{PATIENT}', board=("hil", "serve", "--serial"),
+                rates_hz=(2_000,)),
+        *c_nodes(folder),
+    ]  # fmt: skip
+
+
+def address(port: int) -> str:
+    """Options of a node at a port of this computer."""
+    return f'host = "127.0.0.1"\nport = {port}\n'
+
+
+def c_nodes(folder: Path) -> list[Backend]:
+    """The node in C, compiled below the folder, behind UDP and behind a pseudo-terminal; none without a compiler."""
+    if not (shutil.which("cc") and shutil.which("make")):
+        return []
+    build = folder / "node"
+    subprocess.run(["make", "-s", "-C", ROOT / "deploy/node", "all", f"BUILD={build}"], check=True)
+    program, port, line = (str(build / "rtloop-node"), "--loopback"), free_udp_port(), f"{folder}/tty-c"
+    channels = (
+        "digital_inputs = 4\ndigital_outputs = 4\ninput_range_v = [-10.0, 9.9997]\noutput_range_v = [-10.0, 9.9997]\n"
+    )
+    return [
+        Backend("udp, node in C", f'kind = "udp"\n{address(port)}{channels}{PATIENT}',
+                program=(*program, "--port", str(port))),
+        Backend("serial, node in C", f'kind = "serial"\ndevice = "{line}"\n{channels}{PATIENT}',
+                program=(*program, "--pty", line)),
     ]  # fmt: skip
 
 
 @contextmanager
-def beside(arguments: tuple[str, ...] | None, config: Path, environment: dict[str, str]) -> Iterator[None]:
+def beside(backend: Backend, config: Path, environment: dict[str, str]) -> Iterator[None]:
     """A board or node as a process of its own, for as long as it is needed."""
-    if arguments is None:
+    if backend.board is None and backend.program is None:
         yield
         return
-    command = [sys.executable, "-m", "rtloop", *arguments, str(config)]
-    with subprocess.Popen(command, env=environment, stderr=subprocess.PIPE, text=True) as process:
-        assert process.stderr is not None
-        process.stderr.readline()  # it says that it is there
+    command = backend.program or [sys.executable, "-m", "rtloop", *(backend.board or ()), str(config)]
+    pipes = {"stdout" if backend.program else "stderr": subprocess.PIPE}
+    with subprocess.Popen(command, env=environment, text=True, **pipes) as process:
+        said_by = process.stdout or process.stderr
+        assert said_by is not None
+        said_by.readline()  # it says that it is there
         yield
         process.send_signal(signal.SIGTERM)
 
@@ -80,7 +118,7 @@ def measure(backend: Backend, rate_hz: int, folder: Path, environment: dict[str,
     wiring = f'[driver.channels.x]\ninput = "{source}"\noutput = "{sink}"\num_per_v = 10.0\n'
     config = folder / f"{backend.name.replace(' ', '-')}.toml"
     config.write_text(f"{LAW.format(rate_hz=rate_hz, axis=one_axis(60.0))}[driver]\n{backend.section}{wiring}")
-    with beside(backend.board, config, environment):
+    with beside(backend, config, environment):
         summary = said(environment, "run", config, "--duration", DURATION_S, "--out", folder / "recordings")
     verdict = said(environment, "replay", summary["recording"])
     recording = rtloop.load(summary["recording"])

@@ -34,7 +34,7 @@ _TRIP_REMEDIES = {
     "frozen": "The reading stood still while the drive moved: look after the sensor and its wires.",
 }
 _OTHER_REMEDY = "A smaller drive does not prevent this trip: see the cause in `rtloop info`, and record again."
-"""What prevents a trip, by its cause, and for all other causes."""
+"""Sentences that tell how to avoid a trip, by its cause, and the one for all other causes."""
 PLATEAU_TICKS, PLATEAU_JUMP = 4, 10.0
 """A plateau of PLATEAU_TICKS or more is clipped too if a jump of PLATEAU_JUMP usual changes begins or ends it."""
 

@@ -51,7 +51,7 @@ class FrequencyResponse:
 class Agreement:
     """Model against measurement where it can be trusted: relative deviations of the complex response, and the peaks.
 
-    `resolution_hz` is that of the measurement.
+    `resolution_hz` is the measurement's resolution.
     """
 
     from_hz: float

@@ -118,14 +118,14 @@ def scale_hysteresis(model: PlayModel, gain: float) -> PlayModel:
     return PlayModel(model.thresholds, gain * model.weights)
 
 
-class IdentifiedSections(NamedTuple):
-    """Sections of a file: the dynamics, and the actuator's hysteresis, None where the file has none."""
+class PlantSections(NamedTuple):
+    """Sections of an axis in a file: its dynamics, and the actuator's hysteresis, None where the file has none."""
 
     model: ModelOptions
     feedforward: PrandtlIshlinskiiOptions | None
 
 
-def read_identified(path: Path, axis: str | None = None) -> IdentifiedSections:
+def read_identified(path: Path, axis: str | None = None) -> PlantSections:
     """Read [axis.model] and, where there is one, [axis.feedforward] from a file: as `identify` wrote it, or of axis
     `axis` (None: first) of a configuration.
 
@@ -136,7 +136,7 @@ def read_identified(path: Path, axis: str | None = None) -> IdentifiedSections:
     if "model" not in table:
         raise _missing_section(source, "model", axis)
     feedforward = _validated(PrandtlIshlinskiiOptions, table, "feedforward", source) if "feedforward" in table else None
-    return IdentifiedSections(_validated(ModelOptions, table, "model", source), feedforward)
+    return PlantSections(_validated(ModelOptions, table, "model", source), feedforward)
 
 
 def read_feedforward(path: Path, axis: str | None = None) -> PrandtlIshlinskiiOptions:
@@ -159,7 +159,7 @@ def parse_feedforward(content: str, source: str, axis: str | None = None) -> Pra
 
 
 def _axis_table(content: str, source: str, axis: str | None) -> dict[str, Any]:
-    """Return the table [axis], or of several the one of `axis` (None: first); {} without one.
+    """Return the table [axis], or, of several, the table of axis `axis` (None: first); {} without one.
 
     Raises ConfigError for text that is no TOML.
     """

@@ -66,27 +66,27 @@ def draw_dynamics(fit: DynamicsFit, run: Excitation, measured: FrequencyResponse
     """
     figure = create_picture(13, 8)
     grid = figure.add_gridspec(6, 2)
-    whole, zoom, difference = (figure.add_subplot(grid[row : row + 2, 0]) for row in (0, 2, 4))
+    full, zoom, difference = (figure.add_subplot(grid[row : row + 2, 0]) for row in (0, 2, 4))
     magnitude = figure.add_subplot(grid[:3, 1])
     phase = figure.add_subplot(grid[3:, 1], sharex=magnitude)
-    _draw_in_time(fit, run, whole, zoom, difference)
+    _draw_in_time(fit, run, full, zoom, difference)
     _draw_over_frequency(fit, run, measured, magnitude, phase, input_unit)
     return figure
 
 
-def _draw_in_time(fit: DynamicsFit, run: Excitation, whole: Any, zoom: Any, difference: Any) -> None:
-    """Draw measured and modelled position, a part of them, and their difference over time."""
+def _draw_in_time(fit: DynamicsFit, run: Excitation, full: Any, zoom: Any, difference: Any) -> None:
+    """Draw measured and modelled position over time in full, a part of them, and their difference, in a panel each."""
     residual_um = residual_noise(fit.model, run) if isinstance(run, LoopExcitation) else None
     if residual_um is None:
         residual_um = run.position_um - run.position_um[0] - fit.model.simulate_output(run.input)
     modelled = run.position_um - residual_um
     time_s = np.arange(run.input.size) * run.period_s
     start, end = _zoom_range(fit, run)
-    for panel, part, unit_s in ((whole, slice(POINTS), 1.0), (zoom, slice(start, end), 1e-3)):
+    for panel, part, unit_s in ((full, slice(POINTS), 1.0), (zoom, slice(start, end), 1e-3)):
         panel.plot(time_s[part] / unit_s, run.position_um[part], color="tab:blue", linewidth=2, label="measured")
         panel.plot(time_s[part] / unit_s, modelled[part], color="0.15", linewidth=0.8, label="model")
-    whole.axvspan(time_s[start], time_s[end - 1], color="tab:orange", alpha=0.3, linewidth=0)
-    label_panel(whole, "time / s", "position / µm", f"fit {fit.fit_percent:.2f} %; shaded: the part below")
+    full.axvspan(time_s[start], time_s[end - 1], color="tab:orange", alpha=0.3, linewidth=0)
+    label_panel(full, "time / s", "position / µm", f"fit {fit.fit_percent:.2f} %; shaded: the part below")
     label_panel(zoom, "time / ms", "position / µm", "part of it", legend=False)
     difference.plot(time_s[:POINTS], residual_um[:POINTS], color="tab:red", linewidth=0.6)
     rms_um = float(np.sqrt(np.mean(residual_um**2)))
@@ -100,9 +100,9 @@ def _zoom_range(fit: DynamicsFit, run: Excitation) -> tuple[int, int]:
     """
     slowest_hz = min((mode.frequency_hz for mode in fit.modes if mode.frequency_hz > 0), default=np.inf)
     length = min(max(round(ZOOM_PERIODS / (slowest_hz * run.period_s)), LEAST_ZOOM), run.input.size, POINTS)
-    most = min(run.input.size, POINTS) - length
-    largest_change = int(np.argmax(np.abs(np.diff(run.input[: most + length], prepend=run.input[0]))))
-    start = min(max(largest_change - length // 20, 0), most)
+    latest_start = min(run.input.size, POINTS) - length
+    largest_change = int(np.argmax(np.abs(np.diff(run.input[: latest_start + length], prepend=run.input[0]))))
+    start = min(max(largest_change - length // 20, 0), latest_start)
     return start, start + length
 
 

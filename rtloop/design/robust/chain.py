@@ -229,7 +229,7 @@ def _candidate_designs(design: DesignOptions) -> Iterator[DesignOptions]:
 def _add_disturbance(design: DesignOptions) -> DesignOptions:
     """Return `design` with the default disturbance if it has none: otherwise the slowest integrator would suffice.
 
-    A design without a plant is returned as it is.
+    A design without a plant is returned unchanged.
     """
     specification = design.specification
     if specification.disturbance is not None or design.plant is None:

@@ -43,7 +43,7 @@ SOLVER_TOLERANCE = 1e-6
 
 class Bounds(NamedTuple):
     """x ≥ −undershoot after a unit step; v within `low_um` … `high_um` for steps by up to `step_um` between levels of
-    `lowest_um` … step_um.
+    `lowest_um` … `highest_um`.
     """
 
     undershoot: float
@@ -52,13 +52,19 @@ class Bounds(NamedTuple):
     low_um: float
     high_um: float
 
+    @property
+    def highest_um(self) -> float:
+        """Highest level: one step above the lowest one, or above 0 if that is negative."""
+        return max(self.lowest_um, 0.0) + self.step_um
+
     def command_limits(self, static: Real) -> tuple[Real, Real]:
         """Return least and largest v per unit step such that v fits from any level to any level, in the shape of
         `static`, v/x at rest.
         """
-        step, lowest = self.step_um, self.lowest_um
-        low = np.maximum(self.low_um - lowest * static, step * static - self.high_um) / step
-        return low, np.minimum(self.high_um, (lowest + step) * static - self.low_um) / step
+        step, lowest, highest = self.step_um, self.lowest_um, self.highest_um
+        low = np.maximum(self.low_um - lowest * static, highest * static - self.high_um) / step
+        high = np.minimum(self.high_um - (highest - step) * static, (lowest + step) * static - self.low_um) / step
+        return low, high
 
 
 class Taps(NamedTuple):

@@ -118,7 +118,7 @@ def provenance(robust: RobustDesign, design: DesignOptions, source: str, text: s
 
 
 def _replace_in_axis(text: str, axis: str, parts: dict[str, Any], comments: list[str]) -> str:
-    """Return `text` with `parts` in the named axis and `comments` in place of those of the same command.
+    """Return `text` with `parts` in the named axis and `comments` in place of older comments by the same command.
 
     Raises ValueError for an unknown axis.
     """

@@ -299,7 +299,8 @@ def _describe_relaxations(subject: Subject) -> str:
     options, bounds, tick_ms = subject.options, subject.bounds, 1e3 * subject.controller.period_s
     far = 1e3 * max(abs(bounds.low_um), abs(bounds.high_um))
     nominal = options.scenarios.model_copy(update={"resonance_percent": 0.0, "damping": (1.0,), "gain_percent": 0.0})
-    half = bounds._replace(step_um=bounds.step_um / 2, lowest_um=bounds.lowest_um / 2)
+    lowest_um = bounds.lowest_um / 2 if bounds.lowest_um <= 0 else bounds.lowest_um + bounds.step_um / 4
+    half = bounds._replace(step_um=bounds.step_um / 2, lowest_um=lowest_um)
     variants = {
         f"specification.command.reference_um = {half.step_um:g} instead of {bounds.step_um:g}": replace(
             subject, bounds=half

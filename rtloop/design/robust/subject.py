@@ -96,19 +96,22 @@ def step_bounds(axis: AxisOptions, model: ModelOptions, design: DesignOptions) -
     """Return the bounds of a step of `specification.command.reference_um`, and the levels that it leads from and to.
 
     A range of v with equal sides gives levels to both sides of 0; so does one with unequal sides if the shorter one has
-    room for `command_um`. Otherwise the levels lie between 0 and the reference on the longer side. Raises ValueError,
-    naming the key, for a reference that v cannot hold.
+    room for `command_um`. Otherwise the levels lie between 0 and the reference on the longer side, or in the middle of
+    a range without 0, which is that of a drive of one sign. Raises ValueError, naming the key, for a reference that v
+    cannot hold.
     """
     command, undershoot = design.specification.command, design.shape.undershoot_percent / 100
     if command is None:
         raise ValueError(missing_requirements(design.specification)[0])
     step_um, (low_um, high_um) = command.reference_um, command_range_um(axis)
     static = 1 / abs(model.transfer().dc_gain)
-    if step_um * static > max(-low_um, high_um):
+    has_zero = low_um <= 0 <= high_um
+    largest_um = max(-low_um, high_um) if has_zero else high_um - low_um
+    if step_um * static > largest_um:
         limits = axis.limits
         raise ValueError(
             f"specification.command.reference_um: value is {step_um:g} µm; allowed: up to "
-            f"{max(-low_um, high_um) / static:.4g} µm, because limits.drive_min_v = {limits.lowest_v:g}, "
+            f"{largest_um / static:.4g} µm, because limits.drive_min_v = {limits.lowest_v:g}, "
             f"limits.drive_v = {limits.drive_v:g} and limits.command_um = {limits.command_um:g} allow a command of "
             f"{low_um:.4g} … {high_um:.4g} µm; a smaller value allows faster steps"
         )
@@ -117,7 +120,8 @@ def step_bounds(axis: AxisOptions, model: ModelOptions, design: DesignOptions) -
         return Bounds(undershoot, step_um, -step_um, low_um, high_um)
     if -low_um > high_um:  # a loop and its mirror image have the same taps
         low_um, high_um = -high_um, -low_um
-    return Bounds(undershoot, step_um, 0.0, low_um, high_um)
+    lowest_um = 0.0 if has_zero else (low_um + high_um) / (2 * static) - step_um / 2
+    return Bounds(undershoot, step_um, lowest_um, low_um, high_um)
 
 
 def _controller_fault(check: AxisCheck) -> str:
@@ -128,13 +132,12 @@ def _controller_fault(check: AxisCheck) -> str:
 
 
 def command_range_um(axis: AxisOptions) -> tuple[float, float]:
-    """Return least and largest v in µm: what the drive holds in any order, with its memory, within ±`command_um`.
+    """Return least and largest v in µm that the drive can hold in any order, with its memory, within ±`command_um`.
 
-    For other feedforward than a play model, ±`command_um`. The least is 0 where the drive cannot be negative.
+    For other feedforward than a play model, ±`command_um`; the least is then 0 where the drive cannot be negative.
     """
     limits, law = axis.limits, axis.feedforward
     limit_um = limits.command_um
     if not isinstance(law, PrandtlIshlinskiiOptions):
         return (-limit_um if limits.lowest_v < 0 else 0.0), limit_um
-    low_um, high_um = reachable_range(law.models()[0], limits.lowest_v, limits.drive_v, limit_um)
-    return min(low_um, 0.0), high_um
+    return reachable_range(law.models()[0], limits.lowest_v, limits.drive_v, limit_um)

@@ -234,7 +234,7 @@ class SynthesisOptions(Options):
     largest_loss_percent: float = Field(default=10.0, ge=0)
     """Largest increase of the weighted loop's norm by the reduction."""
     reduction: Literal["residualise", "truncate"] = "residualise"
-    """How the order is reduced: "residualise" keeps the controller's gain at 0 Hz, "truncate" its gain at infinity."""
+    """Reduction of the order: "residualise" keeps the controller's gain at 0 Hz, "truncate" its gain at infinity."""
 
 
 class OutputOptions(Options):
@@ -266,13 +266,13 @@ class DesignOptions(Options):
     """Model of the plant, from command to position; required for synthesis, and for verification of an axis without a
     model."""
     specification: SpecificationOptions = SpecificationOptions()
-    """Requirements on the loop; those that are absent are not judged."""
+    """Requirements on the loop; an absent requirement is not judged."""
     sensor: SensorOptions = SensorOptions()
     """Noise, resolution and bandwidth of the sensor, for predictions of noise and for simulated steps."""
     simulation: SimulationOptions = SimulationOptions()
     """Steps that are simulated with hysteresis, converters and limits."""
     weights: WeightOptions = WeightOptions()
-    """Weights of the H∞ problem in place of those that follow from the requirements."""
+    """Weights of the H∞ problem; by default they follow from the requirements."""
     synthesis: SynthesisOptions = SynthesisOptions()
     """Accepted γ, and order of the reduced controller."""
     controller: OutputOptions = OutputOptions()

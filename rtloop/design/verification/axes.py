@@ -124,7 +124,7 @@ Verifications = dict[str, tuple[Verification, DesignOptions]]
 
 
 def add_simulation(configuration: Configuration, verifications: Verifications) -> Verifications:
-    """Return the verifications with simulated steps of every stable axis; an unstable one stays as it is.
+    """Return the verifications with simulated steps of every stable axis; an unstable one stays unchanged.
 
     If no rig can represent the hardware, every axis gets a warning instead.
     """

@@ -13,10 +13,11 @@ from pathlib import Path
 from typing import Any, NamedTuple, cast
 
 from rtloop.analysis.held_plant import POINTS
-from rtloop.configuration.axis import AxisOptions, HoldOptions, ModelOptions, StepsOptions
+from rtloop.configuration.axis import AxisOptions, ModelOptions
 from rtloop.configuration.checks import delay_ticks
 from rtloop.configuration.file import ChannelOptions, Configuration
 from rtloop.configuration.prepare import prepare
+from rtloop.configuration.reference_options import HoldOptions, StepsOptions
 from rtloop.configuration.references import TableOfSamples, generator_values
 from rtloop.configuration.rig import true_positions
 from rtloop.drivers.sim import SimDriver
@@ -94,8 +95,8 @@ def _place_on_rig(
 ) -> tuple[Configuration, RigOptions]:
     """Return the configuration in closed loop, at rest, without schedule, on a rig, and the rig's options.
 
-    A configured rig is used; otherwise one is made. Raises ValueError for channels beside those of the axes and for an
-    axis without a model.
+    A configured rig is used; otherwise one is made. Raises ValueError for channels that belong to no axis, and for
+    an axis without a model.
     """
     loop = configuration.loop.model_copy(update={"mode": "closed_loop", "enable_input": None, "hold_input": None})
     axes = tuple(axis.model_copy(update={"reference": HoldOptions()}) for axis in configuration.axes)

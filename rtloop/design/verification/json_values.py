@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import asdict
 from typing import Any
 
 from rtloop.analysis.perturbation import PercentRange
 from rtloop.design.verification.verify import Row, ScenarioResults, Verification
+from rtloop.values import to_jsonable
 
 
 def as_dict(verification: Verification) -> dict[str, Any]:
@@ -18,7 +18,7 @@ def as_dict(verification: Verification) -> dict[str, Any]:
     simulated, warnings.
     """
     robustness = verification.robustness
-    return {
+    values = {
         "meets": verification.meets_specification,
         "stable": {
             "continuous": None if verification.continuous is None else verification.continuous.is_stable,
@@ -32,7 +32,7 @@ def as_dict(verification: Verification) -> dict[str, Any]:
             name: {limit_kind: value and _percent(value) for limit_kind, value in ranges.items()}
             for name, ranges in robustness.ranges.items()
         },
-        "delay_margin_us": _number(robustness.delay_us),
+        "delay_margin_us": robustness.delay_us,
         "more_delay_ticks": robustness.delay_ticks,
         "together": None if verification.together is None else verification.together.as_dict(),
         "scenarios": None if verification.scenarios is None else _scenarios(verification.scenarios),
@@ -40,6 +40,7 @@ def as_dict(verification: Verification) -> dict[str, Any]:
         "simulated": None if verification.simulated is None else verification.simulated.as_dict(),
         "warnings": list(verification.warnings),
     }
+    return to_jsonable(values)
 
 
 def _scenarios(scenarios: ScenarioResults) -> dict[str, Any]:
@@ -47,7 +48,7 @@ def _scenarios(scenarios: ScenarioResults) -> dict[str, Any]:
     rows = [
         {
             "name": row.name,
-            "worst": _number(worst_value.value),
+            "worst": worst_value.value,
             "plant": worst_value.plant,
             "met": scenarios.is_met(row, worst_value),
         }
@@ -64,10 +65,10 @@ def _row(row: Row) -> dict[str, Any]:
     return {
         "name": row.name,
         "unit": row.unit,
-        "required": None if limit is None else {"value": _number(limit.value), "at_most": limit.at_most},
-        "continuous": _number(row.continuous),
+        "required": None if limit is None else {"value": limit.value, "at_most": limit.at_most},
+        "continuous": row.continuous,
         "continuous_met": row.is_met(row.continuous),
-        "running": _number(row.running),
+        "running": row.running,
         "running_met": row.is_met(row.running),
         "claim": row.claim or None,
     }
@@ -76,8 +77,3 @@ def _row(row: Row) -> dict[str, Any]:
 def _percent(tolerated: PercentRange) -> list[float | None]:
     """Return [−down, up] in percent; None for an unlimited end."""
     return [None if tolerated.down is None else -tolerated.down, tolerated.up]
-
-
-def _number(value: float | None) -> float | None:
-    """Return a finite value, otherwise None."""
-    return value if value is not None and math.isfinite(value) else None

@@ -6,19 +6,24 @@ Positions are the true ones, without sensor noise, also between ticks.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 from functools import reduce
 from operator import or_
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from rtloop.analysis.held_plant import POINTS
 from rtloop.configuration.axis import AxisOptions
-from rtloop.design.synthesis.specification import QUANTITIES, DesignOptions
+from rtloop.design.synthesis.specification import DesignOptions
 from rtloop.design.verification.bench import Bench
-from rtloop.design.verification.judgement import Limit, required_limits
+from rtloop.design.verification.judgement import required_limits
+from rtloop.design.verification.simulated_steps import (
+    JUDGED_QUANTITIES,
+    STEP_QUANTILE,
+    SimulatedStep,
+    SimulationResult,
+)
 from rtloop.foundation.arrays import Real
 from rtloop.hysteresis.reach import PositionRange, can_hold, reachable_range
 from rtloop.recording.views.steps import measure_steps
@@ -30,102 +35,11 @@ REST_S, SETTLING_S = 2.0, 0.5
 """Duration of the evaluation at rest, and of the settling before it."""
 REST_PLACES = (0.03, 0.12, 0.24, 0.48)
 """Levels for the evaluation at rest, as fractions of the range."""
-CYCLES, DRAWS, MORE_DRAWS, STEP_QUANTILE = 12, 2, 8, 0.95
+CYCLES, DRAWS, MORE_DRAWS = 12, 2, 8
 """Repetitions of four steps in a run; number of runs, each with its own noise; number of runs in all if noise
-determines the figures; quantile of the steps that is reported.
+determines the figures.
 """
-LARGEST_SPREAD, SPREAD_PERCENT = 0.1, 0.5
-"""Spread beyond which noise determines a figure: fraction of a settling time, and percentage points."""
-JUDGED_QUANTITIES = ("overshoot_percent", "settling_ms", "static_error_percent")
-"""Specified figures of a step, in the order of `measure_steps`."""
 LIMIT_FLAGS = {Flag.COMMAND_LIMITED: "command", Flag.DRIVE_LIMITED: "drive", Flag.SLEW_LIMITED: "slew"}
-
-
-class SimulatedStep(NamedTuple):
-    """Figures of the steps of one height, up and down: the STEP_QUANTILE quantile, the median (`typical`, in the
-    order of JUDGED_QUANTITIES), active limits, trips, and the lowest and highest level (`levels_um`).
-
-    A quantile, because the worst of a few steps changes from run to run: noise decides when a loop leaves its dead
-    band.
-    """
-
-    height_um: float
-    overshoot_percent: float
-    settling_ms: float
-    static_error_percent: float
-    typical: tuple[float, ...]
-    peak_drive_v: float
-    limited: tuple[str, ...]
-    trips: tuple[str, ...]
-    levels_um: tuple[float, float] = (0.0, 0.0)
-
-    def is_repeatable(self, name: str) -> bool:
-        """Whether the quantile of figure `name` exceeds the median by at most SPREAD_PERCENT points, or LARGEST_SPREAD
-        of itself for the settling time: noise does not decide it. An infinite quantile needs an infinite median.
-        """
-        quantile, median = getattr(self, name), self.typical[JUDGED_QUANTITIES.index(name)]
-        if math.isinf(quantile):
-            return math.isinf(median)
-        return quantile - median <= (SPREAD_PERCENT if name.endswith("percent") else LARGEST_SPREAD * quantile)
-
-
-@dataclass(frozen=True)
-class SimulationResult:
-    """Simulated steps, heights outside the range (`omitted_heights_um`), and rms noise of position x and command v at
-    rest.
-
-    `truth` names the simulated system, `command_range` has the static commands that are possible. `required` has the
-    limits, which count only if `is_judged`.
-    """
-
-    truth: str
-    steps: tuple[SimulatedStep, ...]
-    omitted_heights_um: tuple[float, ...]
-    command_range: PositionRange
-    noise_x_nm: float
-    noise_v_nm: float
-    required: Mapping[str, Limit]
-    is_judged: bool
-
-    def is_met(self, step: SimulatedStep, name: str) -> bool | None:
-        """Whether a step meets the limit on figure `name`, judged or not; None without limit."""
-        return self.required[name].accepts(getattr(step, name)) if name in self.required else None
-
-    @property
-    def violations(self) -> list[str]:
-        """Requirements that count and are not met: `missed`, or [] without `is_judged`."""
-        return self.missed if self.is_judged else []
-
-    @property
-    def missed(self) -> list[str]:
-        """Requirements that simulated steps do not meet, a text for each height; whatever `is_judged` says."""
-        return [
-            f"{QUANTITIES[name][0]} of {step.height_um:g} µm steps"
-            for step in self.steps
-            for name in JUDGED_QUANTITIES
-            if self.is_met(step, name) is False
-        ] + [f"steps of {step.height_um:g} µm, which trip" for step in self.steps if step.trips]
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return the result for JSON: `truth`, `steps`, `left_out_um`, `range_um`, `noise_x_nm`, `noise_v_nm`,
-        `judged`.
-        """
-        steps = [
-            {
-                **step._asdict(),
-                "met": {name: self.is_met(step, name) for name in JUDGED_QUANTITIES if name in self.required},
-            }
-            for step in self.steps
-        ]
-        return {
-            "truth": self.truth,
-            "steps": steps,
-            "left_out_um": list(self.omitted_heights_um),
-            "range_um": list(self.command_range),
-            "noise_x_nm": self.noise_x_nm,
-            "noise_v_nm": self.noise_v_nm,
-            "judged": self.is_judged,
-        }
 
 
 def simulate(bench: Bench, axis: AxisOptions, slowest_s: float, design: DesignOptions) -> SimulationResult:
@@ -180,19 +94,21 @@ def _levels(axis: AxisOptions, command_range: PositionRange, height_um: float) -
     """Return the levels in µm of one cycle of steps of a height; None for a height that the range has no room for.
 
     To both sides of 0 where the drive allows it. A range with unequal sides also has room for steps between 0 and a
-    level of its longer side, and for larger ones in its middle. Raises ValueError for a hysteresis model without
-    inverse.
+    level of its longer side, and for larger ones in its middle; a drive of one sign has them all there, away from the
+    drive's end at 0 V and from the remanence. Raises ValueError for a hysteresis model without inverse.
     """
     limits, actuator, (low_um, high_um) = axis.limits, axis.feedforward.actuator(), command_range
-    if limits.lowest_v == 0.0:  # steps from 0 are the usual ones, although the memory leaves a remanence there
-        return 2 * (height_um, 0.0) if height_um <= high_um else None
     middle_um = (low_um + high_um) / 2
     candidates = [
         (height_um, 0.0, -height_um, 0.0),
         2 * (math.copysign(height_um, middle_um), 0.0),
         2 * (middle_um + height_um / 2, middle_um - height_um / 2),
     ]
-    for levels in candidates if low_um != -high_um else candidates[:1]:
+    if low_um == -high_um:
+        candidates = candidates[:1]
+    elif limits.lowest_v == 0.0:
+        candidates = candidates[2:] if height_um <= command_range.span_um else []
+    for levels in candidates:
         if max(map(abs, levels)) <= limits.command_um and can_hold(actuator, levels, limits.lowest_v, limits.drive_v):
             return levels
     return None
@@ -223,7 +139,7 @@ def _run_steps(bench: Bench, axis: str, levels_um: tuple[float, ...], dwell_s: f
 
 
 def _summarise_steps(height_um: float, levels_um: tuple[float, ...], runs: Sequence[_SteppedRecord]) -> SimulatedStep:
-    """Return the figures of all steps of one height from several runs; limits and trips are those of any tick."""
+    """Return the figures of all steps of one height from several runs; limits and trips count in any tick."""
     steps = np.vstack([run.steps for run in runs])
     all_flags = reduce(or_, (run.flags for run in runs))
     overshoot_percent, settling_ms, static_error_percent = step_quantiles(steps)

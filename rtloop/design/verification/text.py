@@ -7,7 +7,7 @@ import math
 from rtloop.analysis.coupled_loop import SimultaneousMargins
 from rtloop.analysis.perturbation import PercentRange
 from rtloop.design.synthesis.specification import QUANTITIES
-from rtloop.design.verification.simulation import JUDGED_QUANTITIES, STEP_QUANTILE, SimulatedStep
+from rtloop.design.verification.simulated_steps import JUDGED_QUANTITIES, STEP_QUANTILE, SimulatedStep
 from rtloop.design.verification.verify import Row, Verification
 
 CONTINUOUS_HEADING, RUNNING_HEADING = "C(s), not judged", "as it runs C(z)"
@@ -171,12 +171,32 @@ def simulation_notes(verification: Verification) -> list[str]:
     if result.omitted_heights_um:
         heights = ", ".join(f"{height:g}" for height in result.omitted_heights_um)
         notes.append(f"Left out: steps of {heights} µm; the command's range is {result.command_range}.")
+    notes += _static_error_notes(verification)
     if result.required and not result.is_judged:
         notes.append("These verdicts do not count for the conclusion; set [simulation] judged = true to count them.")
     return notes
 
 
-def together(margins: SimultaneousMargins) -> list[tuple[str, str]]:
+def _static_error_notes(verification: Verification) -> list[str]:
+    """Return a sentence on the static error of the linear loop where a simulated step misses its limit because of it.
+
+    The error is a part of the position: away from 0 it is a larger part of a small step.
+    """
+    result = verification.simulated
+    percent = next((row.running for row in verification.rows if row.name == "static_error_percent"), None)
+    for step in result.steps if result and percent else ():
+        farthest_um = max(map(abs, step.levels_um))
+        step_percent = percent * farthest_um / step.height_um
+        if result.is_met(step, "static_error_percent") is False and 2 * step_percent > step.static_error_percent:
+            return [
+                f"The loop has no integrator: it leaves {percent:.3g} % of the position, {percent / 100 * farthest_um:.3g}"
+                f" µm at {farthest_um:.4g} µm, which is {step_percent:.3g} % of a step of {step.height_um:g} µm. "
+                "`rtloop design auto --robust` designs a controller with an integrator."
+            ]
+    return []
+
+
+def simultaneous_rows(margins: SimultaneousMargins) -> list[tuple[str, str]]:
     """Return rows (label, text) of the margins of all axes of a controller together; one row "stable", "NO" if
     unstable.
     """

@@ -31,7 +31,7 @@ from rtloop.design.verification.robustness import (
     tolerated_shift,
     worst_values,
 )
-from rtloop.design.verification.simulation import SimulationResult
+from rtloop.design.verification.simulated_steps import SimulationResult
 from rtloop.linear.discretise import DiscreteController
 from rtloop.linear.transfer import Transfer
 from rtloop.supervision.host_delay import SpentMargin

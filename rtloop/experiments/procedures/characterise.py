@@ -65,8 +65,8 @@ def analyse(recordings: Sequence[RecordedRun], _: CharacteriseOptions) -> Analys
     start = rest_segment.start_tick
     model = model_output(run.actuator_model, drive)[start:-1] * run.static_gain  # depolarising leaves a memory
     drive, position = drive[start:-1], position[start + 1 :]
-    rest = slice(0, rest_segment.ticks // 2)
-    position, model = position - position[rest].mean(), model - model[rest].mean()
+    at_rest = slice(0, rest_segment.ticks // 2)
+    position, model = position - position[at_rest].mean(), model - model[at_rest].mean()
     shapes: dict[str, tuple[LoopShape, LoopShape]] = {}
     curves: dict[str, Any] = {}
     for segment in run.segments_labelled("half", "major", "minor"):
@@ -84,11 +84,11 @@ def analyse(recordings: Sequence[RecordedRun], _: CharacteriseOptions) -> Analys
     major, model_major = shapes["major"]
     half, minor = shapes["half"], shapes["minor"]
     fit_percent, near_um = 100 * float(np.abs(error).max()) / major.width, TOLERANCE_RATIO * model_major.width
-    whole = f"drive {ranges['major']}"
+    drive_text = f"drive {ranges['major']}"
     rows = [
-        run.row("hysteresis_percent", f"h/H, {whole}", "%", major.percent, model_major.percent, TOLERANCE_PERCENT),
-        run.row("hysteresis_um", f"h, {whole}", "µm", major.height, model_major.height, near_um),
-        run.row("range_um", f"H, {whole}", "µm", major.width, model_major.width, near_um),
+        run.row("hysteresis_percent", f"h/H, {drive_text}", "%", major.percent, model_major.percent, TOLERANCE_PERCENT),
+        run.row("hysteresis_um", f"h, {drive_text}", "µm", major.height, model_major.height, near_um),
+        run.row("range_um", f"H, {drive_text}", "µm", major.width, model_major.width, near_um),
         run.row("", f"h/H, half of it, {ranges['half']}", "%", half[0].percent, half[1].percent, TOLERANCE_PERCENT),
         run.row("", f"h/H, minor loop, {ranges['minor']}", "%", minor[0].percent, minor[1].percent, TOLERANCE_PERCENT),
         run.row("hysteresis_fit", "largest difference to the model", "% of H", fit_percent, 0.0, FIT_TOLERANCE_PERCENT),
@@ -162,6 +162,5 @@ EXPERIMENT = Experiment(
     analyse,
     draw,
     needs_controller=False,
-    is_bipolar=False,
     size=(11.0, 6.4),
 )

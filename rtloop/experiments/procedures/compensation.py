@@ -9,12 +9,14 @@ import numpy as np
 from pydantic import Field
 
 from rtloop.design.palette import Palette
+from rtloop.experiments.largest_amplitudes import largest_command
 from rtloop.experiments.procedure import Experiment
 from rtloop.experiments.recorded_run import RecordedRun
 from rtloop.experiments.setting import Setting
-from rtloop.experiments.timeline import Run, sine
+from rtloop.experiments.timeline import Run, Segment, sine
 from rtloop.experiments.traces import thin_signals
 from rtloop.experiments.verdict import Analysis
+from rtloop.foundation.arrays import Real
 from rtloop.foundation.options import Options
 from rtloop.hysteresis.loop_shape import loop_shape
 from rtloop.hysteresis.plays import model_output
@@ -27,7 +29,7 @@ class CompensationOptions(Options):
     """Options of the slow sine of the command v."""
 
     amplitude_um: float = Field(default=40.0, gt=0)
-    """Amplitude of the command, reduced by default to what limits and interlocks allow."""
+    """Amplitude of the command, reduced by default to fit limits and interlocks."""
     frequency_hz: float = Field(default=0.1, gt=0)
     """Frequency of the command: slow enough for no lag, fast enough for no creep."""
     cycles: float = Field(default=2.0, ge=1.5)
@@ -58,9 +60,7 @@ def analyse(recordings: Sequence[RecordedRun], options: CompensationOptions) -> 
     offset = position[rest_segment.tick_slice].mean()
     ticks = segment.tick_slice
     v, y = reference[ticks][:-1], (position[ticks][1:] - offset) / run.static_gain
-    model_output_um = model_output(run.actuator_model, drive[rest_segment.start_tick :])[
-        segment.start_tick - rest_segment.start_tick :
-    ][: v.size]
+    model_output_um = _modelled_output(run, drive, rest_segment, segment)[: v.size]
     shape, model_shape = loop_shape(v, y), loop_shape(v, model_output_um)
     steady = slice(int(v.size * 0.5 / options.cycles), None)
     gain = float(v[steady] @ y[steady] / (v[steady] @ v[steady]))
@@ -81,6 +81,17 @@ def analyse(recordings: Sequence[RecordedRun], options: CompensationOptions) -> 
         notes.append("The simulated actuator (truth = \"residual\") was chosen to leave 3.75 % of hysteresis. A "
         "result of 3.75 % shows that rig, inverse and analysis agree; it says nothing about a real stage.")  # fmt: skip
     return Analysis(rows, {"v_y_error": thin_signals(v, y, error)}, notes=notes)
+
+
+def _modelled_output(run: RecordedRun, drive: Real, rest: Segment, segment: Segment) -> Real:
+    """Return the position of [axis.feedforward]'s actuator in a segment and behind it, relative to `rest`, in µm.
+
+    Its memory begins at the rest at 0, or, for a run about another middle, with the recording, before the way there.
+    """
+    start = 0 if run.middle_um else rest.start_tick
+    output_um = model_output(run.actuator_model, drive[start:])
+    rest_um = output_um[rest.start_tick - start : rest.start_tick + rest.ticks - start].mean()
+    return output_um[segment.start_tick - start :] - rest_um
 
 
 def draw(figure: Any, curves: Mapping[str, Any], ink: Palette) -> None:
@@ -104,6 +115,6 @@ EXPERIMENT = Experiment(
     runs,
     analyse,
     draw,
-    limits={"amplitude_um": lambda setting: setting.largest_command},
+    limits={"amplitude_um": largest_command},
     needs_controller=False,
 )

@@ -38,7 +38,7 @@ class DisturbanceOptions(Options):
     amplitude_um: float | None = Field(default=None, gt=0)
     """The largest disturbance of the axis's specification, by default."""
     frequencies_hz: Numbers = (1.0, 2.9, 10.0, 50.0)
-    """Frequencies of the sines, each in a recording of its own."""
+    """Frequencies of the sines, with a recording for each."""
 
 
 def runs(options: DisturbanceOptions, setting: Setting) -> list[Run]:

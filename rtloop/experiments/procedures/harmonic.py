@@ -16,6 +16,7 @@ from pydantic import Field
 
 from rtloop.configuration.schedule import ModeName
 from rtloop.design.palette import Palette
+from rtloop.experiments.largest_amplitudes import largest_swept_sine
 from rtloop.experiments.lockin import response, tone
 from rtloop.experiments.procedure import Experiment
 from rtloop.experiments.procedures.harmonic_promise import REFERENCE_HZ, HarmonicPromise
@@ -62,7 +63,7 @@ class HarmonicOptions(Options):
     """Options of the excitation; the drive alone gets the drive that moves so far at the model's mean gain."""
 
     amplitude_um: float = Field(default=AMPLITUDE_UM, gt=0)
-    """Amplitude of reference and command, reduced by default to what limits and interlocks allow."""
+    """Amplitude of reference and command, reduced by default to fit limits and interlocks."""
     frequencies_hz: Numbers | None = Field(default=None, min_length=1)
     """Frequencies up to beyond the resonance of the axis's model, dense about it, by default."""
     settle_s: float = Field(default=0.3, ge=0)
@@ -202,7 +203,7 @@ def _spacing(hz: Real, at_hz: float) -> float:
 
 
 def bandwidth_hz(sweep: Real) -> float:
-    """Frequency in Hz at which the magnitude first falls 3 dB below that of the lowest frequency.
+    """Frequency in Hz at which the magnitude first falls 3 dB below the magnitude at the lowest frequency.
 
     Interpolated between measured points of a sweep (frequencies, 4); NaN if it does not fall so far.
     """
@@ -266,6 +267,6 @@ EXPERIMENT = Experiment(
     analyse,
     draw,
     defaults={"frequencies_hz": default_frequencies},
-    limits={"amplitude_um": lambda setting: setting.largest_swept},
+    limits={"amplitude_um": largest_swept_sine},
     size=(11.0, 8.0),
 )

@@ -21,6 +21,7 @@ from rtloop.analysis.measured.multisine import HIGHEST_PART, LineGrid, make_grid
 from rtloop.design.identification.axis_recording import UnsuitableData
 from rtloop.design.palette import Palette
 from rtloop.errors import ConfigError
+from rtloop.experiments.largest_amplitudes import largest_swept_sine
 from rtloop.experiments.procedure import Experiment
 from rtloop.experiments.recorded_run import RecordedRun
 from rtloop.experiments.setting import REST_S, Setting
@@ -201,6 +202,6 @@ EXPERIMENT = Experiment(
     runs,
     analyse,
     draw,
-    limits={"amplitude_um": lambda setting: setting.largest_swept},
+    limits={"amplitude_um": largest_swept_sine},
     size=(11.0, 8.0),
 )

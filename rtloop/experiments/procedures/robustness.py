@@ -10,6 +10,7 @@ from pydantic import Field
 
 from rtloop.design.palette import Palette
 from rtloop.design.verification.text import format_range
+from rtloop.experiments.largest_amplitudes import largest_step_up
 from rtloop.experiments.procedure import Experiment
 from rtloop.experiments.recorded_run import RecordedRun
 from rtloop.experiments.setting import Setting
@@ -26,9 +27,9 @@ class RobustnessOptions(Options):
     """Options: shifts of the resonance's frequency in %, and the step of the reference."""
 
     shifts_percent: Numbers = Field(default=(-12.0, -10.0, -8.0, -5.0, -2.0, 0.0, 1.0, 2.0, 3.0, 5.0), min_length=1)
-    """Shifts of the rig's resonance, each in a recording of its own."""
+    """Shifts of the rig's resonance, with a recording for each."""
     step_um: float = Field(default=20.0, gt=0)
-    """Height of the step of the reference, reduced by default to what limits and interlocks allow."""
+    """Height of the step of the reference, reduced by default to fit limits and interlocks."""
     duration_s: float = Field(default=1.0, ge=0.2)
     """Duration of each recording after the step; its last fifth decides whether the step settled."""
 
@@ -172,7 +173,7 @@ EXPERIMENT = Experiment(
     runs,
     analyse,
     draw,
-    limits={"step_um": lambda setting: setting.largest_step},
+    limits={"step_um": largest_step_up},
     needs_rig=True,
     size=(11.0, 5.0),
 )

@@ -9,6 +9,7 @@ import numpy as np
 from pydantic import Field
 
 from rtloop.design.palette import Palette
+from rtloop.experiments.largest_amplitudes import largest_sine
 from rtloop.experiments.lockin import response
 from rtloop.experiments.procedure import Experiment
 from rtloop.experiments.recorded_run import RecordedRun
@@ -27,7 +28,7 @@ class SinesOptions(Options):
     """Options: amplitude and frequencies of the reference, and the number of cycles."""
 
     amplitude_um: float = Field(default=20.0, gt=0)
-    """Amplitude of the reference, reduced by default to what limits and interlocks allow."""
+    """Amplitude of the reference, reduced by default to fit limits and interlocks."""
     frequencies_hz: Numbers = Field(default=(0.1, 1.0, 5.0, 10.0, 20.0, 50.0), min_length=1)
     """Frequencies of the reference, one after the other."""
     cycles: int = Field(default=2, ge=1)
@@ -111,6 +112,6 @@ EXPERIMENT = Experiment(
     runs,
     analyse,
     draw,
-    limits={"amplitude_um": lambda setting: setting.largest_sine},
+    limits={"amplitude_um": largest_sine},
     size=(11.0, 6.4),
 )

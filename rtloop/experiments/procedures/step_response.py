@@ -10,6 +10,7 @@ from pydantic import Field
 
 from rtloop.design.identification.axis_recording import UnsuitableData
 from rtloop.design.palette import Palette
+from rtloop.experiments.largest_amplitudes import largest_part_of_drive
 from rtloop.experiments.linear_model import LinearModel
 from rtloop.experiments.procedure import Experiment
 from rtloop.experiments.recorded_run import RecordedRun
@@ -61,7 +62,7 @@ class ModelResponse(NamedTuple):
 
 def runs(options: StepResponseOptions, setting: Setting) -> list[Run]:
     """Plan rest, then the step."""
-    timeline = setting.timeline("raw")
+    timeline = setting.timeline("raw", uses_whole_drive=True)
     timeline.add("step", "raw", hold(options.part_of_drive * setting.axis.limits.drive_v), options.duration_s)
     return [Run("", timeline)]
 
@@ -131,7 +132,7 @@ def ringing_window(model: LinearModel | None) -> tuple[float, float]:
 def fit_ringing(height: Real, rate_hz: float, window_s: tuple[float, float] = RINGING_S) -> Ringing:
     """Fit c + Re(a e^{(−σ + jω)t}) to the position `height` (n,) since a step, within the window.
 
-    Raises UnsuitableData for fewer than 50 ticks in the window, or nothing faster than MIN_PERIODS in it.
+    Raises UnsuitableData for fewer than 50 ticks in the window, or no motion faster than MIN_PERIODS in it.
     """
     from scipy.optimize import least_squares  # a quarter of a second of import, for one experiment of many
 
@@ -189,7 +190,6 @@ EXPERIMENT = Experiment(
     runs,
     analyse,
     draw,
-    limits={"part_of_drive": lambda setting: setting.largest_part_of_drive},
-    is_bipolar=False,
+    limits={"part_of_drive": largest_part_of_drive},
     needs_controller=False,
 )

@@ -10,6 +10,7 @@ from pydantic import Field
 
 from rtloop.design.identification.axis_recording import UnsuitableData
 from rtloop.design.palette import Palette
+from rtloop.experiments.largest_amplitudes import largest_step_down, largest_step_up
 from rtloop.experiments.procedure import Experiment
 from rtloop.experiments.recorded_run import RecordedRun
 from rtloop.experiments.setting import Setting
@@ -30,7 +31,7 @@ class StepsOptions(Options):
     """Options: levels of the reference, and their duration."""
 
     levels_um: Numbers = Field(default=(20.0, 0.0, -20.0, 0.0, 10.0, 30.0, 10.0, 0.0), min_length=1)
-    """Levels of the reference, one after the other, reduced by default to what limits and interlocks allow."""
+    """Levels of the reference, one after the other, reduced by default to fit limits and interlocks."""
     dwell_s: float = Field(default=1.5, ge=0.05)
     """Duration in s of each level."""
 
@@ -98,7 +99,7 @@ def analyse(recordings: Sequence[RecordedRun], _: StepsOptions) -> Analysis:
     )
     curves = {
         **{
-            name: envelope(signal, run.rate_hz)
+            name: envelope(signal[start if run.middle_um else 0 :], run.rate_hz)
             for name, signal in (("reference", reference), ("position", position), ("drive", drive))
         },
         "zoom_ms": 1e3 * np.arange(shown_ticks) / run.rate_hz,
@@ -194,7 +195,7 @@ EXPERIMENT = Experiment(
     runs,
     analyse,
     draw,
-    limits={"levels_um": lambda setting: setting.largest_step},
-    lower_limits={"levels_um": lambda setting: setting.largest_step_down},
+    limits={"levels_um": largest_step_up},
+    lower_limits={"levels_um": largest_step_down},
     size=(11.0, 5.6),
 )

@@ -146,7 +146,7 @@ class LimitedProcess:
         self._unanswered += 1
 
     def _send(self, data: bytes) -> None:
-        """Send a message; to a process that has died nothing is sent: no answer will come."""
+        """Send a message, unless the process has died: then no answer will come."""
         with contextlib.suppress(BrokenPipeError):
             write_frame(self._pipes[0], data)
 

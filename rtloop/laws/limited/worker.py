@@ -30,7 +30,7 @@ STREAMS = {0: "stdin", 1: "stdout", 2: "stderr"}
 
 
 class Preparation(NamedTuple):
-    """First message of a job.
+    """First message of a job to its worker process.
 
     Folder and module search path of the parent, the pickled function, whether it needs the compiler, and the limit.
     """
@@ -174,7 +174,7 @@ def _streams() -> list[tuple[int, Any]]:
 
 
 def _leftover_fault(threads: int, streams: list[tuple[int, Any]]) -> str | None:
-    """Return what the law's code left: a thread, a process, or a standard stream replaced or closed; None for nothing.
+    """Return the fault if the law's code left a thread or process, or replaced or closed a standard stream, else None.
 
     `threads` and `streams` are from before the job.
     """

@@ -79,7 +79,7 @@ class SampledTransferOptions(TransferOptions):
     """Rule that makes C(z) of C(s): "matched" maps poles and zeros by z = exp(s T), "tustin" is the bilinear rule,
     "foh" and "zoh" are exact for an input that is linear or constant between ticks."""
     prewarp_hz: float | None = Field(default=None, gt=0)
-    """Frequency at which "tustin" keeps the response of C(s), such as that of a notch; with other methods it is
+    """Frequency at which "tustin" keeps the response of C(s), for example a notch's; with other methods it is
     refused."""
 
 

@@ -99,6 +99,8 @@ def event_text(event: Event, unit: str = "") -> str:
             return details.get("change") or ("another controller" if details["values"][0] else "other numbers")
         case "tripped":
             return details["reason"] or ", ".join(details["causes"])
+        case "recovery":
+            return f"{details['step']}: {details['reason']}" if details["reason"] else details["step"]
         case "periods_missed":
             return f"{count_text(details['late_ticks'], 'late tick')}, worst {details['worst_ms']:.3g} ms"
     return ""

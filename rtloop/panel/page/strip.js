@@ -20,6 +20,13 @@ function causes(trip, reason) {
   return [reason, also].filter(Boolean).map(words).join("; ");
 }
 
+/** What comes after a trip: a recovery that is under way, or Reset. */
+function remedy(recovery) {
+  if (recovery?.state === "waiting") return "The service will confirm the readings and return; Stop prevents it.";
+  if (recovery?.state === "confirming") return `The service confirms the readings (${recovery.confirmed} of ${recovery.confirmations}) and returns; Stop prevents it.`;
+  return recovery?.state === "latched" && recovery.reason ? `No return, because ${recovery.reason}. Use Reset to continue.` : "Use Reset to continue.";
+}
+
 /** Axes that run in closed loop and are not controlled, and why; "" where all are. */
 function uncontrolled(condition = {}) {
   return Object.entries(condition)
@@ -66,7 +73,7 @@ export class Strip {
     say($("tick"), counted(state.tick));
     if (before !== this.#word) say($("spoken"), `${this.#word}${state.mode ? `, mode ${words(state.mode)}` : ""}`);
     const why = state.trip?.length ? causes(state.trip, state.trip_reason) : (state.faults ?? []).join("; ");
-    say($("alarm"), state.state === "tripped" && why ? `Tripped: ${why}. Use Reset to continue.` : "");
+    say($("alarm"), state.state === "tripped" && why ? `Tripped: ${why}. ${remedy(state.recovery)}` : "");
     if (STOPPED.includes(state.state)) say($("stop-alarm"), "");
     document.title = `${ill ? "!" : state.state === "running" ? "▶" : state.state === "tripped" ? "✕" : "■"} ${$("name").textContent} · rtloop`;
   }

@@ -61,6 +61,7 @@ def application(service: Service) -> Starlette:
             while accepted:
                 message = {"state": service.state, "faults": list(service.faults), "lock": service.lock.holder}
                 message["measuring"] = service.current_measurement.for_json()
+                message["recovery"] = service.recovery.for_json()
                 await socket.send_text(json.dumps(message | newest_signals(service)))
                 await asyncio.sleep(1 / WATCH_HZ)
 

@@ -7,7 +7,7 @@ from typing import Any
 
 from pydantic import TypeAdapter
 
-from rtloop.configuration.axis import ReferenceOptions
+from rtloop.configuration.reference_options import ReferenceOptions
 from rtloop.recording.file.topics.events import MAX_NAME, OPERATOR, RESERVED_NAMES
 from rtloop.service.api.requests import REQUESTS, ApiRequest, Sender
 from rtloop.service.changing.live import TUNABLE_SECTIONS

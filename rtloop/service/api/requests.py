@@ -14,8 +14,8 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from rtloop.configuration.axis import TableOptions
 from rtloop.configuration.file import describe
+from rtloop.configuration.reference_options import TableOptions
 from rtloop.configuration.references import read_samples
 from rtloop.errors import ConfigError
 from rtloop.service.api.bodies import (

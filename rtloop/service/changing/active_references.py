@@ -14,13 +14,13 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rtloop import signals
-from rtloop.engine.messages import MESSAGE, Kind
+from rtloop.engine.messages import MESSAGE, Kind, Origin
 from rtloop.engine.plan import Plan
 from rtloop.engine.ring import drain
-from rtloop.kernel.reference import Generator
+from rtloop.kernel.reference import GENERATOR_PARAMETERS, Generator
 from rtloop.service.changing.staging import Staging
 from rtloop.service.desk import ANSWER_PERIODS, ANSWER_TIMEOUT_S, POLL_S, Refusal
-from rtloop.signals import Mode
+from rtloop.signals import Flag, Mode
 
 EVENTS_AT_ONCE = 64
 
@@ -31,6 +31,25 @@ class ActiveReference(NamedTuple):
     kind: Generator | None
     in_volts: bool
     value: float
+
+
+class Trip(NamedTuple):
+    """Newest trip, or failure of the driver, of a loop."""
+
+    number: int
+    """1 for the first trip; further causes of a latched trip are the same trip."""
+    mode: Mode | None
+    """Mode that it ended; None if unknown."""
+    tick: int
+    first_causes: int
+    """Causes in the tick of the trip, as bits of Flag; TRIP_DRIVER also for a failed write."""
+    causes: int
+    """These, and those that followed."""
+    is_stopped: bool
+    """Whether a client has stopped the loop since."""
+
+
+NO_TRIP = Trip(0, Mode.OFF, 0, 0, 0, False)
 
 
 class ActiveReferences:
@@ -47,6 +66,11 @@ class ActiveReferences:
         self._in_volts = [bool(volts) for volts in plan.generators["volts"]]
         self._since_ticks = [0] * len(plan.axes)
         """First tick of each reference."""
+        self._values: list[tuple[float, ...] | None] = [
+            (float(generator["kind"]), *generator["parameters"].tolist()) for generator in plan.generators
+        ]
+        """[kind, *parameters] of each generator; None for a constant that only the records show."""
+        self._trip, self._is_latched = NO_TRIP, False
 
     def follow(self) -> None:
         """Read the new events. If some were overwritten before, all references are unknown until they are set again."""
@@ -58,8 +82,31 @@ class ActiveReferences:
                 self._cursor = first + event_count
                 if lost:
                     self._mode, self._kinds = None, [None] * len(self._kinds)
+                    self._is_latched = False
                 for event in self._events[:event_count]:
                     self._apply_event(event)
+
+    @property
+    def trip(self) -> Trip:
+        """The newest trip in the events that were read; NO_TRIP before the first one."""
+        with self._lock:
+            return self._trip
+
+    def values(self, number: int) -> tuple[tuple[float, ...], bool] | None:
+        """Return [kind, *parameters] of the generator of axis `number`, and whether it is in V; None if it is unknown.
+
+        Does not wait for the loop, and uses the events that were read.
+        """
+        record = self._staging.newest_record
+        with self._lock:
+            values, in_volts, since_tick = self._values[number], self._in_volts[number], self._since_ticks[number]
+            if self._kinds[number] is None:
+                return None
+        if values is not None:
+            return values, in_volts
+        if record is None or record[signals.TICK] < since_tick:
+            return None
+        return (float(Generator.HOLD), float(record[signals.axis_column(number, signals.REFERENCE)])), in_volts
 
     def newest(self, number: int) -> ActiveReference:
         """Return the reference of axis `number` in the newest tick that the loop executed.
@@ -91,9 +138,25 @@ class ActiveReferences:
             for axis in range(len(self._kinds)):
                 if event["axis"] < 0 or event["axis"] == axis:
                     self._kinds[axis] = None if self._mode is None else Generator(int(values[0]))
+                    self._values[axis] = tuple(float(value) for value in values[: 1 + GENERATOR_PARAMETERS])
                     self._in_volts[axis], self._since_ticks[axis] = self._mode is Mode.RAW, tick
-        elif kind in (Kind.TRIPPED, Kind.RESET_TRIP, Kind.STOP):
+        elif kind in (Kind.TRIPPED, Kind.DRIVER_FAILED):
+            self._record_trip(tick, int(values[0]) if kind == Kind.TRIPPED else int(Flag.TRIP_DRIVER))
+        elif kind == Kind.REFUSED:
+            is_stop = values[0] == Kind.SET_MODE and values[1] == Mode.OFF
+            if is_stop and event["origin"] != Origin.SUPERVISOR:
+                self._trip = self._trip._replace(is_stopped=True)
+        elif kind in (Kind.RESET_TRIP, Kind.STOP):
+            self._is_latched = self._is_latched and kind != Kind.RESET_TRIP
             self._mode = Mode.OFF
+
+    def _record_trip(self, tick: int, causes: int) -> None:
+        """Record a trip at `tick`, or further causes of the latched one, as bits of Flag; the lock must be held."""
+        if not self._is_latched:
+            self._trip = Trip(self._trip.number + 1, self._mode, tick, causes, causes, False)
+        first = self._trip.first_causes | (causes if tick == self._trip.tick else 0)
+        self._trip = self._trip._replace(first_causes=first, causes=self._trip.causes | causes)
+        self._mode, self._is_latched = Mode.OFF, True
 
     def _change_units(self, to_volts: bool, holds_output: bool, tick: int) -> None:
         """Set the unit of all references, V or µm, from `tick` on.
@@ -104,5 +167,5 @@ class ActiveReferences:
         for axis, kind in enumerate(self._kinds):
             if self._in_volts[axis] != to_volts:
                 if holds_output and kind is not None:
-                    self._kinds[axis] = Generator.HOLD
+                    self._kinds[axis], self._values[axis] = Generator.HOLD, None
                 self._in_volts[axis], self._since_ticks[axis] = to_volts, tick

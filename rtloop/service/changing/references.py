@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from typing import Any, NamedTuple
 
 import numpy as np
 from pydantic import TypeAdapter, ValidationError
 
-from rtloop.configuration.axis import ReferenceOptions
 from rtloop.configuration.file import describe
 from rtloop.configuration.prepare import Prepared
+from rtloop.configuration.reference_options import ReferenceOptions
 from rtloop.configuration.references import (
     TableOfSamples,
     extent,
@@ -23,11 +24,26 @@ from rtloop.engine.messages import Kind
 from rtloop.errors import ConfigError
 from rtloop.kernel.limits import USABLE_MAGNITUDE
 from rtloop.kernel.reference import Generator
-from rtloop.service.changing.active_references import ActiveReferences
+from rtloop.service.changing.active_references import ActiveReferences, Trip
 from rtloop.service.changing.staging import Staging
 from rtloop.service.desk import Refusal, UnconfirmedCommand
 
 Samples = np.ndarray[Any, Any]
+
+
+class Setting(NamedTuple):
+    """A reference: [kind, *parameters] of its generator, in V or µm, and the samples of a table outside the plan."""
+
+    values: tuple[float, ...]
+    in_volts: bool
+    samples: Samples | None = None
+
+
+class ReferenceReplaced(Refusal):
+    """The reference of axis `axis` was replaced by another client."""
+
+    def __init__(self, axis: str) -> None:
+        super().__init__(f"reference of axis {axis}: replaced by another client")
 
 
 class LiveReferences:
@@ -44,6 +60,8 @@ class LiveReferences:
         self._active_references = ActiveReferences(plan, staging)
         self._set_counts = [0] * len(plan.axes)
         """Number of references set on each axis, which the loop accepted or may still start."""
+        self._own_counts = [0] * len(plan.axes)
+        """Those of them that the service itself set: sines that depolarise, and the ramps of a return."""
 
     def set(self, axis: str, reference: Mapping[str, Any], *, restores: bool = False) -> int:
         """Start a generator, {kind, …} as in [axis.reference], on an axis. Returns its first tick.
@@ -81,13 +99,72 @@ class LiveReferences:
         Limits are not checked. Returns the tick of the first sample. Raises Refusal, UnconfirmedCommand; ConfigError
         for too many samples.
         """
-        with self._staging.lock:
+        with self._own_change(number):
             return self._submit_table(number, [Generator.TABLE, 0, samples_v.size, 1.0, 0.0], samples_v)
+
+    def play_once(self, number: int, samples: Samples, hold_ticks: int, replaces: int) -> int:
+        """Play samples (n, 1 or 2) once on axis `number`, `hold_ticks` ticks each, as `set_waveform` does.
+
+        `replaces` is the entry of `client_counts` with which the reference may be replaced. Limits are not checked.
+        Returns the tick of the first sample. Raises ReferenceReplaced, Refusal, UnconfirmedCommand; ConfigError for too
+        many samples.
+        """
+        count, columns = samples.shape
+        with self._own_change(number, replaces):
+            values = [Generator.TABLE, 0, count, hold_ticks, 0.0, float(columns == 2)]
+            return self._submit_table(number, values, samples.T.ravel())
+
+    def setting(self, number: int) -> Setting | None:
+        """Return the reference of axis `number` for `restart`; None if it is unknown. Does not wait."""
+        active = self._active_references.values(number)
+        if active is None:
+            return None
+        values, in_volts = active
+        if values[0] != Generator.TABLE or values[1] < self._first_spare:
+            return Setting(values, in_volts)
+        first, size = int(values[1]), int(values[2]) * (2 if values[5] else 1)
+        return Setting(values, in_volts, self._staging.block["table"][first : first + size].copy())
+
+    def restart(self, number: int, setting: Setting, replaces: int) -> int:
+        """Start a reference again, from its beginning, without a check of limits. Returns its first tick.
+
+        The loop must have the same configured tables. `replaces` and errors as in `play_once`.
+        """
+        with self._own_change(number, replaces):
+            values = list(setting.values)
+            if setting.samples is None:
+                return self._submit(number, values)
+            return self._submit_table(number, values, setting.samples)
+
+    @contextmanager
+    def _own_change(self, number: int, replaces: int | None = None) -> Iterator[None]:
+        """Hold the staging lock, and count the references set on axis `number` within as the service's own.
+
+        Raises ReferenceReplaced if `replaces` is given and clients have set another number of references.
+        """
+        with self._staging.lock:
+            if replaces is not None and self.client_counts[number] != replaces:
+                raise ReferenceReplaced(self._prepared().plan.axes[number])
+            before = self._set_counts[number]
+            try:
+                yield
+            finally:
+                self._own_counts[number] += self._set_counts[number] - before
+
+    @property
+    def trip(self) -> Trip:
+        """The newest trip in the events that were read."""
+        return self._active_references.trip
 
     def set_count(self, number: int) -> int:
         """Return how many references were set on axis `number`, after a change that is under way has ended."""
         with self._staging.lock:
             return self._set_counts[number]
+
+    @property
+    def client_counts(self) -> tuple[int, ...]:
+        """Number of references that clients set on each axis; a change that is under way may not be counted yet."""
+        return tuple(count - own for count, own in zip(self._set_counts, self._own_counts, strict=True))
 
     def follow(self) -> None:
         """Read the loop's new events. Call this often: the loop overwrites old ones."""

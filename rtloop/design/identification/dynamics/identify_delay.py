@@ -76,7 +76,7 @@ def identify_delay(run: Excitation, orders: Sequence[int]) -> int:
 
 
 def simplest_candidates(candidates: Sequence[Candidate]) -> list[Candidate]:
-    """Return, of all candidates that predict as well as the best one (within LEAST_IMPROVEMENT), those of fewest poles.
+    """Return the candidates of fewest poles among all that predict as well as the best one, within LEAST_IMPROVEMENT.
 
     A candidate whose errors depend on the input counts only if all do.
     """

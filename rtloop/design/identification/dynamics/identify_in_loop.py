@@ -109,8 +109,9 @@ def identify_in_loop(
 
 
 def _choose_final(search: ModelSearch, models: list[JudgedModel], equivalent: list[JudgedModel]) -> FinalModel | None:
-    """Return the model of least total error among `equivalent` that settle on the whole recording, else the one of
-    least held-out error among `models` that does; None if none does.
+    """Return the model of least total error among the `equivalent` ones that settle on the whole recording.
+
+    Otherwise return the model of least held-out error among the `models` that settle; None if no model settles.
     """
     finals = [final for model in equivalent if (final := search.refit_on_whole(model))]
     if finals:
@@ -122,7 +123,7 @@ def _choose_final(search: ModelSearch, models: list[JudgedModel], equivalent: li
 def _search_models(
     search: ModelSearch, order: int | None, largest_order: int, delay_ticks: int | None
 ) -> tuple[list[JudgedModel], list[JudgedModel]]:
-    """Return all models tried (of `order`, if given), and those of fewest poles among the models as good as the best.
+    """Return all models tried (of `order`, if given), and the models of fewest poles among those as good as the best.
 
     Both are empty if none is stable.
     """

@@ -50,9 +50,9 @@ TURN_SHARE, LEAST_TURNS = 0.5, 3
 class PartsFit:
     """Model to write, judgement of each recording under it, and the choice of its terms.
 
-    `trial_errors_um` has the held-out error in µm rms of each trial, by name, `terms` those that lowered it ("drift",
-    "creep"), `creep_um` the range of creep. `stroke_v` is the longest stroke of known memory; `missing_drive` names the
-    drive that would show larger plays, "" if the drive covers its range.
+    `trial_errors_um` has the held-out error in µm rms of each trial, by name, `terms` the trials that lowered it
+    ("drift", "creep"), `creep_um` the range of creep. `stroke_v` is the longest stroke of known memory; `missing_drive`
+    names the drive that would show larger plays, "" if the drive covers its range.
     """
 
     hysteresis: HysteresisFit
@@ -159,7 +159,7 @@ def _choose_trial(work: RecordingSet, trials: Sequence[Trial]) -> tuple[Trial, d
 
 
 def _lowers_error(squares: Real, reference_squares: Real) -> bool:
-    """Whether the root mean of `squares` is below IMPROVED_SHARE times that of `reference_squares`."""
+    """Whether the root mean of `squares` is below IMPROVED_SHARE times the root mean of `reference_squares`."""
     return bool(np.mean(squares) < IMPROVED_SHARE**2 * np.mean(reference_squares))
 
 

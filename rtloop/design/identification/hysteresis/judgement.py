@@ -125,7 +125,7 @@ def evaluate_from_rest(
     """Judge `runs`, each from rest and held out in turn, and `other_runs`, of unknown memory, under plays placed as in
     `shape`.
 
-    Returns the judgements of `runs`, then those of `other_runs`.
+    Returns the judgements of `runs`, then the judgements of `other_runs`.
     """
     recordings = prepare_recordings(runs, shape.weights, [np.zeros(1)] * len(runs))
     trial = Trial(shape.model.thresholds, shape.placement, ())
@@ -137,7 +137,7 @@ def fit_and_judge(
 ) -> tuple[SharedGains, tuple[Judgement, ...], tuple[Judgement, ...]]:
     """Fit all recordings of the set and judge each by a fit without it.
 
-    Returns the common gains, the judgements of `recording_set.runs` and those of `other_runs`, which are not fitted.
+    Returns the common gains, the judgements of `recording_set.runs`, and of `other_runs`, which are not fitted.
     """
     recordings = [recording_set.equations(run, trial) for run in recording_set.runs]
     common, gains = fit_gains(recordings, recording_set.limits)

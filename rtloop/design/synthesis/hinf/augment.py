@@ -40,7 +40,7 @@ class Matrices(NamedTuple):
 class GeneralisedPlant(NamedTuple):
     """The plant x' = A x + B1 w + B2 u, z = C1 x + D11 w + D12 u, y = C2 x + D21 w + D22 u.
 
-    There are n states, m1 and m2 inputs w and u, p1 and p2 outputs z and y; u and y are those of the controller.
+    There are n states, m1 and m2 inputs w and u, p1 and p2 outputs z and y; the controller's input is y, its output u.
     """
 
     a: Real

@@ -15,6 +15,7 @@ from unicodedata import category
 import numpy as np
 
 from rtloop.engine.messages import ALL_AXES, MESSAGE, Kind, Origin
+from rtloop.recording.file.topics.recovery_steps import Note, step_meaning
 from rtloop.signals import Failure, Flag, Mode, trip_causes
 
 Event = dict[str, Any]
@@ -57,10 +58,12 @@ def event_from_message(
         meaning = {"periods": json_value(values[0])}
     elif kind == Kind.LATENESS_OVER:
         meaning = dict(zip(("periods", "late_ticks", "largest"), map(json_value, values), strict=False))
+    elif kind == Note.RECOVERY:
+        meaning = step_meaning(values)
     return {
         "tick": int(message["tick"]),
         "time_ns": time_ns,
-        "kind": _member_name(Kind, kind),
+        "kind": _kind_name(kind),
         "who": name or _member_name(Origin, int(message["origin"])),
         "axis": axes[axis] if 0 <= axis < len(axes) else None,
         "what": {**meaning, "values": [json_value(value) for value in values], "identity": int(message["identity"])},
@@ -104,7 +107,7 @@ def message_from_event(event: Event, axes: Sequence[str]) -> np.ndarray[Any, Any
         return None
     record = np.zeros(1, MESSAGE)
     record["tick"], record["identity"] = event["tick"], event["what"]["identity"]
-    record["kind"], record["origin"] = _member_value(Kind, event["kind"]), _origin_value(event["who"])
+    record["kind"], record["origin"] = _kind_value(event["kind"]), _origin_value(event["who"])
     record["axis"] = ALL_AXES if event["axis"] is None else list(axes).index(event["axis"])
     record["values"][0] = [float(value) for value in event["what"]["values"]]
     return record
@@ -122,6 +125,11 @@ def name_problem(name: str) -> str | None:
     return None
 
 
+def is_kind_name(name: str) -> bool:
+    """Whether `name` is a Kind or Note of the loop's messages, or a number of at most 9 digits."""
+    return is_member_name(Kind, name) or is_member_name(Note, name)
+
+
 def is_member_name(kinds: Any, name: str) -> bool:
     """Whether `name` is a member of `kinds` or a number of at most 9 digits (a member unknown to this version)."""
     return name.upper() in kinds.__members__ or (name.isascii() and name.isdigit() and len(name) < 10)
@@ -130,6 +138,16 @@ def is_member_name(kinds: Any, name: str) -> bool:
 def recorder_event(kind: str, tick: int, time_ns: int, details: dict[str, Any]) -> Event:
     """Make an event of the recorder, `time_ns` after the start, for no axis; `details` becomes its `what`."""
     return {"tick": tick, "time_ns": time_ns, "kind": kind, "who": RECORDER, "axis": None, "what": details}
+
+
+def _kind_name(kind: int) -> str:
+    """Return the name of a Kind or Note in lower case, or the number as text if this version has no such kind."""
+    return _member_name(Note if kind in list(Note) else Kind, kind)
+
+
+def _kind_value(name: str) -> int:
+    """Return the number of a Kind or Note by its name, or by its number as text."""
+    return _member_value(Note if name.upper() in Note.__members__ else Kind, name)
 
 
 def _member_name(kinds: Any, value: float) -> str:

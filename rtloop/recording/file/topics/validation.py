@@ -15,7 +15,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from rtloop import signals
 from rtloop.engine.messages import MESSAGE_VALUES, Kind, Origin
-from rtloop.kernel.extras import ExtraOutput, Extras
+from rtloop.kernel.extras import ExtraOutput, Extras, Mark
 from rtloop.kernel.layout import MAX_EXTRAS
 from rtloop.kernel.reference import Generator
 from rtloop.recording.file.topics.events import (
@@ -27,10 +27,12 @@ from rtloop.recording.file.topics.events import (
     RECORDING_RESUMED,
     RETENTION_BEGUN,
     Event,
+    is_kind_name,
     is_member_name,
     name_problem,
 )
 from rtloop.recording.file.topics.format import FORMAT
+from rtloop.recording.file.topics.recovery_steps import Note
 from rtloop.signals import Mode
 
 HIGHEST_RATE_HZ, LOWEST_RATE_HZ = 1e6, 1e-3
@@ -98,6 +100,8 @@ class _OutputModel(_InputModel):
     lowest_v: float
     highest_v: float
     safe_v: float
+    mark: Annotated[int, Field(ge=0, le=max(Mark))] = 0
+    level_um: float = 0.0
 
 
 class _ExtrasModel(_CheckedModel):
@@ -291,10 +295,11 @@ def require_columns(header: dict[str, Any]) -> None:
 def header_extras(header: Mapping[str, Any]) -> Extras:
     """Return the recorded inputs and outputs besides sensors and drives."""
     entries = header.get("extras", {})
-    outputs = [[output[field] for field in ExtraOutput._fields] for output in entries.get("outputs", ())]
-    return Extras(
-        tuple(entry["name"] for entry in entries.get("inputs", ())), tuple(ExtraOutput(*output) for output in outputs)
-    )
+    outputs = [
+        ExtraOutput(**{field: output[field] for field in ExtraOutput._fields if field in output})
+        for output in entries.get("outputs", ())
+    ]
+    return Extras(tuple(entry["name"] for entry in entries.get("inputs", ())), tuple(outputs))
 
 
 def header_extra_channels(header: Mapping[str, Any]) -> dict[str, str]:
@@ -319,8 +324,9 @@ def parse_event(payload: bytes, axes: Sequence[str]) -> Event:
             raise MalformedText(f"who: {_shorten(event['who'])}; allowed for {kind}: {RECORDER}")
         _validate(model, details, "what.")
         return event
-    if not is_member_name(Kind, kind):
-        raise MalformedText(f"kind: {_shorten(kind)}; allowed: {', '.join(Kind.__members__).lower()} or a number")
+    if not is_kind_name(kind):
+        names = ", ".join((*Kind.__members__, *Note.__members__)).lower()
+        raise MalformedText(f"kind: {_shorten(kind)}; allowed: {names} or a number")
     if not is_member_name(Origin, event["who"]) and (fault := name_problem(event["who"])):
         raise MalformedText(f"who: {fault}")
     _validate(_MessageDetails, details, "what.")

@@ -1,0 +1,106 @@
+"""Figures of simulated steps and of rest, and their comparison with a specification."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+from rtloop.design.synthesis.specification import QUANTITIES
+from rtloop.design.verification.judgement import Limit
+from rtloop.hysteresis.reach import PositionRange
+
+STEP_QUANTILE = 0.95
+"""Quantile of the steps that is reported."""
+LARGEST_SPREAD, SPREAD_PERCENT = 0.1, 0.5
+"""Spread beyond which noise determines a figure: fraction of a settling time, and percentage points."""
+JUDGED_QUANTITIES = ("overshoot_percent", "settling_ms", "static_error_percent")
+"""Specified figures of a step, in the order of `measure_steps`."""
+
+
+class SimulatedStep(NamedTuple):
+    """Figures of the steps of one height, up and down: the STEP_QUANTILE quantile, the median (`typical`, in the
+    order of JUDGED_QUANTITIES), active limits, trips, and the lowest and highest level (`levels_um`).
+
+    A quantile, because the worst of a few steps changes from run to run: noise decides when a loop leaves its dead
+    band.
+    """
+
+    height_um: float
+    overshoot_percent: float
+    settling_ms: float
+    static_error_percent: float
+    typical: tuple[float, ...]
+    peak_drive_v: float
+    limited: tuple[str, ...]
+    trips: tuple[str, ...]
+    levels_um: tuple[float, float] = (0.0, 0.0)
+
+    def is_repeatable(self, name: str) -> bool:
+        """Whether the quantile of figure `name` exceeds the median by at most SPREAD_PERCENT points, or LARGEST_SPREAD
+        of itself for the settling time: noise does not decide it. An infinite quantile needs an infinite median.
+        """
+        quantile, median = getattr(self, name), self.typical[JUDGED_QUANTITIES.index(name)]
+        if math.isinf(quantile):
+            return math.isinf(median)
+        return quantile - median <= (SPREAD_PERCENT if name.endswith("percent") else LARGEST_SPREAD * quantile)
+
+
+@dataclass(frozen=True)
+class SimulationResult:
+    """Simulated steps, heights outside the range (`omitted_heights_um`), and rms noise of position x and command v at
+    rest.
+
+    `truth` names the simulated system, `command_range` has the static commands that are possible. `required` has the
+    limits, which count only if `is_judged`.
+    """
+
+    truth: str
+    steps: tuple[SimulatedStep, ...]
+    omitted_heights_um: tuple[float, ...]
+    command_range: PositionRange
+    noise_x_nm: float
+    noise_v_nm: float
+    required: Mapping[str, Limit]
+    is_judged: bool
+
+    def is_met(self, step: SimulatedStep, name: str) -> bool | None:
+        """Whether a step meets the limit on figure `name`, judged or not; None without limit."""
+        return self.required[name].accepts(getattr(step, name)) if name in self.required else None
+
+    @property
+    def violations(self) -> list[str]:
+        """Requirements that count and are not met: `missed`, or [] without `is_judged`."""
+        return self.missed if self.is_judged else []
+
+    @property
+    def missed(self) -> list[str]:
+        """Requirements that simulated steps do not meet, a text for each height; whatever `is_judged` says."""
+        return [
+            f"{QUANTITIES[name][0]} of {step.height_um:g} µm steps"
+            for step in self.steps
+            for name in JUDGED_QUANTITIES
+            if self.is_met(step, name) is False
+        ] + [f"steps of {step.height_um:g} µm, which trip" for step in self.steps if step.trips]
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the result for JSON: `truth`, `steps`, `left_out_um`, `range_um`, `noise_x_nm`, `noise_v_nm`,
+        `judged`.
+        """
+        steps = [
+            {
+                **step._asdict(),
+                "met": {name: self.is_met(step, name) for name in JUDGED_QUANTITIES if name in self.required},
+            }
+            for step in self.steps
+        ]
+        return {
+            "truth": self.truth,
+            "steps": steps,
+            "left_out_um": list(self.omitted_heights_um),
+            "range_um": list(self.command_range),
+            "noise_x_nm": self.noise_x_nm,
+            "noise_v_nm": self.noise_v_nm,
+            "judged": self.is_judged,
+        }

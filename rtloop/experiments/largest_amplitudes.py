@@ -1,0 +1,119 @@
+"""Largest amplitudes with which an experiment neither trips the loop nor meets a limit.
+
+A command is larger than the reference by the overshoot of the controller, and a position larger than the command by the
+resonance: the factors of the linear model divide the range of slow commands (`Setting.reach`).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+
+from rtloop.experiments.setting import Bound, Setting
+from rtloop.hysteresis.reach import can_hold
+
+UNKNOWN_PEAK, MIN_PEAK = 1.4, 1.1
+"""Command per step of the reference without a model, and the least value used, as the hysteresis adds to it."""
+FEEDFORWARD_PEAK = 1.02
+"""Factor for the dead band, which the inverse may add to the command."""
+
+
+def largest_command(setting: Setting) -> Bound:
+    """Return the largest slow command without feedback, µm."""
+    return setting.reach.divided(FEEDFORWARD_PEAK, "with a dead band the command is up to")
+
+
+def largest_step_up(setting: Setting) -> Bound:
+    """Return the largest step of the reference up from 0, µm, and back."""
+    return _largest_step_towards(setting, 1.0)
+
+
+def largest_step_down(setting: Setting) -> Bound:
+    """Return the largest step of the reference down from 0, µm, and back."""
+    return _largest_step_towards(setting, -1.0)
+
+
+def _largest_step_towards(setting: Setting, direction: float) -> Bound:
+    """Return the largest step of the reference from 0 towards ±1, and back, in µm.
+
+    The longer side of the drive comes first; steps towards the other side find the memory that its steps leave. With a
+    drive of one sign, steps are about the middle of the reachable range, and have equal room to both sides.
+    """
+    axis, model, drive_range_v = setting.axis, setting.model, setting.drive_range_v
+    peak = max((model and model.step_peak) or UNKNOWN_PEAK, MIN_PEAK)
+    modelled_reversal = None if model is None else model.step_reversal
+    reversal = UNKNOWN_PEAK - 1 if modelled_reversal is None else max(modelled_reversal, MIN_PEAK - 1)
+    if setting.is_one_sided:
+        return setting.reach.divided(max(peak, reversal), "the command of a step is up to")
+    sign = direction * math.copysign(1.0, setting.um_per_v)
+    earlier_commands_um = np.zeros(1)
+    if sign * sum(drive_range_v) < 0 or (sum(drive_range_v) == 0 and direction < 0):
+        opposite_um = _largest_step_towards(setting, -direction).magnitude
+        earlier_commands_um = -opposite_um * np.array([peak, -reversal])
+    bound = min(
+        Bound(axis.limits.command_um, f"limits.command_um = {axis.limits.command_um:g}"),
+        setting.trip_towards(direction),
+    ).divided(peak, "the command of a step is up to")
+    actuator = axis.feedforward.actuator()
+
+    def is_held(height_um: float) -> bool:
+        """Whether the drive holds the commands of a step of a height and of the step back, after the earlier ones."""
+        commands_um = np.concatenate([earlier_commands_um, height_um * np.array([peak, -reversal])])
+        return can_hold(actuator, direction * commands_um, *drive_range_v)
+
+    held_um = largest_true(is_held, bound.magnitude)
+    peak_um = np.append(earlier_commands_um, held_um * (1 + 1e-6) * peak)
+    if can_hold(actuator, direction * peak_um, *drive_range_v):
+        key, effect = setting.largest_drive(-sign)[1], f"step back goes {reversal:.3g} times as far beyond 0"
+    else:
+        key, effect = setting.largest_drive(sign)[1], f"step is up to {peak:.3g} times as large"
+    return min(bound, Bound(held_um, f"{key} (the command of a {effect})"))
+
+
+def largest_sine(setting: Setting) -> Bound:
+    """Return the largest amplitude of a sine of the reference, µm."""
+    peak = max((setting.model and setting.model.sine_peak) or UNKNOWN_PEAK, MIN_PEAK)
+    return setting.reach.divided(peak, "the command of a sine is up to")
+
+
+def largest_swept_sine(setting: Setting) -> Bound:
+    """Return the largest amplitude of a sine at any frequency, µm, with and without control.
+
+    It neither trips nor is clipped at the resonance.
+    """
+    interlocks, model = setting.axis.interlocks, setting.model
+    closed_peak = max((model and model.tracking_peak) or 1.0, 1.0)
+    swing_um = interlocks.oscillation_um if interlocks.oscillation_swings else np.inf
+    swing = Bound(swing_um, f"interlocks.oscillation_um = {swing_um:g}")
+    open_peak = model.open_peak if model else 1.0
+    return min(
+        largest_sine(setting),
+        setting.reach.divided(open_peak, "at the resonance the stage's motion without control is"),
+        swing.divided(2 * closed_peak, "the position's swing from peak to peak is"),
+    )
+
+
+def largest_part_of_drive(setting: Setting) -> Bound:
+    """Return the largest step of the drive without control, as a fraction 0 … 1 of the drive's limit."""
+    drive_v = setting.axis.limits.drive_v
+    overshoot_um = abs(setting.um_per_v) * drive_v * (setting.model.open_overshoot if setting.model else 2.0)
+    return min(
+        Bound(1.0, f"limits.drive_v = {drive_v:g}"),
+        Bound(
+            setting.trip_um / overshoot_um,
+            f"{setting.trip.reason} (a step of the whole drive moves the stage by {overshoot_um:.4g} µm)",
+        ),
+    )
+
+
+def largest_true(condition: Callable[[float], bool], upper: float) -> float:
+    """Return the largest number from 0 to `upper` up to which `condition` holds, to a part in 10⁹, by bisection."""
+    if condition(upper):
+        return upper
+    low, high = 0.0, upper
+    while high - low > 1e-9 * upper:
+        middle = (low + high) / 2
+        low, high = (middle, high) if condition(middle) else (low, middle)
+    return low

@@ -1,0 +1,1 @@
+"""Recovery by policy: the return to the former mode after a trip from outside, [service.recover]."""

@@ -1,0 +1,353 @@
+"""Recovery by policy, [service.recover]: after a trip from outside, confirmed by readings, at most some times an hour.
+
+    ready ──allowed trip──► waiting ──wait_s──► confirming ──n confirmations──► returning ──► ready
+      ▲                        ▲                    │ unsound: from 0                │ trip: counts once more
+      └──reset── latched ◄─────┴── another cause, too many, a client's stop, another law
+
+Nothing here waits or sends; `worker` does. The state of the service stays `tripped` until the return begins.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from enum import StrEnum
+from typing import Any, NamedTuple, Protocol
+
+from rtloop import signals
+from rtloop.configuration.file import Configuration
+from rtloop.configuration.service import RecoverOptions
+from rtloop.recording.file.topics.recovery_steps import REASON_TEXTS, RecoveryStep, StepReason
+from rtloop.service.changing.active_references import Trip
+from rtloop.service.changing.live import LiveLaw
+from rtloop.service.desk import Desk
+from rtloop.service.recovering.confirmation import Confirmation
+from rtloop.service.recovering.former_state import FormerState, record_former_state
+from rtloop.signals import Mode
+from rtloop.supervision.supervisor import Supervisor
+
+HOUR_S = 3600.0
+LONGEST_PAUSE_S = 60.0
+"""Longest pause between two starts of a loop whose driver fails each time."""
+UNSOUND_PERIOD_S = 10.0
+"""Time between two reports of unsound readings for the same reason."""
+OUTSIDE_OUTCOMES = {"driver_failed": "driver", "heartbeat_lost": "heartbeat"}
+"""Cause of the trip by the outcome of a loop that ended by itself."""
+STANDSTILL_CAUSES, STANDSTILL = {"stale", "driver"}, "frozen"
+"""While samples do not come, the reading stands still and the outputs ramp: `frozen` may follow these causes."""
+log = logging.getLogger("rtloop")
+
+
+class RecoveryState(StrEnum):
+    """State of the recovery."""
+
+    READY = "ready"
+    """There is no trip to recover from."""
+    WAITING = "waiting"
+    CONFIRMING = "confirming"
+    RETURNING = "returning"
+    LATCHED = "latched"
+    """The service does not return before `reset`."""
+
+
+class Host(Protocol):
+    """The service, as far as a recovery uses it."""
+
+    configuration: Configuration
+    supervisor: Supervisor | None
+    live: LiveLaw | None
+    faults: list[str]
+    armed: bool
+
+    @property
+    def desk(self) -> Desk:
+        """The desk of the running loop. Raises Refusal without one."""
+        ...
+
+    @property
+    def is_moved(self) -> bool:
+        """Whether a measurement or the preparation of the actuator moves the loop."""
+        ...
+
+
+class Step(NamedTuple):
+    """A step of the recovery: its reason, recoveries left within the hour, causes of the trip as bits of Flag."""
+
+    step: RecoveryStep
+    reason: StepReason
+    left: int
+    causes: int
+
+
+class Return(NamedTuple):
+    """A confirmed return: the state to return to, the options, and the serial number of the recovery."""
+
+    former: FormerState
+    options: RecoverOptions
+    serial: int
+
+
+class Recovery:
+    """Recovery of one service. Thread-safe; `now_s` is a monotonic clock."""
+
+    def __init__(self, host: Host, now_s: Callable[[], float] = time.monotonic) -> None:
+        self._host, self._now_s = host, now_s
+        self._guard = threading.RLock()
+        self._state, self._reason, self._causes = RecoveryState.READY, StepReason.NONE, 0
+        self._former: FormerState | None = None
+        """State to return to; None unless a recovery is under way."""
+        self._serial = 0
+        """Changes when a recovery begins or ends; the commands of an earlier one are refused."""
+        self._begun_s: deque[float] = deque()
+        self._due_s, self._unsound_s = 0.0, 0.0
+        self._confirmation: Confirmation | None = None
+        self._live: LiveLaw | None = None
+        self._seen_trip = 0
+        self._own_faults: set[str] = set()
+        self._failures = 0
+        """Loops that the driver ended, or that could not start, since the last return."""
+        self._steps: deque[Step] = deque(maxlen=64)
+
+    def observe(self) -> None:
+        """Look at the newest trip of the loop; call this often, after the references followed the loop's events."""
+        with self._guard:
+            options, live = self._options, self._host.live
+            if options is None:
+                if self._former is not None:
+                    self._end(RecoveryStep.ENDED, StepReason.CHANGED, RecoveryState.LATCHED)
+                return
+            if live is None:
+                return
+            if live is not self._live:
+                self._live, self._seen_trip = live, 0
+            trip = live.references.trip
+            if trip.number != self._seen_trip:
+                self._seen_trip = trip.number
+                self._begin(trip, live, options)
+            elif self._former is not None and self._state is not RecoveryState.RETURNING:
+                self._causes |= trip.causes
+                if (reason := self._obstacle(trip, options)) is not None:
+                    self._end(RecoveryStep.LATCHED, reason, RecoveryState.LATCHED)
+                elif live is self._former.live:
+                    self._former = self._former.renewed(live)
+
+    def _begin(self, trip: Trip, live: LiveLaw, options: RecoverOptions) -> None:
+        """Begin a recovery after a new trip, also in the middle of another one, or latch; the guard must be held.
+
+        A trip in mode off begins nothing: there is no mode to return to.
+        """
+        is_under_way = self._former is not None
+        if self._state is RecoveryState.LATCHED or (trip.mode is Mode.OFF and not is_under_way):
+            return
+        self._causes = trip.causes
+        reason = self._obstacle(trip, options)
+        if reason is None and self._left(options) == 0:
+            reason = StepReason.COUNT
+        if reason is None and self._former is None:
+            self._former = None if trip.mode is None else record_former_state(trip.mode, live)
+            reason = StepReason.REFERENCE if self._former is None else None
+        if reason is not None:
+            self._end(RecoveryStep.LATCHED, reason, RecoveryState.LATCHED)
+            return
+        self._begun_s.append(self._now_s())
+        self._serial += 1
+        self._state, self._reason, self._confirmation = RecoveryState.WAITING, StepReason.NONE, None
+        self._due_s = self._now_s() + options.wait_s
+        self._add_step(RecoveryStep.BEGUN)
+
+    def _obstacle(self, trip: Trip, options: RecoverOptions) -> StepReason | None:
+        """Return why the service may not return after `trip` as things are now, None if it may."""
+        if not _are_allowed(trip, options):
+            return StepReason.CAUSE
+        if trip.is_stopped:
+            return StepReason.CLIENT
+        if set(self._host.faults) - self._own_faults:
+            return StepReason.FAULT
+        if self._host.is_moved:
+            return StepReason.ACTIVITY
+        return None if self._host.armed else StepReason.DISARMED
+
+    def confirm(self, supervisor: Supervisor, live: LiveLaw) -> Return | None:
+        """Judge the newest readings if it is time. Returns the return once all confirmations have succeeded."""
+        with self._guard:
+            options, former = self._options, self._former
+            is_due = self._state in (RecoveryState.WAITING, RecoveryState.CONFIRMING) and self._now_s() >= self._due_s
+            if options is None or former is None or live is not self._live or not is_due:
+                return None
+            if self._confirmation is None or self._confirmation.supervisor is not supervisor:
+                self._state = RecoveryState.CONFIRMING
+                self._confirmation = Confirmation(supervisor, options.confirmation_s, self._now_s())
+            if (reason := self._confirmation.advance(live.prepared, self._now_s())) is not None:
+                self._add_unsound(reason)
+            if self._confirmation.count < options.confirmations:
+                return None
+            former = former.renewed(live)
+            obstacle = self._obstacle(live.references.trip, options) or former.obstacle(live)
+            if obstacle is not None:
+                self._end(RecoveryStep.LATCHED, obstacle, RecoveryState.LATCHED)
+                return None
+            self._state, self._reason = RecoveryState.RETURNING, StepReason.NONE
+            self._add_step(RecoveryStep.CONFIRMED)
+            return Return(former, options, self._serial)
+
+    def is_current(self, serial: int) -> bool:
+        """Return whether the recovery `serial` is under way, with no trip since it began."""
+        return self._serial == serial
+
+    def report(self, serial: int, step: RecoveryStep) -> None:
+        """Record a step of the return."""
+        with self._guard:
+            if self._serial == serial:
+                self._add_step(step)
+
+    def finish(self, serial: int, failure: StepReason | None = None) -> bool:
+        """End the return `serial`: it succeeded, a client took over (CLIENT), or it failed and latches.
+
+        Returns False if it has ended already, or if another trip is in the loop's events: `observe` handles it.
+        """
+        with self._guard:
+            live = self._host.live
+            if self._serial != serial or live is not self._live or live is None:
+                return False
+            live.references.follow()
+            if live.references.trip.number != self._seen_trip:
+                return False
+            if failure is None:
+                self._failures = 0
+                self._end(RecoveryStep.RECOVERED, StepReason.NONE, RecoveryState.READY)
+            elif failure is StepReason.CLIENT:
+                self._end(RecoveryStep.ENDED, failure, RecoveryState.READY)
+            else:
+                self._end(RecoveryStep.LATCHED, failure, RecoveryState.LATCHED)
+            return True
+
+    def end(self) -> None:
+        """End a recovery that is under way, because a client takes over: none of its commands is sent from now on."""
+        with self._guard:
+            if self._former is not None:
+                is_returning = self._state is RecoveryState.RETURNING
+                state = RecoveryState.READY if is_returning else RecoveryState.LATCHED
+                self._end(RecoveryStep.ENDED, StepReason.CLIENT, state)
+
+    def clear(self) -> None:
+        """Be ready for the next trip, after a reset; the recoveries of the last hour still count."""
+        with self._guard:
+            self.end()
+            self._state, self._reason, self._causes, self._failures = RecoveryState.READY, StepReason.NONE, 0, 0
+            self._own_faults.clear()
+
+    def accept_end(self, outcome: str, fault: str) -> bool:
+        """Return whether the policy covers a loop that ended by itself; else the recovery latches.
+
+        `fault` is the text that the service latches for it.
+        """
+        with self._guard:
+            options = self._options
+            if options is None:
+                return False
+            if OUTSIDE_OUTCOMES.get(outcome) in options.causes:
+                return self._accept(fault)
+            if self._state is not RecoveryState.LATCHED:
+                self._end(RecoveryStep.LATCHED, StepReason.CAUSE, RecoveryState.LATCHED)
+            return False
+
+    def accept_failed_start(self, fault: str) -> bool:
+        """Return whether the policy covers a loop whose driver could not be opened.
+
+        The first loop of a service must start.
+        """
+        with self._guard:
+            options = self._options
+            if options is None or "driver" not in options.causes or self._live is None:
+                return False
+            return self._accept(fault)
+
+    def _accept(self, fault: str) -> bool:
+        """Add a fault that the return removes, and count the failure. Returns True."""
+        self._own_faults.add(fault)
+        self._failures += 1
+        return True
+
+    def remove_own_faults(self) -> None:
+        """Remove the faults of ended loops that the policy covers from the service's faults."""
+        with self._guard:
+            self._host.faults[:] = [fault for fault in self._host.faults if fault not in self._own_faults]
+            self._own_faults.clear()
+
+    @property
+    def pause_s(self) -> float:
+        """Time to the next start of a loop, s; it doubles with each one that fails."""
+        wait_s = LONGEST_PAUSE_S if self._options is None else self._options.wait_s
+        return min(wait_s * 2.0 ** min(max(self._failures - 1, 0), 10), LONGEST_PAUSE_S)
+
+    @property
+    def oldest_step(self) -> Step | None:
+        """The oldest step that is not in a recording; None if there is none."""
+        with self._guard:
+            return self._steps[0] if self._steps else None
+
+    def forget_step(self, step: Step) -> None:
+        """Forget the oldest step, `step`, once it is an event of the loop."""
+        with self._guard:
+            if self._steps and self._steps[0] is step:
+                self._steps.popleft()
+
+    def for_json(self) -> dict[str, Any] | None:
+        """Return {state, left, confirmed, confirmations, causes, reason} for `/status`; None without [service.recover].
+
+        `left` is the number of recoveries left within the hour, `reason` the last reason in words, or None.
+        """
+        with self._guard:
+            options = self._options
+            return None if options is None else {
+                "state": self._state.value,
+                "left": self._left(options),
+                "confirmed": 0 if self._confirmation is None else self._confirmation.count,
+                "confirmations": options.confirmations,
+                "causes": signals.trip_causes(self._causes),
+                "reason": REASON_TEXTS.get(self._reason),
+            }  # fmt: skip
+
+    @property
+    def _options(self) -> RecoverOptions | None:
+        """The policy in the present configuration; None if recovery is off."""
+        return self._host.configuration.service.recover
+
+    def _left(self, options: RecoverOptions) -> int:
+        """Return the number of recoveries left within the hour; the guard must be held."""
+        while self._begun_s and self._now_s() - self._begun_s[0] >= HOUR_S:
+            self._begun_s.popleft()
+        return max(options.max_per_hour - len(self._begun_s), 0)
+
+    def _end(self, step: RecoveryStep, reason: StepReason, state: RecoveryState) -> None:
+        """End the recovery with a step, and enter `state`; the guard must be held."""
+        self._serial += 1
+        self._former, self._confirmation = None, None
+        self._state, self._reason = state, reason
+        self._add_step(step, reason)
+
+    def _add_unsound(self, reason: StepReason) -> None:
+        """Add a step for unsound readings, at most one in UNSOUND_PERIOD_S for the same reason."""
+        if reason is not self._reason or self._now_s() >= self._unsound_s:
+            self._reason, self._unsound_s = reason, self._now_s() + UNSOUND_PERIOD_S
+            self._add_step(RecoveryStep.UNSOUND, reason)
+
+    def _add_step(self, step: RecoveryStep, reason: StepReason = StepReason.NONE) -> None:
+        """Add a step to be reported, and log it; the guard must be held."""
+        options = self._options
+        left = 0 if options is None else self._left(options)
+        self._steps.append(Step(step, reason, left, self._causes))
+        causes, text = ", ".join(signals.trip_causes(self._causes)), REASON_TEXTS.get(reason)
+        is_bad = step in (RecoveryStep.LATCHED, RecoveryStep.UNSOUND)
+        words = f"recovery after {causes or 'a trip'}: {step.name.lower()}{f' ({text})' if text else ''}"
+        log.log(logging.WARNING if is_bad else logging.INFO, "%s; %d left within the hour", words, left)
+
+
+def _are_allowed(trip: Trip, options: RecoverOptions) -> bool:
+    """Return whether the policy covers all causes of a trip, and those that followed it."""
+    first, allowed = set(signals.trip_causes(trip.first_causes)), set(options.causes)
+    followers = {STANDSTILL} if first & STANDSTILL_CAUSES else set()
+    return first <= allowed and set(signals.trip_causes(trip.causes)) <= allowed | followers

@@ -1,0 +1,111 @@
+"""Thread of a recovery: reports its steps to the loop, judges the readings, and returns."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import time
+from functools import partial
+
+from rtloop.engine.messages import Kind, Origin
+from rtloop.errors import RtloopError
+from rtloop.recording.file.topics.recovery_steps import Note, RecoveryStep, StepReason
+from rtloop.service.background import repeat_every
+from rtloop.service.changing.references import ReferenceReplaced
+from rtloop.service.desk import Refusal, Requester, use_requester
+from rtloop.service.recovering.comeback import ReturnStep, RunningLoop, come_back
+from rtloop.service.recovering.recovery import Host, Recovery, Return
+from rtloop.signals import Mode
+
+PERIOD_S = 0.02
+log = logging.getLogger("rtloop")
+
+
+def run_recovery(host: Host, recovery: Recovery) -> contextlib.AbstractContextManager[None]:
+    """Return a context in which a thread takes the steps of `recovery`."""
+    return repeat_every(PERIOD_S, RecoveryWorker(host, recovery).step)
+
+
+class RecoveryWorker:
+    """Worker of a recovery; `step` waits for the loop, for seconds during a return."""
+
+    def __init__(self, host: Host, recovery: Recovery) -> None:
+        self._host, self._recovery = host, recovery
+
+    def step(self) -> None:
+        """Report, judge and return, whatever is due; an error is logged."""
+        try:
+            loop = self._running_loop()
+            if loop is None:
+                return
+            self._report_steps(loop)
+            if (confirmed := self._recovery.confirm(loop.supervisor, loop.live)) is not None:
+                self._return(loop, confirmed)
+                self._report_steps(loop)
+        except RtloopError as error:
+            log.warning("recovery: %s", error)
+
+    def _running_loop(self) -> RunningLoop | None:
+        """Return the loop that executes ticks; None without one."""
+        supervisor, live = self._host.supervisor, self._host.live
+        if supervisor is None or live is None or supervisor.ended:
+            return None
+        try:
+            return RunningLoop(supervisor, live, self._host.desk)
+        except Refusal:
+            return None
+
+    def _report_steps(self, loop: RunningLoop) -> None:
+        """Send the new steps through the loop, which makes them events of the recording.
+
+        A step that a loop does not acknowledge, because it ends, goes through the next loop.
+        """
+        with use_requester(Requester(origin=Origin.SUPERVISOR)), contextlib.suppress(RtloopError):
+            while (step := self._recovery.oldest_step) is not None and not loop.supervisor.ended:
+                values = (step.step, step.left, step.reason, step.causes)
+                loop.desk.submit(Note.RECOVERY, values=[float(value) for value in values])
+                self._recovery.forget_step(step)
+
+    def _return(self, loop: RunningLoop, confirmed: Return) -> None:
+        """Return to the former state, then watch the loop for one more confirmation."""
+        recovery, serial = self._recovery, confirmed.serial
+        sine = self._host.configuration.service.depolarise if confirmed.options.depolarise else None
+        requester = Requester(
+            origin=Origin.SUPERVISOR, require_permission=partial(self._require_current, serial), may_always_stop=False
+        )
+        self._report_steps(loop)
+        try:
+            with use_requester(requester):
+                come_back(confirmed.former, loop, sine, partial(self._take_step, loop, serial))
+        except RtloopError as error:
+            self._fail(error, loop, serial)
+            return
+        deadline_s = time.monotonic() + confirmed.options.confirmation_s
+        while recovery.is_current(serial) and time.monotonic() < deadline_s:
+            time.sleep(PERIOD_S)
+        recovery.finish(serial)
+
+    def _require_current(self, serial: int) -> None:
+        """Raise Refusal once the recovery `serial` has ended."""
+        if not self._recovery.is_current(serial):
+            raise Refusal("the recovery has ended")
+
+    def _take_step(self, loop: RunningLoop, serial: int, step: ReturnStep) -> None:
+        """Remove the faults after the reset; report the other steps of a return."""
+        if step is ReturnStep.RESET:
+            self._recovery.remove_own_faults()
+            return
+        self._recovery.report(
+            serial, RecoveryStep.DEPOLARISED if step is ReturnStep.DEPOLARISED else RecoveryStep.RETURNING
+        )
+        self._report_steps(loop)
+
+    def _fail(self, error: RtloopError, loop: RunningLoop, serial: int) -> None:
+        """Latch a return that failed without a trip, with the outputs off; leave it to a client that took over."""
+        is_client = isinstance(error, ReferenceReplaced)
+        if not self._recovery.finish(serial, StepReason.CLIENT if is_client else StepReason.REFUSED) or is_client:
+            return
+        log.error("recovery: %s", error)
+        self._host.faults.append(f"recovery: {error}")
+        with use_requester(Requester(origin=Origin.SUPERVISOR)):
+            loop.desk.submit(Kind.SET_MODE, values=[float(Mode.OFF), 0.0, 1.0])

@@ -1,0 +1,66 @@
+"""Frames and arrivals as a relay between driver and node sees them, read from docs/node-protocol.md alone."""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from typing import NamedTuple, Protocol
+
+from tests.node.frames import DRIVE
+
+LOOP, STRANGER = "loop", "stranger"
+"""Senders, as the node sees them."""
+
+
+class Node(Protocol):
+    """A node without a line of its own."""
+
+    def receive(self, data: bytes, sender: str, now_us: int) -> bytes:
+        """Process a datagram; return the answer, empty without one."""
+        ...
+
+    @property
+    def outputs(self) -> tuple[int, ...]:
+        """Codes at the outputs."""
+        ...
+
+    @property
+    def counts(self) -> tuple[int, int]:
+        """Invalid frames and parkings by the watchdog."""
+        ...
+
+
+class DriveFrame(NamedTuple):
+    """Fields of a DRIVE."""
+
+    sequence: int
+    session: int
+    flags: int
+    codes: tuple[int, ...]
+
+
+def parse_drive(data: bytes) -> DriveFrame | None:
+    """Return the fields of a DRIVE; None for another frame."""
+    if len(data) < 28 or data[2] != DRIVE:
+        return None
+    assert struct.unpack("<I", data[-4:])[0] == zlib.crc32(data[:-4])
+    sequence, session, flags, count = struct.unpack_from("<IIBB", data, 4)
+    return DriveFrame(sequence, session, flags, struct.unpack(f"<{count}i", data[24:-4]))
+
+
+class Arrival(NamedTuple):
+    """A datagram that arrived at the loop: "sample" with its sequence and codes, "invalid" or "foreign"."""
+
+    kind: str
+    sequence: int = 0
+    codes: tuple[int, ...] = ()
+
+
+def drive_content(session: int, flags: int, codes: tuple[int, ...]) -> bytes:
+    """Return the bytes of a DRIVE between its sequence and its check."""
+    return struct.pack(f"<IBBHII{len(codes)}i", session, flags, len(codes), 0, 50_000, 0, *codes)
+
+
+def sample_content(session: int, boot: int, codes: tuple[int, ...]) -> bytes:
+    """Return the bytes of a SAMPLE between its sequence and its check."""
+    return struct.pack(f"<IIBBHII{len(codes)}i", session, boot, 1, len(codes), 0, 0, 0, *codes)

@@ -1,0 +1,165 @@
+"""The driver `serial` on a line that loses, doubles and damages bytes, and puts garbage between frames."""
+
+from __future__ import annotations
+
+import array
+import fcntl
+import math
+import os
+import random
+import select
+import struct
+import termios
+import threading
+import time
+import tty
+import zlib
+from pathlib import Path
+
+import pytest
+
+from rtloop.drivers.base import Wiring
+from rtloop.drivers.contract import DriverCalls
+from rtloop.drivers.node.driver import SerialDriver
+from rtloop.drivers.node.options import SerialOptions
+from tests.drivers.relay_frames import LOOP, Arrival
+from tests.drivers.relayed_nodes import PythonNode
+from tests.faults.evidence import wait_for
+from tests.node.accounts import COUNTS, accounts
+from tests.node.frames import SAMPLE, cobs, uncobs
+
+TICKS, PERIOD_US = 300, 1000
+LONGEST_CODE = 2896
+"""Bytes of a frame on the line from which on the driver skips to its end."""
+
+
+class Line:
+    """A pseudo-terminal with a node; a thread answers until `leave`, then the test does by `exchange`."""
+
+    def __init__(self, link: Path) -> None:
+        self._fd, self._end = os.openpty()
+        tty.setraw(self._end)
+        link.symlink_to(os.ttyname(self._end))
+        self.node, self._now_us, self._rest = PythonNode(), 0, b""
+        self._is_left = threading.Event()
+        self._thread = threading.Thread(target=self._serve)
+        self._thread.start()
+
+    def _serve(self) -> None:
+        while not self._is_left.is_set():
+            for answer in self._answers(0.01):
+                os.write(self._fd, cobs(answer))
+
+    def leave(self) -> None:
+        """End the thread."""
+        self._is_left.set()
+        self._thread.join()
+
+    def serve_again(self) -> None:
+        """Answer by a thread again."""
+        self._is_left.clear()
+        self._thread = threading.Thread(target=self._serve)
+        self._thread.start()
+
+    def _answers(self, timeout_s: float) -> list[bytes]:
+        """Return the node's answers to the frames that have come, which must be whole."""
+        if not select.select([self._fd], [], [], timeout_s)[0]:
+            return []
+        *frames, self._rest = (self._rest + os.read(self._fd, 65_536)).split(b"\0")
+        self._now_us += PERIOD_US
+        answers = [self.node.receive(uncobs(frame), LOOP, self._now_us) for frame in frames if frame]
+        return [answer for answer in answers if answer]
+
+    def exchange(self, damage: random.Random, fd: int) -> bytes:
+        """Answer a drive by bytes that are damaged at random; return them once they are at the driver's end."""
+        answers: list[bytes] = []
+        while not answers:
+            answers = self._answers(60.0)
+        sent = b"".join(spoilt(cobs(answer), damage) for answer in answers)
+        os.write(self._fd, sent)
+        waiting = array.array("i", [0])
+
+        def have_come() -> bool:
+            fcntl.ioctl(fd, termios.FIONREAD, waiting)
+            return waiting[0] == len(sent)
+
+        wait_for(have_come, "the bytes", poll_s=0.0)
+        return sent
+
+    def close(self) -> None:
+        """End the thread and close the line."""
+        self.leave()
+        os.close(self._fd)
+        os.close(self._end)
+
+
+def spoilt(line: bytes, chance: random.Random) -> bytes:
+    """Return the bytes of a frame with something wrong at one of two, or a good frame."""
+    place = chance.randrange(len(line))
+    return {
+        0: lambda: b"",
+        1: lambda: line + line,
+        2: lambda: line[:place] + line[place + 1 :],  # a byte is lost, at times the end of the frame
+        3: lambda: line[:place] + bytes([line[place] ^ 1 << chance.randrange(8)]) + line[place + 1 :],
+        4: lambda: chance.randbytes(20) + b"\0" + line,
+        5: lambda: bytes(3) + line,
+        6: lambda: line[:place] + b"\0" + line[place:],
+    }.get(chance.randrange(14), lambda: line)()
+
+
+def arrivals_of(stream: list[bytes], boot: int, session: int) -> list[list[Arrival]]:
+    """Return the frames that end in the bytes of each tick."""
+    ticks, rest = [], b""
+    for data in stream:
+        *lines, rest = (rest + data).split(b"\0")
+        ticks.append([arrival_of(line, boot, session) for line in lines if line])
+    return ticks
+
+
+def arrival_of(line: bytes, boot: int, session: int) -> Arrival:
+    """Return what the bytes between two 0 are."""
+    try:
+        content = uncobs(line) if len(line) < LONGEST_CODE else b""
+    except ValueError:
+        content = b""
+    if len(content) != 36 or content[2] != SAMPLE or struct.unpack("<I", content[-4:])[0] != zlib.crc32(content[:-4]):
+        return Arrival("invalid")
+    sequence, *owner, code = struct.unpack("<4xIII12xi4x", content)
+    assert owner == [session, boot]
+    return Arrival("sample", sequence, (code,))
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_the_counts_are_what_the_line_did(seed, tmp_path):
+    line, chance = Line(tmp_path / "tty"), random.Random(seed)
+    options = SerialOptions(
+        device=str(tmp_path / "tty"), hold_ticks=2, error_limit=1_000_000, watchdog_ms=5000, wait_s=60
+    )
+    driver = SerialDriver(options, {"x": Wiring("adc0", "dac0")}, 100.0)
+    calls = DriverCalls(driver.open(), driver.facts)
+    calls.read()
+    line.leave()
+    card = driver._opened_card
+    first, results, stream = int(card["sequence"][0]), [], []
+    start_s = time.monotonic()
+    for tick in range(TICKS):
+        results.append(calls.read())
+        volts = 5.0 * math.sin(0.7 * tick)
+        assert calls.write([volts]) == 0
+        stream.append(line.exchange(chance, int(card["fd"][0])))
+        assert line.node.volts(line.node.outputs[0]) == pytest.approx(volts, abs=1e-5)
+        assert time.monotonic() < start_s + 120
+    boot, session = int(card["boot"][0]), int(card["session"][0])
+    line.serve_again()
+    driver.close()
+    line.close()
+    arrivals = [[Arrival("sample", first)], *arrivals_of(stream, boot, session)[: TICKS - 1]]
+    truth, got = accounts(arrivals, first), [values[2 : 2 + len(COUNTS)] for _, values in results]
+    assert got == truth
+    assert truth[-1][0] > 0 < truth[-1][2]
+    newest, reading = first, 0.0
+    for arrived, (_, values) in zip(arrivals, results, strict=True):
+        for sample in arrived:
+            if sample.kind == "sample" and sample.sequence > newest:
+                newest, reading = sample.sequence, line.node.volts(sample.codes[0])
+        assert newest == first or values[0] == pytest.approx(reading, abs=1e-8)
