@@ -142,7 +142,9 @@ def test_a_level_below_the_remanence_is_named() -> None:
 
     def warnings(*levels_um: float) -> list[str]:
         reference = f'[axis.reference]\nkind = "steps"\nlevels = {list(levels_um)}\ndwell_s = 0.1\n'
-        text = STAGE.replace(f"drive_min_v = {LOWEST_V}", "drive_min_v = 0.0").replace("command_um = 60.0", "command_um = 39.0")
+        text = STAGE.replace(f"drive_min_v = {LOWEST_V}", "drive_min_v = 0.0").replace(
+            "command_um = 60.0", "command_um = 39.0"
+        )
         lines = cautions(prepare(parse(text + reference, "stage", Path(), "stage")))
         return [line for line in lines if line.startswith("axis.x.reference")]
 

@@ -15,7 +15,7 @@ import numpy as np
 from rtloop.drivers.base import Channel, Driver, Exchanges, Facts, Pointers, Wiring, require_channels
 from rtloop.drivers.errors import DriverError
 from rtloop.drivers.node import frames
-from rtloop.drivers.node.card import OBSERVED, make_card
+from rtloop.drivers.node.card import OBSERVED, WINDOW, make_card
 from rtloop.drivers.node.exchange import HIGH_V, node_read, node_write
 from rtloop.drivers.node.failures import failure_text
 from rtloop.drivers.node.frames import Drive, Sample, Welcome
@@ -110,6 +110,7 @@ class NodeDriver(Driver):
             session=self._session, boot=welcome.boot, sequence=last, last_sequence=last, newest=last,
         )  # fmt: skip
         self._set_codes([scale.safe for scale in welcome.outputs])
+        self._arrays["ring_ns"][last % WINDOW] = time.monotonic_ns()
         return Pointers(self._card.ctypes.data, read, write)
 
     def measure_exchanges(self, count: int) -> Exchanges:

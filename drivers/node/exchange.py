@@ -37,7 +37,7 @@ from rtloop.foundation.native.pointers import SIGNATURE, address_pointer, carray
 
 FAILED, GOOD, HELD = -1, 0, 1
 MAX_FRAMES_PER_TICK = 64
-OPEN_TRIES, OPEN_WAIT_NS = 20, 5_000_000
+OPEN_TRIES, OPEN_WAIT_NS = 200, 5_000_000
 RISE, FALL = 2, 1
 """Steps of the error level for a tick without and with its answer (LinuxCNC, hm2_eth)."""
 EXPECTED, ANSWERED, MISSING = 1, 2, 3

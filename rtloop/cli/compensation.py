@@ -10,7 +10,7 @@ import click
 from rtloop.cli.exit_codes import report_errors
 from rtloop.cli.identify import AXIS, PLOT
 from rtloop.cli.options import CONFIG, JSON, OUTPUT
-from rtloop.cli.output import print_result
+from rtloop.cli.output import print_result, print_warnings
 from rtloop.errors import ConfigError
 from rtloop.values import to_jsonable
 from rtloop.workbench.hysteresis_text import print_files
@@ -21,7 +21,12 @@ RANDOM_COMMANDS = 20_000
 
 @click.command()
 @CONFIG
-@click.option("--actuator", type=OUTPUT, required=True, help="File with the identified [axis.feedforward].")
+@click.option(
+    "--actuator",
+    type=OUTPUT,
+    required=True,
+    help="File with the actuator's [axis.feedforward], from another recording than CONFIG's inverse.",
+)
 @AXIS
 @click.option(
     "--command-um",
@@ -34,7 +39,9 @@ RANDOM_COMMANDS = 20_000
 def compensation(as_json: bool, **options: Any) -> None:
     """Compute the hysteresis that the inverse of CONFIG leaves.
 
-    For the identified actuator: the gain ρ, the remaining hysteresis Ω and its bound ξ.
+    For the actuator: the gain ρ, the remaining hysteresis Ω and its bound ξ. ACTUATOR is the best known model of the
+    real actuator: identified from another recording than the inverse of CONFIG, or the model of a simulated rig. With
+    the model from which CONFIG's inverse is computed, only the dead band is left, and a warning says so.
     """
     print_result(compensation_report(**options), as_json, _print_compensation)
 
@@ -118,10 +125,12 @@ def _print_compensation(report: dict[str, Any]) -> None:
         f"the safe bound Σ ζ|w|: {report['triangle_bound_um']:.4f} µm"
     )
     if report["same_model"]:
-        out.print(
-            "the actuator equals the model from which the inverse is computed: the deviation is that of the dead band "
-            "below the first threshold, without an error of the model. For the error of the model, give --actuator the "
-            "model identified from another recording"
+        print_warnings(
+            [
+                "the actuator equals the model from which the inverse is computed: the deviation is that of the dead "
+                "band below the first threshold, without an error of the model. For the error of the model, give "
+                "--actuator the model identified from another recording"
+            ]
         )
     if report["dead_band"] == "exact":
         out.print("these figures leave out dead_band = 'exact', with which less hysteresis remains")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import shlex
 import sys
 from collections.abc import Callable, Mapping
@@ -14,6 +15,7 @@ from rtloop.cli.exit_codes import report_errors
 from rtloop.cli.options import FILES, JSON, OUTPUT
 from rtloop.cli.output import print_result
 from rtloop.cli.output.progress import Counter
+from rtloop.errors import OutputError
 from rtloop.values import count_text
 from rtloop.workbench.tables import console, escape, format_number, table
 
@@ -122,7 +124,12 @@ def import_file(
     table = read_table(file, merged.group)
     if not merged and not is_from_recording(table):
         return ColumnListing(list_columns(file, table, merged))
-    report = import_data(file, merged, output, table=table, progress=progress)
+    try:
+        report = import_data(file, merged, output, table=table, progress=progress)
+    except OutputError as error:
+        if error.number != errno.EEXIST:
+            raise
+        raise OutputError(f"{error}; --out FILE writes another one", error.number) from None
     return report | {"mapping": None if mapping_path is None else str(mapping_path)}
 
 

@@ -37,6 +37,7 @@ NAMES = {"law": "my_law", "driver": "my_card"}
 @click.option("--resonance-hz", type=float, help="Resonance of the stage, 1 to 10000 Hz [800].")
 @click.option("--damping", type=float, help="Damping ratio of the resonance, 0.001 to 0.9 [0.02].")
 @click.option("--range-um", type=float, help="Position at the largest drive, from rest, in µm [20].")
+@click.option("--gain-um-per-v", type=float, help="In place of --range-um: that position divided by the largest drive.")
 @click.option("--drive-v", type=float, help="Largest drive, 0.1 to 10 V [10].")
 @click.option("--drive-min-v", type=float, help="Lowest drive, minus the largest drive to 0 V [minus the largest].")
 @click.option(
@@ -45,8 +46,12 @@ NAMES = {"law": "my_law", "driver": "my_card"}
     help="Largest difference between rising and falling positions at one drive, in percent of the stroke between the "
     "lowest and the largest drive, 0 to 30 [15.3].",
 )
-@click.option("--sensor-um-per-v", type=float, help="Scale of the sensor, which reads ±10 V [a quarter of the travel].")
+@click.option("--sensor-um-per-v", type=float, help="Scale of the sensor, up to 10 V [a quarter of the travel].")
+@click.option(
+    "--sensor-min-v", type=float, help="Lowest reading of the sensor, -10 to 0 V; below it, the loop trips [-10]."
+)
 @click.option("--sensor-noise-um", type=float, help="Noise of the sensor, µm rms [a 4000th of the travel].")
+@click.option("--sensor-noise-mv", type=float, help="In place of --sensor-noise-um: noise of the reading, mV rms.")
 @click.option("--sensor-resolution-um", type=float, help="Step of the sensor's reading, µm [as the noise].")
 @click.option("--rate-hz", type=float, help="Rate of the loop [10000 Hz; more for a resonance above 1000 Hz].")
 @report_errors
@@ -87,7 +92,7 @@ def _starter(kind: str, name: str | None, config: Path | None, figures: dict[str
     `config` is the configuration for a law, or None. Raises RtloopError where it is unreadable or invalid.
     """
     from rtloop.starters import folder
-    from rtloop.starters.stage_figures import StageFigures
+    from rtloop.starters.stage_figures import stage_figures
 
     if name is not None and kind not in NAMES:
         raise click.UsageError(f"--name: not allowed with --kind {kind}; allowed with --kind law and --kind driver")
@@ -96,7 +101,7 @@ def _starter(kind: str, name: str | None, config: Path | None, figures: dict[str
         raise click.UsageError(f"--{option}: not allowed with --kind {kind}; allowed with --kind stage")
     if kind == "stage":
         try:
-            return folder.stage(StageFigures(**figures))
+            return folder.stage(stage_figures(figures))
         except ValueError as error:
             raise click.UsageError(str(error)) from None
     if kind == "paper":

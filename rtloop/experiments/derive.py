@@ -88,8 +88,9 @@ def read_metadata(configuration: str) -> dict[str, Any] | None:
     """Return the description of the run in the first line of a configuration's text; None where it holds none.
 
     Keys, as `derive_configuration` writes them and unchecked: name (of the experiment), run (its label), runs (their
-    number), axis, may_trip, ticks, middle_um (the middle of its motion; missing: 0), parameters, asked (the axis's specification), beside (whether the run is one of the
-    second configuration), reduced (sentences on reduced defaults), segments (each a list of the fields of Segment).
+    number), axis, may_trip, ticks, middle_um (the middle of its motion; 0 if missing), parameters, asked (the axis's
+    specification), beside (whether the run is one of the second configuration), reduced (sentences on reduced
+    defaults), segments (each a list of the fields of Segment).
     """
     first_line = configuration.partition("\n")[0].removeprefix("# ")
     if not first_line.startswith(METADATA_PREFIX):

@@ -125,8 +125,11 @@ def _experiment_section(
         if analysis
         else [],
         "tables": analysis.tables if analysis else (),
-        "notes": [*_middle_notes(runs[0]), *(f"Reduced: {text}." for text in runs[0].reductions),
-                  *(analysis.notes if analysis else ())],  # fmt: skip
+        "notes": [
+            *_middle_notes(runs[0]),
+            *(f"Reduced: {text}." for text in runs[0].reductions),
+            *(analysis.notes if analysis else ()),
+        ],
     }
     return section, files
 

@@ -13,7 +13,7 @@ from rtloop.configuration.axis import AxisOptions
 from rtloop.configuration.schedule import ModeName
 from rtloop.design.synthesis.specification import SpecificationOptions
 from rtloop.experiments.linear_model import LinearModel, linear_model
-from rtloop.experiments.timeline import Middle, Timeline, hold
+from rtloop.experiments.timeline import ABOUT_ZERO, Middle, Timeline, hold
 from rtloop.hysteresis.plays import loading_curve, model_output
 from rtloop.hysteresis.reach import PositionRange, reachable_range
 
@@ -58,7 +58,7 @@ class Setting:
         None: no rest. It depolarises about 0, or about the middle of the allowed drive where that has one sign. With
         `uses_whole_drive` it does so in any case, and rests and moves about 0.
         """
-        timeline = Timeline(self.rate_hz, Middle() if uses_whole_drive else self.middle)
+        timeline = Timeline(self.rate_hz, ABOUT_ZERO if uses_whole_drive else self.middle)
         low_v, high_v = self.drive_range_v
         if not self.is_virgin and (uses_whole_drive or self.is_one_sided):
             timeline.depolarise((high_v - low_v) / 2, (high_v + low_v) / 2)
@@ -135,7 +135,7 @@ class Setting:
     def middle(self) -> Middle:
         """Middle about which experiments move: 0, or that of the reachable range of a drive of one sign."""
         if not self.is_one_sided:
-            return Middle()
+            return ABOUT_ZERO
         middle_um = float(f"{sum(self._one_sided_range) / 2:.3g}")
         return Middle(middle_um, float(model_output(self.axis.feedforward.actuator().inverse(), [middle_um])[0]))
 

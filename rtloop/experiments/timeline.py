@@ -58,10 +58,13 @@ class Middle(NamedTuple):
         return {**reference, key: reference[key] + offset}
 
 
+ABOUT_ZERO = Middle()
+
+
 class Timeline:
     """Segments of one run, in order, and the reference of each."""
 
-    def __init__(self, rate_hz: float, middle: Middle = Middle()) -> None:
+    def __init__(self, rate_hz: float, middle: Middle = ABOUT_ZERO) -> None:
         """Begin without segments; `rate_hz` converts their durations in s to ticks.
 
         References of added segments are about `middle`, to which a slow half cycle leads first.

@@ -13,7 +13,7 @@ from collections.abc import Iterable
 
 from rtloop.starters.stage_actuator import Actuator, make_actuator
 from rtloop.starters.stage_excitation import excitation_values
-from rtloop.starters.stage_figures import RATES_HZ, SAMPLES_PER_PERIOD, StageFigures
+from rtloop.starters.stage_figures import RATES_HZ, SAMPLES_PER_PERIOD, TRAVEL_V, StageFigures
 from rtloop.starters.templates import fill_template
 
 FILES = ("stage.toml", "stage-spec.toml", "stage-sine.toml", "stage-step.toml")
@@ -28,8 +28,8 @@ INTERLOCK_TRAVELS, INTERLOCK_V = 2.25, 9.89
 """Position interlock: as a multiple of the travel, and at most the position at this reading. The interlock of the
 sensor's range trips at 9.99 V.
 """
-TRAVEL_V = 4.0
-"""Reading at the end of the travel of a sensor whose scale is not given."""
+SENSOR_MARGIN_V, NOISE_DEVIATIONS = 0.01, 10.0
+"""Distance of the interlock from the sensor's lowest reading, and from 0 V in standard deviations of the noise."""
 SETTLING_PERIODS, RESPONSE_PER_OMEGA = 4.8, 0.15
 """Settling time to specify, in periods of the resonance; pole of the tracking weight relative to ω."""
 
@@ -59,7 +59,7 @@ def _values(figures: StageFigures) -> dict[str, object]:
         "resolution_um": resolution_um,
         "position_um": position_um,
         **_loop_numbers(figures, actuator),
-        **_travel_numbers(figures.range_um, min(figures.range_um, position_um)),
+        **_travel_numbers(figures.range_um, min(figures.range_um, position_um), max(actuator.lowest_um, 0.0)),
     }
     rate_hz = _rate_hz(figures)
     period_ticks = rate_hz / figures.resonance_hz
@@ -71,6 +71,7 @@ def _values(figures: StageFigures) -> dict[str, object]:
         "thresholds_v": _numbers(actuator.thresholds_v),
         "weights_um_per_v": _numbers(actuator.weights_um_per_v),
         "levels": _numbers(_levels_um(actuator, position_um)),
+        "sensor_min_line": _sensor_min_line(figures.sensor_min_v, noise_um / um_per_v),
         "delay_ticks": DELAY_TICKS,
         "swing_ticks": math.ceil(1.5 * period_ticks),
         "frozen_ticks": max(50, math.ceil(period_ticks / 2)),
@@ -99,11 +100,22 @@ def _loop_numbers(figures: StageFigures, actuator: Actuator) -> dict[str, float]
     }
 
 
-def _travel_numbers(range_um: float, reach_um: float) -> dict[str, float]:
-    """Return the numbers that are shares of the travel, or of its part within the position interlock, `reach_um`."""
+def _sensor_min_line(sensor_min_v: float | None, noise_v: float) -> str:
+    """Return the interlock at the sensor's lowest reading as a line of TOML, below the noise at rest; "" for none."""
+    if sensor_min_v is None:
+        return ""
+    interlock_v = min(sensor_min_v + SENSOR_MARGIN_V, -max(SENSOR_MARGIN_V, NOISE_DEVIATIONS * noise_v))
+    return f"sensor_min_v = {_number(interlock_v)}           # the sensor reads from {sensor_min_v:g} V on\n"
+
+
+def _travel_numbers(range_um: float, reach_um: float, remanence_um: float) -> dict[str, float]:
+    """Return the numbers that are shares of the travel, or of its part within the position interlock, `reach_um`.
+
+    `remanence_um` is the position below which a drive of one sign does not bring the stage back; 0 for any other drive.
+    """
     return {
         "largest_command_um": COMMAND_SHARE * reach_um,
-        "reference_um": COMMAND_SHARE / 1.1 * reach_um,
+        "reference_um": COMMAND_SHARE / 1.1 * (reach_um - remanence_um),
         "oscillation_um": range_um / 5,
         "disturbance_um": range_um / 20,
         "disturbance_error_um": range_um / 200,

@@ -1,7 +1,8 @@
 """Excitation of a stage without a controller, within the limits of drive and sensor: a slow sine and a step.
 
 The sine begins at 0 V, as the stage rests there, also where it moves about another drive. A step of the position by x
-swings to x (1 + exp(−πζ/√(1 − ζ²))) before it settles.
+swings to x (1 + exp(−πζ/√(1 − ζ²))) before it settles. A sensor that shows no position below 0 sees the step down to
+half the drive alone, after which the position swings to 0 at most.
 """
 
 from __future__ import annotations
@@ -38,6 +39,7 @@ def excitation_values(
         "sine_phase_deg": -math.degrees(math.asin(offset_v / amplitude_v)) + 0.0,
         "sine_frequency_hz": frequency_hz,
         "step_v": step_v,
+        "step_low_v": 0.0 if figures.sensor_min_v in (None, -10.0) else step_v / 2,
     }
     return {
         **{name: float(f"{value:.9g}") for name, value in numbers.items()},

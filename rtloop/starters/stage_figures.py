@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 RATES_HZ = (10_000.0, 20_000.0, 50_000.0, 100_000.0)
 SAMPLES_PER_PERIOD, LEAST_SAMPLES_PER_PERIOD = 10, 4
 """Samples in a period of the resonance: at a rate that is chosen, and at least at a rate that is given."""
 LARGEST_HYSTERESIS_PERCENT = 30.0
+TRAVEL_V = 4.0
+"""Reading at the end of the travel of a sensor whose scale is not given."""
 
 
 @dataclass(frozen=True)
@@ -32,6 +35,8 @@ class StageFigures:
     The drive moves over its whole range, often enough that the loop repeats.
     """
     sensor_um_per_v: float | None = None
+    sensor_min_v: float | None = None
+    """Lowest reading of the sensor, −10 to 0 V; the stage rests at 0 V."""
 
     def __post_init__(self) -> None:
         """Require figures within their ranges. Raises ValueError, one sentence for the first that is not."""
@@ -48,6 +53,13 @@ class StageFigures:
             _require(
                 "sensor-um-per-v", self.sensor_um_per_v, lowest, highest, "µm/V: ±10 V show half of the travel or more"
             )
+        if self.sensor_min_v is not None:
+            _require("sensor-min-v", self.sensor_min_v, -10.0, 0.0, "V, as the stage rests at 0 V")
+            if self.sensor_min_v > -10.0 and self.drive_min_v != 0.0:
+                raise ValueError(
+                    f"--sensor-min-v: value is {self.sensor_min_v:g}; allowed with --drive-min-v=0 alone, as a stage "
+                    "that goes below 0 µm needs a sensor that shows it"
+                )
         for name, value in (
             ("sensor-noise-um", self.sensor_noise_um),
             ("sensor-resolution-um", self.sensor_resolution_um),
@@ -57,6 +69,24 @@ class StageFigures:
         if self.rate_hz is not None:
             least_hz = LEAST_SAMPLES_PER_PERIOD * self.resonance_hz
             _require("rate-hz", self.rate_hz, least_hz, RATES_HZ[-1], "Hz, from four samples in a period on")
+
+
+def stage_figures(values: Mapping[str, float]) -> StageFigures:
+    """Return the figures of a stage from options by their names, with `gain_um_per_v` and `sensor_noise_mv` converted.
+
+    Raises ValueError for a value out of its range, and for two options that set one figure.
+    """
+    figures = dict(values)
+    for option, replaced in (("gain_um_per_v", "range_um"), ("sensor_noise_mv", "sensor_noise_um")):
+        if option in figures and replaced in figures:
+            names = (f"--{name.replace('_', '-')}" for name in (option, replaced))
+            raise ValueError(f"{' and '.join(names)}: both set one figure; use one of them")
+    if (gain_um_per_v := figures.pop("gain_um_per_v", None)) is not None:
+        figures["range_um"] = gain_um_per_v * figures.get("drive_v", StageFigures.drive_v)
+    if (noise_mv := figures.pop("sensor_noise_mv", None)) is not None:
+        um_per_v = figures.get("sensor_um_per_v", figures.get("range_um", StageFigures.range_um) / TRAVEL_V)
+        figures["sensor_noise_um"] = 1e-3 * noise_mv * um_per_v
+    return StageFigures(**figures)
 
 
 def _require(name: str, value: float, lowest: float, highest: float, unit: str) -> None:

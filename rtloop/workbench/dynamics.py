@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -41,7 +41,7 @@ if TYPE_CHECKING:
 class DynamicsResult(IdentifiedModel):
     """Identified dynamics: `fit` has D(s) and the evidence, `runs` and `loops` the recordings and their closed loops.
 
-    `excitation` is the input and output of the first recording, `actuator` the model of the hysteresis before the
+    `excitation` is the input and output of the first recording, without free motion, `actuator` the model of the hysteresis before the
     dynamics, for the input "hysteresis". `response` is a measured frequency response, `comparison` the model's
     deviation from it; None without a recording to compare.
     """
@@ -102,7 +102,7 @@ class DynamicsResult(IdentifiedModel):
             {"recordings": [run.name for run in self.runs], "digests": [run.digest for run in self.runs]}
             | {"input": self.input, "sampled_together": self.runs[0].is_sampled_together}
             | {"loop": loop and {"from_tick": loop.start, "to_tick": loop.end, "outside": loop.names}}
-            | {key: value for key, value in dataclass_fields(fit).items() if key != "model"}
+            | {key: value for key, value in dataclass_fields(fit).items() if key not in ("model", "free_motion_um")}
             | {"order": self.order, "tests": dataclass_fields(fit.tests) | tests}
             | {"frequency_response": self.comparison, "output": self.output, "plot": self.picture}
         )
@@ -159,6 +159,8 @@ def fit_dynamics(
         fit = identify_recorded_dynamics(excitations[0], order, largest_order, criterion, excitations[1:], delay)
     except ValueError as fault:
         raise ConfigError("identify dynamics", [str(fault)]) from None
+    if fit.free_motion_um is not None:
+        excitations[0] = replace(excitations[0], position_um=excitations[0].position_um - fit.free_motion_um)
     response, comparison = None, None
     if compare is not None:
         closed_loop = find_closed_loop(compare, axis, loop, outside)

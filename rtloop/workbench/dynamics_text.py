@@ -38,6 +38,15 @@ def print_dynamics(out: Console, report: dict[str, Any]) -> None:
     spread = f" ± {report['static_gain_std']:.2g} (1σ)"
     out.print(f"D(0) = 1; {static_gain_text(report['static_gain'], report['input'], spread)}", markup=False)
     out.print(f"delay {count_text(report['delay_ticks'], 'sample')}; fit {report['fit_percent']:.2f} %")
+    out.print(
+        f"prediction error, one step ahead: {report['rms_error_um']:.5f} µm rms over the whole recording; the table "
+        "has it where the model was not fitted, if the input changes there"
+    )
+    if report["free_motion_s"]:
+        out.print(
+            f"the recording does not begin at rest: free motion in its first {1e3 * report['free_motion_s']:.3g} ms, "
+            "which no recorded input explains, was estimated and left out"
+        )
     if report["sampled_together"]:
         out.print(
             f"{SAMPLED_TOGETHER[0].upper()}{SAMPLED_TOGETHER[1:]}, the delay is one sample more than if the position "

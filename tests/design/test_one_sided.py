@@ -1,4 +1,4 @@
-"""A drive of 0 … 10 V: the remanence, steps above it, the levels of taps, and what is said of a loop that leaves an error."""
+"""A drive of 0 … 10 V: the remanence, steps and levels of taps above it, and a static error that is named."""
 
 from __future__ import annotations
 

@@ -136,7 +136,7 @@ def test_a_flood_of_garbage_to_both_ports_moves_nothing_and_ends_nothing(node):
         is_ended = threading.Event()
         thread = threading.Thread(target=flood, args=([local_port(driver), node.options["port"]], is_ended))
         thread.start()
-        statuses, start_s = [], time.monotonic()
+        statuses, values, start_s = [], list[float](), time.monotonic()
         for tick in range(1000):
             calls.write([0.001 * tick])
             time.sleep(max(0.0, start_s + (tick + 1) / 2000 - time.monotonic()))

@@ -250,7 +250,9 @@ def test_steps_on_a_drive_of_one_sign_are_analysed_about_the_middle(tmp_path: Pa
     assert rows["static error, median"]["run"] < 1.0
     assert rows["settling time to 5 %, median"]["mark"] == "good"
     assert section["middle_um"] == pytest.approx(middle_um(), rel=0.005)
-    assert section["notes"][0].startswith(f"The drive has one sign: the experiment moves about {section['middle_um']:g} µm")
+    assert section["notes"][0].startswith(
+        f"The drive has one sign: the experiment moves about {section['middle_um']:g} µm"
+    )
     (run,) = load_runs([path])
     for name in ("reference_um", "position_um", "command_um"):
         assert run.signal(name) + section["middle_um"] == pytest.approx(signals[f"x_{name}"])
@@ -258,7 +260,7 @@ def test_steps_on_a_drive_of_one_sign_are_analysed_about_the_middle(tmp_path: Pa
 
 
 def test_compensation_on_a_drive_of_one_sign_agrees_with_its_model(tmp_path: Path) -> None:
-    """The rig has the plays of the inverse: nothing is left, and the model says so, memory of the way there included."""
+    """The rig has the plays of the inverse: nothing is left, and the model says so, with the memory of the way there."""
     path = recorded_one_sided("compensation", tmp_path, frequency_hz=4.0)
     (section,) = make_report(load_runs([path])).content["experiments"]
     assert section["problem"] is None

@@ -236,6 +236,7 @@ def test_an_output_that_exists_stays_as_it_is(scan: Path, folder: Path):
     (folder / "scan.mcap").write_bytes(b"precious")
     result = run("import", scan, "--all")
     assert result.exit_code == 73
+    assert "scan.mcap exists already; a recording is never overwritten; --out FILE writes another one" in result.stderr
     assert (folder / "scan.mcap").read_bytes() == b"precious"
     assert {file.name for file in folder.iterdir()} == {"scan.mat", "scan.mcap"}
 

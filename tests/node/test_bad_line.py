@@ -19,9 +19,9 @@ from pathlib import Path
 import pytest
 
 from rtloop.drivers.base import Wiring
-from rtloop.drivers.contract import DriverCalls
 from rtloop.drivers.node.driver import SerialDriver
 from rtloop.drivers.node.options import SerialOptions
+from tests.drivers.node_calls import open_calls
 from tests.drivers.relay_frames import LOOP, Arrival
 from tests.drivers.relayed_nodes import PythonNode
 from tests.faults.evidence import wait_for
@@ -136,7 +136,7 @@ def test_the_counts_are_what_the_line_did(seed, tmp_path):
         device=str(tmp_path / "tty"), hold_ticks=2, error_limit=1_000_000, watchdog_ms=5000, wait_s=60
     )
     driver = SerialDriver(options, {"x": Wiring("adc0", "dac0")}, 100.0)
-    calls = DriverCalls(driver.open(), driver.facts)
+    calls = open_calls(driver)
     calls.read()
     line.leave()
     card = driver._opened_card

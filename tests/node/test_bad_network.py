@@ -21,6 +21,7 @@ from rtloop.drivers.node.driver import UdpDriver
 from rtloop.drivers.node.options import UdpOptions
 from tests.drivers.lossy_relay import Relay, relayed
 from tests.drivers.network_plan import DAMAGES, Copy, Plan, Script
+from tests.drivers.node_calls import open_calls
 from tests.drivers.relay_frames import Arrival
 from tests.drivers.relayed_nodes import LibraryNode, PythonNode
 from tests.node.accounts import COUNTS, accounts
@@ -45,7 +46,7 @@ def driver_behind(relay: Relay, **options: object) -> UdpDriver:
 def started(driver: UdpDriver) -> DriverCalls:
     """Open a driver and make its first read, again where this machine let the relay wait too long meanwhile."""
     while True:
-        calls = DriverCalls(driver.open(), driver.facts)
+        calls = open_calls(driver)
         if calls.read()[0] == 0:
             return calls
         assert "does not answer" in str(driver.error)
@@ -97,7 +98,7 @@ def assert_true(run: Run, node: AnyNode) -> None:
     assert run.relay.applied
     for sequence, codes in run.relay.applied:
         assert node.volts(codes[0]) == pytest.approx(run.drives_v[sequence], abs=0.51 * lsb_v), sequence
-    newest, readings = run.first, run.column("reading_v")
+    newest, reading, readings = run.first, (0,), run.column("reading_v")
     for tick, arrived in enumerate(run.arrivals):
         for sample in arrived:
             if sample.kind == "sample" and sample.sequence > newest:

@@ -220,7 +220,8 @@ def test_plot_writes_a_picture(paced: bool, tmp_path: Path):
     with Image.open(plot(path, tmp_path / "run.png")) as picture:
         assert (picture.format, picture.width > 1000) == ("PNG", True)
     drawn = plot(path, tmp_path / "run.svg").read_text(encoding="utf-8")
-    assert ("unpaced: no deadlines" in drawn) == (not paced)
+    assert ("timing / µs" in drawn) == paced
+    assert "error / µm" in drawn
     with pytest.raises(RecordingError, match="no tick from"):
         plot(path, tmp_path / "run.png", start_s=100.0)
 

@@ -14,16 +14,21 @@ from rtloop import signals
 from rtloop.configuration.file import Configuration, load, parse
 from rtloop.configuration.prepare import Prepared, prepare
 from rtloop.configuration.service import RecoverOptions
+from rtloop.engine.memory import SharedBlock, Word
+from rtloop.engine.messages import Kind
 from rtloop.errors import ConfigError
 from rtloop.kernel.reference import Generator
 from rtloop.recording.file.topics.recovery_steps import RecoveryStep, StepReason
 from rtloop.service.changing.active_references import NO_TRIP, Trip
 from rtloop.service.changing.references import Setting
-from rtloop.service.recovering.comeback import BUMP_FACTOR, raised_cosine, ramp_ticks
+from rtloop.service.desk import Desk, Refusal, Requester, use_requester
+from rtloop.service.recovering.comeback import BUMP_FACTOR, RunningLoop, raised_cosine, ramp_ticks
 from rtloop.service.recovering.recovery import HOUR_S, LONGEST_PAUSE_S, Recovery
 from rtloop.service.recovering.soundness import unsound_reason
+from rtloop.service.recovering.worker import RecoveryWorker
 from rtloop.signals import Flag, Mode
 from tests.laws.test_shipped import DEPLOY
+from tests.service.test_after_mishap import SIZES
 
 WAIT_S, PERIOD_S, CONFIRMATIONS = 2.0, 0.5, 3
 OPTIONS = {"wait_s": WAIT_S, "confirmation_s": PERIOD_S, "confirmations": CONFIRMATIONS, "max_per_hour": 2}
@@ -288,6 +293,36 @@ def test_a_client_that_takes_over_ends_it():
     bench.recovery.end()
     assert not bench.recovery.is_current(confirmed.serial)
     assert not bench.recovery.finish(confirmed.serial)
+
+
+def test_no_command_of_an_ended_recovery_reaches_the_loop():
+    """A client's stop came after the last confirmation, and before the first command of the return."""
+    bench, block = Bench(), SharedBlock.create(SIZES)
+    bench.trip(Flag.TRIP_STALE)
+    confirmed = bench.run(10.0)
+    bench.recovery.end()
+    assert bench.steps
+    worker = RecoveryWorker(bench.host, bench.recovery)  # type: ignore[arg-type]
+    worker._return(RunningLoop(bench.loop, bench.loop, Desk(block)), confirmed)  # type: ignore[arg-type]
+    assert block.load(Word.COMMANDS_HEAD) == 0
+    assert bench.host.faults == []
+
+
+@pytest.mark.parametrize("command", [(Kind.RESET_TRIP, ()), (Kind.SET_MODE, (0.0,)), (Kind.SET_MODE, (3.0,))])
+def test_a_recovery_without_permission_may_send_nothing(command):
+    """A client's stop and reset need no permission; those of a recovery do."""
+
+    def refuse() -> None:
+        raise Refusal("ended")
+
+    kind, values = command
+    block = SharedBlock.create(SIZES)
+    with (
+        use_requester(Requester(require_permission=refuse, may_always_stop=False)),
+        pytest.raises(Refusal, match="ended"),
+    ):
+        Desk(block).submit(kind, values=values)
+    assert block.load(Word.COMMANDS_HEAD) == 0
 
 
 def test_a_stop_that_came_before_the_service_saw_the_trip_ends_it():

@@ -27,6 +27,7 @@ from tests.one_axis import one_axis
 ROOT = Path(__file__).resolve().parents[2]
 DURATION_S = 8.0
 WIDTH = 140
+LONGEST_HOLD_US = 5_000_000
 PATIENT = "hold_ticks = 1000\nerror_limit = 1000000\nwatchdog_ms = 1000\nwait_s = 60\n"
 LAW = """
 [loop]
@@ -84,10 +85,9 @@ def c_nodes(folder: Path) -> list[Backend]:
         return []
     build = folder / "node"
     subprocess.run(["make", "-s", "-C", ROOT / "deploy/node", "all", f"BUILD={build}"], check=True)
-    program, port, line = (str(build / "rtloop-node"), "--loopback"), free_udp_port(), f"{folder}/tty-c"
-    channels = (
-        "digital_inputs = 4\ndigital_outputs = 4\ninput_range_v = [-10.0, 9.9997]\noutput_range_v = [-10.0, 9.9997]\n"
-    )
+    program = str(build / "rtloop-node"), "--loopback", "--hold", str(LONGEST_HOLD_US)
+    port, line = free_udp_port(), f"{folder}/tty-c"
+    channels = "digital_inputs = 4\ndigital_outputs = 4\n"
     return [
         Backend("udp, node in C", f'kind = "udp"\n{address(port)}{channels}{PATIENT}',
                 program=(*program, "--port", str(port))),
@@ -103,13 +103,15 @@ def beside(backend: Backend, config: Path, environment: dict[str, str]) -> Itera
         yield
         return
     command = backend.program or [sys.executable, "-m", "rtloop", *(backend.board or ()), str(config)]
-    pipes = {"stdout" if backend.program else "stderr": subprocess.PIPE}
-    with subprocess.Popen(command, env=environment, text=True, **pipes) as process:
+    out, err = (subprocess.PIPE, None) if backend.program else (None, subprocess.PIPE)
+    with subprocess.Popen(command, env=environment, text=True, stdout=out, stderr=err) as process:
         said_by = process.stdout or process.stderr
         assert said_by is not None
         said_by.readline()  # it says that it is there
-        yield
-        process.send_signal(signal.SIGTERM)
+        try:
+            yield
+        finally:
+            process.send_signal(signal.SIGTERM)
 
 
 def measure(backend: Backend, rate_hz: int, folder: Path, environment: dict[str, str]) -> dict[str, Any]:
@@ -146,6 +148,7 @@ def main() -> None:
         environment = os.environ | {"PYTHONPATH": path}
         for backend in backends(folder):
             for rate_hz in backend.rates_hz:
+                print(f"{backend.name} at {rate_hz} Hz", file=sys.stderr, flush=True)
                 found = measure(backend, rate_hz, folder, environment)
                 late, steps = found["lateness_us"], found["steps"]
                 good &= found["complete"] and found["ticks_lost"] == 0 and found["identical"]

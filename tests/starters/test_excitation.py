@@ -23,6 +23,12 @@ FIGURES = [
     StageFigures(800.0, 0.02, 40.0, drive_min_v=lowest, hysteresis_percent=percent, sensor_um_per_v=scale)
     for lowest, percent, scale in itertools.product(LOWEST_V, PERCENT, SENSOR_UM_PER_V)
 ]
+FIGURES += [
+    StageFigures(
+        800.0, 0.015, 90.0, 7.5, drive_min_v=0.0, hysteresis_percent=percent, sensor_um_per_v=10.0, sensor_min_v=0.0
+    )
+    for percent in (0.0, 15.0, 30.0)
+]
 SENSOR_END_V = 9.99
 
 
@@ -80,21 +86,24 @@ def test_both_excitations_stay_within_drive_and_sensor(figures: StageFigures) ->
     drive_v = reference["offset"] + reference["amplitude"] * np.sin(phase)
     assert abs(drive_v[0]) < 1e-6
     assert low_v - 1e-6 <= drive_v.min()
-    assert drive_v.max() <= 10 + 1e-6
+    assert drive_v.max() <= figures.drive_v + 1e-6
     sensor_um = SENSOR_END_V * sine["driver"]["plant"]["sensor"]["um_per_v"]
     end_um = min(sine["axis"][0]["interlocks"]["position_um"], sensor_um)
     reached_um = np.abs(played(sine, drive_v)).max()
     assert reached_um < end_um
-    is_whole = drive_v.max() > 9.99 and drive_v.min() < low_v + 0.01
+    is_whole = drive_v.max() > figures.drive_v - 0.01 and drive_v.min() < low_v + 0.01
     assert is_whole or reached_um > 0.9 * end_um  # no smaller than it need be
 
     step_v = step["schedule"][0]["reference"]["value"]
     assert 0 < step_v <= 10
-    up_down_um = played(step, np.repeat([step_v, 0.0], 4000))
+    low_step_v = step["schedule"][1]["reference"]["value"]
+    up_down_um = played(step, np.repeat([step_v, low_step_v], 4000))
     (_, damping_term, stiffness) = step["driver"]["plant"]["dynamics"]["denominator"][0]
     _, swing_um, _ = lsim(([stiffness], [1.0, damping_term, stiffness]), up_down_um, np.arange(8000) * 2e-5)
     reached_um = np.abs(swing_um).max()
     assert reached_um < end_um
+    assert figures.sensor_min_v is None or swing_um.min() > -1e-6
+    assert (low_step_v > 0) == (figures.sensor_min_v is not None)
     assert step_v > 9.99 or reached_um > 0.85 * end_um
 
 

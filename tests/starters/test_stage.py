@@ -15,7 +15,7 @@ from rtloop.configuration.cautions import cautions
 from rtloop.configuration.file import parse
 from rtloop.configuration.prepare import prepare
 from rtloop.starters.stage import stage_files
-from rtloop.starters.stage_figures import StageFigures
+from rtloop.starters.stage_figures import StageFigures, stage_figures
 
 RESONANCES_HZ, DAMPINGS, RANGES_UM = (10.0, 100.0, 800.0, 5000.0), (0.002, 0.05, 0.7), (0.1, 20.0, 500.0)
 GRID = list(itertools.product(RESONANCES_HZ, DAMPINGS, RANGES_UM))
@@ -149,3 +149,47 @@ def test_the_specification_has_a_controller_that_meets_it(resonance_hz: float, d
     assert running.stable
     assert 1e3 * running.settling_time_s <= design.specification.settling_ms
     assert running.overshoot_percent <= design.specification.overshoot_percent
+
+
+def test_a_stage_of_one_sign_is_specified_within_the_range_above_its_remanence() -> None:
+    """By the plays of its own configuration, stepped up to the largest drive and back to 0."""
+    figures = StageFigures(800.0, 0.015, 90.0, 7.5, drive_min_v=0.0, hysteresis_percent=15.0, sensor_um_per_v=10.0)
+    stage, specification = (tomllib.loads(stage_files(figures)[name]) for name in ("stage.toml", "stage-spec.toml"))
+    plays = stage["axis"][0]["feedforward"]
+    remanence_um = sum(
+        weight * min(max(7.5 - threshold, 0.0), threshold)
+        for weight, threshold in zip(plays["weights_um_per_v"], plays["thresholds_v"], strict=True)
+    )
+    room_um = stage["axis"][0]["limits"]["command_um"] - remanence_um
+    assert remanence_um > 5.0
+    assert 0.85 * room_um < specification["specification"]["command"]["reference_um"] < room_um
+
+
+def test_gain_and_noise_of_a_data_sheet_give_the_same_stage() -> None:
+    """12 µm/V up to 7.5 V are 90 µm; 1 mV of a sensor of 10 µm/V are 10 nm."""
+    expected = StageFigures(range_um=90.0, drive_v=7.5, sensor_um_per_v=10.0, sensor_noise_um=0.01)
+    values = {"gain_um_per_v": 12.0, "drive_v": 7.5, "sensor_um_per_v": 10.0, "sensor_noise_mv": 1.0}
+    assert stage_figures(values) == expected
+    assert stage_figures({"gain_um_per_v": 2.0, "sensor_noise_mv": 2.0}) == StageFigures(sensor_noise_um=0.01)
+    with pytest.raises(ValueError, match="--gain-um-per-v and --range-um: both set one figure; use one of them"):
+        stage_figures({"gain_um_per_v": 2.0, "range_um": 20.0})
+    with pytest.raises(ValueError, match="--sensor-noise-mv and --sensor-noise-um: both"):
+        stage_figures({"sensor_noise_mv": 2.0, "sensor_noise_um": 0.01})
+
+
+@pytest.mark.parametrize(
+    ("lowest_v", "noise_um", "interlock_v"),
+    [(0.0, 0.01, -0.01), (0.0, 0.1, -0.1), (-5.0, 0.01, -4.99), (None, 0.01, None)],
+)
+def test_the_interlock_of_the_sensor_lies_below_the_noise_at_rest(lowest_v, noise_um, interlock_v) -> None:
+    figures = StageFigures(
+        range_um=90.0, drive_min_v=0.0, sensor_um_per_v=10.0, sensor_noise_um=noise_um, sensor_min_v=lowest_v
+    )
+    for name in ("stage.toml", "stage-sine.toml", "stage-step.toml"):
+        interlocks = tomllib.loads(stage_files(figures)[name])["axis"][0]["interlocks"]
+        assert interlocks.get("sensor_min_v") == (None if interlock_v is None else pytest.approx(interlock_v))
+
+
+def test_a_sensor_from_0_v_on_needs_a_drive_from_0_v_on() -> None:
+    with pytest.raises(ValueError, match="--sensor-min-v: value is 0; allowed with --drive-min-v=0 alone"):
+        StageFigures(sensor_min_v=0.0)

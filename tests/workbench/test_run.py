@@ -5,9 +5,11 @@ from __future__ import annotations
 import asyncio
 import json
 import math
+import re
 import signal
 import sys
 import threading
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -19,9 +21,11 @@ from rtloop.configuration.file import parse
 from rtloop.configuration.prepare import prepare
 from rtloop.errors import ConfigError, MissingExtra, RtloopError
 from rtloop.recording.load import Recording
+from rtloop.recording.views.steps import StepMetrics
 from rtloop.recording.views.summary import summarise
 from rtloop.supervision.supervisor import RunResult as SupervisedRun
 from rtloop.workbench.run_result import RunResult
+from rtloop.workbench.step_figures import specification_rows
 from tests.recording.real_loop import changed, record
 from tests.recording.tamper import rewrite
 from tests.workbench.conftest import DURATION_S, PAPER
@@ -71,7 +75,27 @@ def test_a_run_prints_and_returns_what_the_commands_do(paper_run: RunResult, com
     summary_text = lines(command("info", file).stdout)
     text = lines(str(paper_run))
     assert text[: len(summary_text)] == summary_text
-    assert "paper-spec.toml asks" in text[-2]
+    (asked,) = (line for line in text if "paper-spec.toml asks" in line)
+    assert re.split(r"\s{2,}", asked.strip()) == ["paper-spec.toml asks", "≤ 0, MISSED", "≤ 3, MISSED", "≤ 0.1, MISSED"]
+    assert any(line.startswith("MISSED: the worst recorded step") for line in text)
+
+
+@pytest.mark.parametrize(
+    ("worst", "cells"),
+    [
+        ((1.0, 6.0, 0.2), ["≤ 1", "≤ 6", "≤ 0.2"]),
+        ((1.0, 6.1, 0.265), ["≤ 1", "≤ 6, MISSED", "≤ 0.2, MISSED"]),
+        ((math.nan, math.inf, 0.1), ["≤ 1, MISSED", "≤ 6, MISSED", "≤ 0.2"]),
+    ],
+)
+def test_limits_that_the_worst_step_does_not_meet_are_marked(worst, cells, tmp_path: Path):
+    limits = "[specification]\novershoot_percent = 1.0\nsettling_ms = 6.0\nstatic_error_percent = 0.2\n"
+    (tmp_path / "spec.toml").write_text(limits, encoding="utf-8")
+    configuration = replace(load_configuration(PAPER), folder=tmp_path)
+    axis = configuration.axes[0].model_copy(update={"specification": "spec.toml"})
+    pairs = [value for value in worst for _ in range(2)]
+    (row,) = specification_rows(configuration, axis, StepMetrics(4, 0, *pairs))
+    assert (row.label, row.cells) == ("spec.toml asks", cells)
 
 
 def test_a_part_of_a_recording_has_the_ticks_and_events_of_its_time(paper_run: RunResult):

@@ -81,7 +81,7 @@ def dynamics_provenance(fit: DynamicsFit, run: AxisRecording, input_kind: str) -
     return [
         f"Dynamics, identified by rtloop {__version__} from {describe_sources([run])}, input: {input_kind}",
         f"{fit.method}: order {fit.model.order} at {1 / run.period_s:g} Hz, prediction error "
-        f"{fit.rms_error_um:.3g} µm rms, fit {fit.fit_percent:.2f} %",
+        f"one step ahead {fit.rms_error_um:.3g} µm rms, fit {fit.fit_percent:.2f} %",
         f"modes: {', '.join(modes)}; behind {count_text(fit.delay_ticks, 'sample')} of delay"
         + (f", {SAMPLED_TOGETHER}" if run.is_sampled_together else ""),
         f"normalised to D(0) = 1; {static_gain_text(fit.static_gain, input_kind)}",

@@ -90,7 +90,7 @@ def _draw_in_time(fit: DynamicsFit, run: Excitation, full: Any, zoom: Any, diffe
     label_panel(zoom, "time / ms", "position / µm", "part of it", legend=False)
     difference.plot(time_s[:POINTS], residual_um[:POINTS], color="tab:red", linewidth=0.6)
     rms_um = float(np.sqrt(np.mean(residual_um**2)))
-    title = f"measured − model: {rms_um:.3g} µm rms"
+    title = f"output error, measured − simulated: {rms_um:.3g} µm rms"
     label_panel(difference, "time / s", "difference / µm", title, legend=False)
 
 

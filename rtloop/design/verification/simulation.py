@@ -116,7 +116,7 @@ def _levels(axis: AxisOptions, command_range: PositionRange, height_um: float) -
 
 class _SteppedRecord(NamedTuple):
     """Overshoot (%), settling time (ms) and static error (%) of each step, (steps, 3), largest |drive| in V, and the
-    flags of all ticks combined.
+    flags of all ticks combined, without limits on the way to the first level.
     """
 
     steps: Real
@@ -134,12 +134,14 @@ def _run_steps(bench: Bench, axis: str, levels_um: tuple[float, ...], dwell_s: f
     steps = measure_steps(reference, bench.true_positions(record, axis).ravel(), POINTS * bench.rate_hz)
     if steps is None:
         raise ValueError(f"axis {axis}: the reference has no step")
-    flags = int(np.bitwise_or.reduce(record["flags"].astype(np.int64)))
-    return _SteppedRecord(steps, float(np.abs(record[f"{axis}_drive_v"]).max()), flags)
+    flags = record["flags"].astype(np.int64)
+    flags[: round(dwell_s * bench.rate_hz)] &= ~int(reduce(or_, LIMIT_FLAGS))  # on the way from 0 to the first level
+    peak_drive_v = float(np.abs(record[f"{axis}_drive_v"]).max())
+    return _SteppedRecord(steps, peak_drive_v, int(np.bitwise_or.reduce(flags)))
 
 
 def _summarise_steps(height_um: float, levels_um: tuple[float, ...], runs: Sequence[_SteppedRecord]) -> SimulatedStep:
-    """Return the figures of all steps of one height from several runs; limits and trips count in any tick."""
+    """Return the figures of all steps of one height from several runs; trips count in any tick, limits in steps."""
     steps = np.vstack([run.steps for run in runs])
     all_flags = reduce(or_, (run.flags for run in runs))
     overshoot_percent, settling_ms, static_error_percent = step_quantiles(steps)

@@ -184,13 +184,15 @@ def _static_error_notes(verification: Verification) -> list[str]:
     """
     result = verification.simulated
     percent = next((row.running for row in verification.rows if row.name == "static_error_percent"), None)
-    for step in result.steps if result and percent else ():
+    if result is None or percent is None:
+        return []
+    for step in result.steps:
         farthest_um = max(map(abs, step.levels_um))
         step_percent = percent * farthest_um / step.height_um
         if result.is_met(step, "static_error_percent") is False and 2 * step_percent > step.static_error_percent:
             return [
-                f"The loop has no integrator: it leaves {percent:.3g} % of the position, {percent / 100 * farthest_um:.3g}"
-                f" µm at {farthest_um:.4g} µm, which is {step_percent:.3g} % of a step of {step.height_um:g} µm. "
+                f"The loop has no integrator: it leaves {percent:.3g} % of the position, "
+                f"{percent / 100 * farthest_um:.3g} µm at {farthest_um:.4g} µm, which is {step_percent:.3g} % of a step of {step.height_um:g} µm. "
                 "`rtloop design auto --robust` designs a controller with an integrator."
             ]
     return []

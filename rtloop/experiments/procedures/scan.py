@@ -88,7 +88,7 @@ def _plan_run(cycle: int, options: ScanOptions, setting: Setting, tables: Sequen
     for hz, table in zip(options.frequencies_hz, tables, strict=True):
         name, period_s = f"scan-{cycle}-{hz:g}Hz.npy", len(table) / setting.rate_hz
         settling_periods, measured_periods = cycle_periods(len(table), setting.rate_hz)
-        named_tables[name] = table + [timeline.middle.um, 0.0]
+        named_tables[name] = table + np.array([timeline.middle.um, 0.0])
         duration_s = (settling_periods + measured_periods) * period_s
         timeline.add("scan", "closed_loop", {"kind": "table", "file": name}, duration_s,
                      frequency_hz=hz, period_ticks=len(table), periods=measured_periods)  # fmt: skip

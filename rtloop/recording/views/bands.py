@@ -52,12 +52,11 @@ class Mark(NamedTuple):
 
 
 class Panel(NamedTuple):
-    """Signals of one panel; the text `empty` is shown if all of them are NaN."""
+    """Signals of one panel."""
 
     label: str
     unit: str
     names: list[str]
-    empty: str = ""
 
 
 class DrawnRecording(NamedTuple):
@@ -126,14 +125,13 @@ def read_bands(
 
 
 def make_panels(recording: Recording) -> list[Panel]:
-    """Return the panels of a picture, from the top, each with a recorded signal.
+    """Return the panels of a picture, from the top, each with a recorded signal; an unpaced run has none of its timing.
 
     Raises RecordingError if there is no signal to draw.
     """
     axis_panels = [_panel(recording, axis, names) for axis in recording.header["axes"] for names in AXIS_PANELS]
-    axis_panels.append(
-        Panel("timing", "µs", [*filter(recording.__contains__, TIMING)], "unpaced: no deadlines, no lateness")
-    )
+    if recording.header["paced"]:
+        axis_panels.append(Panel("timing", "µs", [*filter(recording.__contains__, TIMING)]))
     if "imported" in recording.header:
         panel_signals = {name for panel in axis_panels for name in panel.names}
         other_names = [name for name in recording.columns[DEADLINE + 1 :] if name not in panel_signals]

@@ -63,9 +63,9 @@ def _page_subtitle(drawing: DrawnRecording) -> str:
 
 
 def _panel_data(panel: Panel, bands: dict[str, Band]) -> dict[str, Any]:
-    """Panel as {unit, empty, traces} for the page."""
+    """Panel as {unit, traces} for the page."""
     traces = [_trace_data(bands[name], name) for name in panel.names]
-    return {"unit": panel.unit, "empty": panel.empty, "traces": traces}
+    return {"unit": panel.unit, "traces": traces}
 
 
 def _trace_data(band: Band, name: str) -> dict[str, Any]:

@@ -90,14 +90,9 @@ def _draw(figure: Any, drawing: DrawnRecording) -> None:
     panels, bands = drawing.panels, drawing.bands
     plots = list(np.ravel(figure.subplots(len(panels), 1, sharex=True)))
     for subplot, panel in zip(plots, panels, strict=True):
-        if panel.empty and all(np.isnan(bands[name].high).all() for name in panel.names):
-            subplot.text(0.5, 0.5, panel.empty, transform=subplot.transAxes, ha="center")
-            subplot.plot([], [], label=signal_kind(panel.names[-1]))
-            subplot.set_yticks([])
-        else:
-            for name in panel.names:
-                _draw_trace(subplot, bands[name], signal_kind(name))
-            subplot.set_ylabel(f"{panel.label.replace('_', ' ')} / {panel.unit}", parse_math=False)
+        for name in panel.names:
+            _draw_trace(subplot, bands[name], signal_kind(name))
+        subplot.set_ylabel(f"{panel.label.replace('_', ' ')} / {panel.unit}", parse_math=False)
         subplot.grid(visible=True, alpha=0.3)
         subplot.margins(x=0)
         subplot.legend(loc="upper right", fontsize=8, framealpha=0.8, ncols=2)

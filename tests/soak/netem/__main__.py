@@ -16,7 +16,7 @@ import time
 from pathlib import Path
 from statistics import median
 
-from rtloop.drivers.contract import DriverCalls
+from tests.drivers.node_calls import open_calls
 from tests.node.node_process import read_witness
 from tests.soak.netem.exchange import AGE, DIGITAL, driver_of, node_program, run
 from tests.soak.netem.namespaces import Network, network, reason_without
@@ -43,7 +43,8 @@ WATCHDOG_MS = 100.0
 def disturb_rows(built: Network, program: Path, folder: Path, rows: list[str], rate_hz: float, ticks: int) -> bool:
     """Print a row for each disturbance; return whether all are as they must be."""
     print(f"{'netem':20} {'drives':>6} {'arrived':>7} {'samples':>7} {'arrived':>7} {'dropped':>9} {'broken':>6} "
-          f"{'held':>5} {'stale':>5}  driver: lost late doubled invalid foreign   node: invalid old   equal  wrong")  # fmt: skip
+          f"{'held':>5} {'stale':>5}  driver: lost late doubled invalid foreign   "
+          "node: invalid old   equal  wrong")  # fmt: skip
     good = True
     for name in rows:
         o = run(built, program, folder, ROWS[name].split(), rate_hz, ticks)
@@ -82,7 +83,7 @@ def cable_row(built: Network, program: Path, folder: Path, rate_hz: float) -> bo
     with node_program(built, program, folder / "witness"):
         driver = driver_of(rate_hz, watchdog_ms=WATCHDOG_MS)
         with built.inside("loop"):
-            calls = DriverCalls(driver.open(), driver.facts)
+            calls = open_calls(driver)
         calls.read()
 
         def tick_for(duration_s: float) -> list[tuple[int, float]]:

@@ -16,9 +16,9 @@ from itertools import accumulate, groupby
 from pathlib import Path
 
 from rtloop.drivers.base import Wiring
-from rtloop.drivers.contract import DriverCalls
 from rtloop.drivers.node.driver import UdpDriver
 from rtloop.drivers.node.options import UdpOptions
+from tests.drivers.node_calls import open_calls
 from tests.node.frames import SAMPLE, Sample, parse
 from tests.soak.netem.capture import Capture, datagram
 from tests.soak.netem.namespaces import NODE_ADDRESS, Network
@@ -93,7 +93,7 @@ def run(network: Network, program: Path, folder: Path, netem: list[str], rate_hz
     with node_program(network, program, folder / "witness") as process:
         driver = driver_of(rate_hz)
         with network.inside("loop"):
-            calls = DriverCalls(driver.open(), driver.facts)
+            calls = open_calls(driver)
         calls.read()
         first = int(driver._opened_card["sequence"][0])
         network.disturb(*netem)

@@ -65,6 +65,10 @@ class DynamicsFit:
     delay_ticks: int
     """Delay in samples beyond the single sample of a held output; `model` acts after it."""
     method: str
+    free_motion_s: float = 0.0
+    """Duration of the free motion that was left out at the beginning; 0 for a recording from rest (`initial_state`)."""
+    free_motion_um: Real | None = None
+    """The motion (samples,) that was left out; None from rest."""
     level_correction: float = 0.0
     """Largest correction of a level that the input holds, in the input's unit (`measured_levels`)."""
 

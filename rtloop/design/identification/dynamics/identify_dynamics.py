@@ -31,6 +31,7 @@ from rtloop.design.identification.dynamics.identify_delay import (
     held_out_start,
     identify_delay,
 )
+from rtloop.design.identification.dynamics.initial_state import free_motion
 from rtloop.design.identification.dynamics.innovations import Innovations
 from rtloop.design.identification.dynamics.measured_levels import correct_levels
 from rtloop.design.identification.dynamics.prediction_error import (
@@ -47,6 +48,8 @@ from rtloop.design.identification.dynamics.residuals import residual_tests
 
 Criterion = Literal["aic", "held-out", "validation"]
 METHOD = "prediction errors (ARMAX), open loop"
+MOST_REPETITIONS = 3
+"""Further identifications of a recording that does not begin at rest, each without the free motion found before."""
 LEAST_EXCITED_POLES = 4
 """Fewest poles that the input must excite if the order is searched."""
 
@@ -64,9 +67,33 @@ def identify_dynamics(
 
     "held-out" judges by the prediction of the second part of the run, and as "aic" does where the input does not change
     there; "aic" by the run itself, which takes slow errors of the hysteresis model for modes; "validation" by the
-    free-running output error on `validation`. Raises UnsuitableData if the input excites too few poles, if no model is
-    stable or none settles within the run, and if D(0) is below 0; ValueError for "validation" without other recordings;
-    ArithmeticError for a model with an unstable predictor.
+    free-running output error on `validation`. Free motion of a run that does not begin at rest is estimated and left
+    out. Raises UnsuitableData if the input excites too few poles, if no model is stable or none settles within the run,
+    and if D(0) is below 0; ValueError for "validation" without other recordings; ArithmeticError for a model with an
+    unstable predictor.
+    """
+    left_out_um, duration_s, repetitions = np.zeros_like(run.position_um), 0.0, 0
+    while True:
+        rest_run = replace(run, position_um=run.position_um - left_out_um)
+        fit, recording = _identify_from_rest(rest_run, order, largest_order, criterion, validation, delay_ticks)
+        motion = free_motion(fit.model, recording) if repetitions < MOST_REPETITIONS else None
+        if motion is None:
+            return replace(fit, free_motion_s=duration_s, free_motion_um=left_out_um) if duration_s else fit
+        repetitions += 1
+        left_out_um, duration_s = left_out_um + motion.position_um, max(duration_s, motion.duration_s)
+
+
+def _identify_from_rest(
+    run: Excitation,
+    order: int | None,
+    largest_order: int,
+    criterion: Criterion,
+    validation: Sequence[Excitation],
+    delay_ticks: int | None,
+) -> tuple[DynamicsFit, Excitation]:
+    """Identify a model as `identify_dynamics`, of a run from rest. Returns also the run that it was fitted to.
+
+    Its input is delayed, its position relative to the first one. Raises as `identify_dynamics`.
     """
     if criterion == "validation" and not validation:
         raise ValueError("criterion 'validation' needs another recording for the validation; give a further RUN")
@@ -97,7 +124,7 @@ def identify_dynamics(
         model = refitted
     if model.static_gain < 0:
         raise wrong_sign(run.name, "the position falls where the drive rises")
-    return _build_fit(model, recording, tuple(candidates), delay_ticks, corrected)
+    return _build_fit(model, recording, tuple(candidates), delay_ticks, corrected), recording
 
 
 def _require_settled(models: Sequence[Innovations], run: Excitation) -> list[Innovations]:
@@ -175,5 +202,5 @@ def _build_fit(
         model,
         delay_ticks,
         METHOD,
-        corrected,
+        level_correction=corrected,
     )
