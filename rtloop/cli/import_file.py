@@ -73,8 +73,8 @@ def import_command(
 ) -> int:
     """Make recordings of measurements of other programs.
 
-    Reads MAT (also v7.3; ControlDesk, Simulink), CSV, npz, Parquet, HDF5, Stabilizer's stream, and MCAP with numbers in it. Without a
-    mapping, the command lists the columns of FILE, shows how to map them, and ends with exit code 2.
+    Reads MAT (also v7.3; ControlDesk, Simulink), CSV, npz, Parquet, HDF5, Stabilizer's stream, and MCAP with numbers in
+    it. Without a mapping, the command lists the columns of FILE, shows how to map them, and ends with exit code 2.
 
     \b
       --map x_drive_v="Piezo Out [mV]"                    from mV to V, the unit in the signal's name

@@ -49,7 +49,7 @@ def stage(figures: StageFigures) -> Starter:
         "rtloop run stage.toml --duration 2",
         *excitations,
         "rtloop design auto sine/*.mcap step/*.mcap --specs stage-spec.toml --out designed.toml",
-        "rtloop design auto sine/*.mcap step/*.mcap --specs stage-spec.toml --robust --out robust.toml  # an integrator",
+        "rtloop design auto sine/*.mcap step/*.mcap --specs stage-spec.toml --robust --out robust.toml  # integrates",
         "rtloop run designed.toml --duration 2",
     )
     return Starter(texts, commands)

@@ -260,7 +260,7 @@ def test_steps_on_a_drive_of_one_sign_are_analysed_about_the_middle(tmp_path: Pa
 
 
 def test_compensation_on_a_drive_of_one_sign_agrees_with_its_model(tmp_path: Path) -> None:
-    """The rig has the plays of the inverse: nothing is left, and the model says so, with the memory of the way there."""
+    """The rig has the plays of the inverse: no hysteresis is left, and the model says so, with the plays' memory."""
     path = recorded_one_sided("compensation", tmp_path, frequency_hz=4.0)
     (section,) = make_report(load_runs([path])).content["experiments"]
     assert section["problem"] is None

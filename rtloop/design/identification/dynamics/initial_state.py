@@ -1,6 +1,6 @@
 """Free motion at the beginning of a recording that does not begin at rest, by least squares over the modes' decay.
 
-    y = G u + H ε + Σ q_i λ_i^k + offset,     H⁻¹ Σ q_i λ_i^k ≈ H⁻¹ (y − G u − offset)
+y = G u + H ε + Σ q_i λ_i^k + offset,     H⁻¹ Σ q_i λ_i^k ≈ H⁻¹ (y − G u − offset)
 """
 
 from __future__ import annotations
