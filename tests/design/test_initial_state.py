@@ -17,14 +17,13 @@ def recording(samples: int, skipped: int) -> Excitation:
     rng = np.random.default_rng(3)
     drive_v = np.repeat(rng.uniform(-0.5, 0.5, (samples + skipped) // 2), 2)
     omega = 2 * np.pi * HZ
-    plant = signal.StateSpace(
-        [[0.0, 1.0], [-(omega**2), -2 * ZETA * omega]], [[0.0], [omega**2]], [[1.0, 0.0]], [[0.0]]
-    )
-    held = plant.to_discrete(1 / RATE_HZ, "zoh")
+    a, b = np.array([[0.0, 1.0], [-(omega**2), -2 * ZETA * omega]]), np.array([[0.0], [omega**2]])
+    plant = (a, b, np.array([[1.0, 0.0]]), np.zeros((1, 1)))
+    a, b, *_ = signal.cont2discrete(plant, 1 / RATE_HZ, "zoh")
     state, position_um = np.zeros(2), np.empty(drive_v.size)
     for k, drive in enumerate(drive_v):
         position_um[k] = GAIN * state[0]
-        state = held.A @ state + held.B[:, 0] * drive
+        state = a @ state + b[:, 0] * drive
     position_um += rng.normal(0.0, NOISE_UM, position_um.size)
     return Excitation("x", drive_v[skipped:], position_um[skipped:], 1 / RATE_HZ)
 

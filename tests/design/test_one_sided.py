@@ -12,6 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from rtloop.analysis.held_plant import POINTS
 from rtloop.cli.verify import _write_report
 from rtloop.configuration.axis import LimitsOptions, ModelOptions
 from rtloop.configuration.checks import Findings, check_axes
@@ -23,10 +24,11 @@ from rtloop.design.verification.bench import Bench
 from rtloop.design.verification.json_values import as_dict
 from rtloop.design.verification.judgement import Limit
 from rtloop.design.verification.simulated_steps import SimulatedStep, SimulationResult
-from rtloop.design.verification.simulation import simulate
+from rtloop.design.verification.simulation import CYCLES, _run_steps, _summarise_steps, simulate
 from rtloop.design.verification.text import simulation_notes
 from rtloop.hysteresis.play_model import PlayModel
 from rtloop.hysteresis.reach import PositionRange, reachable_range
+from rtloop.signals import Flag
 from tests.unequal_stage import HIGHEST_V, STAGE, THRESHOLDS_V, WEIGHTS_UM_PER_V, Plays, curve
 
 MODEL = PlayModel(np.array(THRESHOLDS_V), np.array(WEIGHTS_UM_PER_V))
@@ -132,3 +134,22 @@ def test_a_static_error_of_the_position_is_named(percent, height_um, measured_pe
     rows = [SimpleNamespace(name="static_error_percent", running=percent)]
     notes = simulation_notes(SimpleNamespace(simulated=result(step), rows=rows))  # type: ignore[arg-type]
     assert any("0.024 µm at 24 µm, which is 2.4 % of a step of 1 µm" in note for note in notes) == is_named
+
+
+@pytest.mark.parametrize(("clipped", "limited"), [(slice(0, 100), ()), (slice(250, 251), ("drive",))])
+def test_a_limit_on_the_way_to_the_first_level_is_none_of_a_step(clipped: slice, limited: tuple[str, ...]) -> None:
+    """At 0 V noise clips the drive of one sign; the levels of 100 ticks begin behind. A trip counts there, too."""
+    reference_um = np.repeat([20.0, 10.0] * (CYCLES + 1), 100)[: 100 * (2 * CYCLES + 1)]
+    flags = np.zeros(reference_um.size)
+    flags[clipped] = Flag.DRIVE_LIMITED
+    flags[50] = int(flags[50]) | Flag.TRIP_POSITION
+    record = {"x_reference_um": reference_um, "x_drive_v": reference_um / 4, "flags": flags}
+    bench = SimpleNamespace(
+        rate_hz=1000.0,
+        run=lambda *_: record,
+        true_positions=lambda *_: np.repeat(reference_um[:, None], POINTS, axis=1),
+    )
+    run = _run_steps(bench, "x", (10.0, 20.0), 0.1, 0)  # type: ignore[arg-type]
+    step = _summarise_steps(10.0, (10.0, 20.0), [run])
+    assert step.limited == limited
+    assert len(step.trips) == 1

@@ -145,7 +145,7 @@ def test_what_cannot_be_says_what_binds_and_the_fastest() -> None:
 
 def test_bounds_let_every_step_between_allowed_levels_stay_within_the_drive() -> None:
     """v = a·s + h·w for every level a, step h, and w at its bounds; at one end or another it reaches the drive."""
-    cases = ((BOUNDS, 0.97), (Bounds(0.05, 40.0, 0.0, 0.0, 44.0), 1.02), (Bounds(0.05, 40.0, 25.0, 20.0, 75.0), 1.02))
+    cases = ((BOUNDS, 0.97), (Bounds(0.05, 40.0, 0.0, 0.0, 44.0), 1.02), (Bounds(0.05, 40.0, 25.0, 15.0, 72.0), 1.02))
     for bounds, static in cases:
         low, high = (float(value) for value in bounds.command_limits(np.array(static)))
         starts = np.linspace(bounds.lowest_um, max(bounds.lowest_um, 0.0) + 40.0, 41)

@@ -193,8 +193,7 @@ def _static_error_notes(verification: Verification) -> list[str]:
             return [
                 f"The loop has no integrator: it leaves {percent:.3g} % of the position, "
                 f"{percent / 100 * farthest_um:.3g} µm at {farthest_um:.4g} µm, which is {step_percent:.3g} % of a "
-                f"step of {step.height_um:g} µm. "
-                "`rtloop design auto --robust` designs a controller with an integrator."
+                f"step of {step.height_um:g} µm. `rtloop design auto --robust` designs a controller with an integrator."
             ]
     return []
 
