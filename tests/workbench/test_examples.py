@@ -13,12 +13,13 @@ import pytest
 import rtloop
 from rtloop.recording.load import Recording
 from rtloop.recording.recorded_signals import RecordedSignals
+from rtloop.workbench import design as workbench_design
 from rtloop.workbench.run_result import RunResult
 
 DEPLOY = Path(__file__).resolve().parents[2] / "deploy"
 OWNERS = {
     "rtloop.check": rtloop.check,
-    "rtloop.design": rtloop.design,
+    "rtloop.design": workbench_design.design,
     "rtloop.load": rtloop.load,
     "rtloop.replay": rtloop.replay,
     "rtloop.run": rtloop.run,
