@@ -129,4 +129,4 @@ def test_a_watched_loop_has_its_events_followed_before_it_overwrites_them(monkey
     service.live = cast(Any, SimpleNamespace(references=SimpleNamespace(follow=lambda: followed.append(True))))
     monkeypatch.setattr(service, "_notify_systemd", lambda _: None)
     assert service._watch(supervisor) is result
-    assert followed == [True, True]
+    assert followed == [True, True, True]  # once more at the end: the last events belong to the recording too
