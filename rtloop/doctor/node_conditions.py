@@ -25,30 +25,30 @@ def check_line(line: NetworkLine | SerialLine | None, host: Host, pacing: Pacing
     interface = route(line, host)
     if interface.good is False or line.interface == "lo":
         return (interface,)
-    return (interface, cable(line, host), coalescing(line), joined_packets(line), card_interrupts(line, host, pacing))
+    return (interface, cable(line, host), coalescing(line), packet_merging(line), card_interrupts(line, host, pacing))
 
 
 def route(line: NetworkLine, host: Host) -> Finding:
     """Check that an interface leads to the node, that it is up, and that it has a cable."""
-    name, wanted, net = line.interface, "a cable to the node", f"/sys/class/net/{line.interface}"
+    name, required, net = line.interface, "a cable to the node", f"/sys/class/net/{line.interface}"
     if not name:
         return Finding(
-            "node's network", f"no route to {line.host}", wanted, False, LOST_LINE_US,
+            "node's network", f"no route to {line.host}", required, False, LOST_LINE_US,
             "no drive reaches the node",
             "sudo ip address add 192.168.10.1/24 dev INTERFACE; check driver.host and driver.bind",
         )  # fmt: skip
     if name == "lo":
-        return Finding("node's network", "loopback: the node is on this computer", wanted, True)
+        return Finding("node's network", "loopback: the node is on this computer", required, True)
     value = f"{name} to {line.host}"
     if host.paths(f"{net}/wireless") or host.paths(f"{net}/phy80211"):
         return Finding(
-            "node's network", f"{value}, wireless", wanted, False, WIRELESS_US,
+            "node's network", f"{value}, wireless", required, False, WIRELESS_US,
             "a wireless network delays frames by milliseconds, and loses some",
             "connect the node by a cable, and set driver.bind to the address of its interface",
         )  # fmt: skip
     state = host.read(f"{net}/operstate")
     return Finding(
-        "node's network", value + (f", {state}" if state == "down" else ""), wanted, state != "down", LOST_LINE_US,
+        "node's network", value + (f", {state}" if state == "down" else ""), required, state != "down", LOST_LINE_US,
         "no drive reaches the node", f"plug the cable in; sudo ip link set {name} up",
     )  # fmt: skip
 
@@ -57,12 +57,12 @@ def cable(line: NetworkLine, host: Host) -> Finding:
     """Check that the interface runs at MIN_SPEED_MBIT or more, full duplex; unknown where it does not tell."""
     net = f"/sys/class/net/{line.interface}"
     speed, duplex = host.read(f"{net}/speed"), host.read(f"{net}/duplex")
-    wanted = f"{MIN_SPEED_MBIT} Mbit/s or more, full duplex"
+    required = f"{MIN_SPEED_MBIT} Mbit/s or more, full duplex"
     if not speed or not speed.isdecimal() or not duplex or duplex == "unknown":
-        return Finding("node's cable", "not shown", wanted, None)
+        return Finding("node's cable", "not shown", required, None)
     is_good = int(speed) >= MIN_SPEED_MBIT and duplex == "full"
     return Finding(
-        "node's cable", f"{speed} Mbit/s, {duplex} duplex", wanted, is_good, 1000.0,
+        "node's cable", f"{speed} Mbit/s, {duplex} duplex", required, is_good, 1000.0,
         "at half duplex frames collide, and a slow cable holds each frame for longer",
         f"sudo ethtool -s {line.interface} autoneg on, or another cable",
     )  # fmt: skip
@@ -70,18 +70,18 @@ def cable(line: NetworkLine, host: Host) -> Finding:
 
 def coalescing(line: NetworkLine) -> Finding:
     """Check that the card interrupts at each packet; unknown where its driver does not tell."""
-    wanted = "0 µs, not adaptive"
+    required = "0 µs, not adaptive"
     if line.rx_usecs is None:
-        return Finding("interrupt coalescing", "not shown", wanted, None)
+        return Finding("interrupt coalescing", "not shown", required, None)
     return Finding(
-        "interrupt coalescing", f"{line.rx_usecs} µs{', adaptive' if line.is_adaptive else ''}", wanted,
+        "interrupt coalescing", f"{line.rx_usecs} µs{', adaptive' if line.is_adaptive else ''}", required,
         line.rx_usecs == 0 and not line.is_adaptive, max(float(line.rx_usecs), 1.0),
         "the card collects packets before it interrupts, and the node's answer waits meanwhile",
         f"sudo ethtool -C {line.interface} adaptive-rx off rx-usecs 0",
     )  # fmt: skip
 
 
-def joined_packets(line: NetworkLine) -> Finding:
+def packet_merging(line: NetworkLine) -> Finding:
     """Check that the card does not wait for packets to join (LRO); unknown where its driver does not tell."""
     if line.collects is None:
         return Finding("large receive offload", "not shown", "off", None)
@@ -98,14 +98,14 @@ def card_interrupts(line: NetworkLine, host: Host, pacing: Pacing) -> Finding:
     numbers |= {path.rpartition("/")[2] for path in host.paths(f"/sys/class/net/{line.interface}/device/msi_irqs/*")}
     paths = [f"/proc/irq/{number}/smp_affinity_list" for number in sorted(numbers, key=int)]
     affinities = {path: parse_cpus(text) for path in paths if (text := host.read(path)) is not None}
-    wanted, others = "none on loop.cpu", format_cpus(allowed - loop_processors)
+    required, others = "none on loop.cpu", format_cpus(allowed - loop_processors)
     if not affinities:
-        return Finding("card's interrupts", "not shown", wanted, None)
+        return Finding("card's interrupts", "not shown", required, None)
     shared = [path for path, cpus in affinities.items() if cpus & loop_processors]
     return Finding(
         "card's interrupts",
         f"{len(shared)} of {len(affinities)} may interrupt processor {format_cpus(loop_processors)}",
-        wanted, not shared, INTERRUPT_US, "the card interrupts the loop while it computes a tick",
+        required, not shared, INTERRUPT_US, "the card interrupts the loop while it computes a tick",
         "; ".join(f"echo {others or 0} | sudo tee {path}" for path in shared or affinities),
         dict.fromkeys(shared, others) if others else {},
     )  # fmt: skip

@@ -35,14 +35,14 @@ LONGEST_PAUSE_S = 60.0
 UNSOUND_PERIOD_S = 10.0
 """Time between two reports of unsound readings for the same reason."""
 OUTSIDE_OUTCOMES = {"driver_failed": "driver", "heartbeat_lost": "heartbeat"}
-"""Cause of the trip by the outcome of a loop that ended by itself."""
+"""Cause of the trip by the outcome of a loop that ended without a request."""
 STANDSTILL_CAUSES, STANDSTILL = {"stale", "driver"}, "frozen"
 """While samples do not come, the reading stands still and the outputs ramp: `frozen` may follow these causes."""
 log = logging.getLogger("rtloop")
 
 
 class RecoveryState(StrEnum):
-    """State of the recovery."""
+    """State of the recovery, as the status shows it."""
 
     READY = "ready"
     """There is no trip to recover from."""
@@ -240,7 +240,7 @@ class Recovery:
             self._own_faults.clear()
 
     def accept_end(self, outcome: str, fault: str) -> bool:
-        """Return whether the policy covers a loop that ended by itself; else the recovery latches.
+        """Return whether the policy covers a loop that ended without a request; else the recovery latches.
 
         `fault` is the text that the service latches for it.
         """
