@@ -18,6 +18,7 @@ from pydantic import Field, model_validator
 from rtloop.drivers.base import Channel, Driver, Facts, Pointers, Wiring
 from rtloop.drivers.comedi_board import Board, Kind
 from rtloop.drivers.errors import DriverError
+from rtloop.drivers.volt_ranges import Volts, require_ranges
 from rtloop.foundation.native.compiled import cfunc, intrinsic_like
 from rtloop.foundation.native.pointers import SIGNATURE, address_pointer, carray
 from rtloop.foundation.options import Options
@@ -33,7 +34,6 @@ CONTEXT = np.dtype(
 )
 """Context of the C functions; `failed_…` is the index of the channel that failed last, −1 for none."""
 FAILED = -1
-Volts = Annotated[tuple[float, float], Field(strict=False)]
 
 
 class ComediOptions(Options):
@@ -61,13 +61,7 @@ class ComediOptions(Options):
     @model_validator(mode="after")
     def _check(self) -> Self:
         """Require the lower end of each range before the higher, and `safe_v` within `output_range_v`."""
-        for name in ("input_range_v", "output_range_v"):
-            lowest, highest = getattr(self, name)
-            if lowest >= highest:
-                raise ValueError(f"{name}: [{lowest:g}, {highest:g}] V; allowed: the lower end before the higher")
-        lowest, highest = self.output_range_v
-        if not lowest <= self.safe_v <= highest:
-            raise ValueError(f"safe_v: {self.safe_v:g} V; allowed by output_range_v: {lowest:g} … {highest:g} V")
+        require_ranges(self.input_range_v, self.output_range_v, self.safe_v)
         return self
 
 

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal, Self
+from typing import Literal, Self
 
 from pydantic import Field, model_validator
 
 from rtloop.drivers.node.frames import MAX_CHANNELS, MAX_DIGITAL
+from rtloop.drivers.volt_ranges import Volts, require_ranges
 from rtloop.hil.options import RigOptions
 
-Volts = Annotated[tuple[float, float], Field(strict=False)]
 LONGEST_HOLD_TICKS = 1000
 """Fewer than the frames whose sending times are known."""
 
@@ -52,13 +52,7 @@ class NodeOptions(RigOptions):
     @model_validator(mode="after")
     def _check_ranges(self) -> Self:
         """Require the lower end of each range before the higher, `safe_v` within `output_range_v`, and few channels."""
-        for name in ("input_range_v", "output_range_v"):
-            lowest, highest = getattr(self, name)
-            if lowest >= highest:
-                raise ValueError(f"{name}: [{lowest:g}, {highest:g}] V; allowed: the lower end before the higher")
-        lowest, highest = self.output_range_v
-        if not lowest <= self.safe_v <= highest:
-            raise ValueError(f"safe_v: {self.safe_v:g} V; allowed by output_range_v: {lowest:g} … {highest:g} V")
+        require_ranges(self.input_range_v, self.output_range_v, self.safe_v)
         if (self.inputs or 1) + (self.outputs or 1) > MAX_CHANNELS:
             raise ValueError(f"inputs, outputs: {self.inputs} and {self.outputs}; allowed: {MAX_CHANNELS} in all")
         return self
