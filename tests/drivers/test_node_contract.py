@@ -87,6 +87,17 @@ def test_a_stopped_node_shows_in_status_and_age(node):
         assert [values[-3:-1] for _, values in readings] == [[n, 2 * n] for n in range(1, 6)]
 
 
+def test_a_node_that_stops_before_the_first_tick_is_named_and_the_age_is_that_of_its_last_answer(node):
+    driver, start_s = node.driver(**PATIENT), time.monotonic()
+    with opened(driver) as calls:
+        node.process.send_signal(signal.SIGSTOP)
+        status, values = calls.read()
+        node.process.send_signal(signal.SIGCONT)
+        assert status < 0
+        assert "does not answer" in str(driver.error)
+        assert 0 <= values[1] <= (time.monotonic() - start_s) * 1e6
+
+
 def test_missing_answers_end_the_exchange_at_the_error_limit(node):
     driver = node.driver(**PATIENT | {"error_limit": 10})
     with opened(driver) as calls:

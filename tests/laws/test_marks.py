@@ -10,12 +10,11 @@ import pytest
 import rtloop
 from rtloop.engine.messages import Kind
 from rtloop.errors import ConfigError
-from rtloop.recording.capture.session import Session
 from rtloop.recording.file.topics.validation import header_extras
 from rtloop.recording.replay.replay import replay
 from rtloop.signals import Mode
 from tests.engine.harness import LoopBench, plan_of, prepare_text
-from tests.recording.real_loop import PAPER, Options, RealLoop
+from tests.recording.real_loop import PAPER, record
 
 CHANNELS = """
 [inputs.gate]
@@ -89,16 +88,7 @@ def test_marks_are_low_where_outputs_are_off_and_with_a_voltage_as_reference(tmp
 
 
 def test_a_replay_from_any_snapshot_has_the_same_marks(tmp_path: Path):
-    loop = RealLoop(configuration(TRIANGLE), tmp_path)
-    session = Session(loop.block, tmp_path / "marks.mcap", loop.header, Options(min_free_bytes=0))
-    for _ in range(3):
-        loop.run(2000)
-        session.drain()
-        session.write_due()
-    loop.end()
-    session.drain()
-    session.finish("finished")
-    recording = rtloop.load(tmp_path / "marks.mcap")
+    recording = rtloop.load(record(tmp_path / "marks.mcap", configuration(TRIANGLE), 6000))
     assert recording["line_v"].max() == 5.0
     assert replay(recording).identical
     header = recording.header
