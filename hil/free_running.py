@@ -25,7 +25,7 @@ class FreeRunningRig:
         _advance(self._coefficients, self._state, self.drive_v, self.sample_v, 0)
 
     def advance_to(self, elapsed_s: float) -> None:
-        """Advance the rig to `elapsed_s` after its start with the outputs held, and take its readings."""
+        """Advance the rig to `elapsed_s` since its start with `drive_v` held; store readings in `sample_v`."""
         index = int(elapsed_s * self._rate_hz)
         _advance(self._coefficients, self._state, self.drive_v, self.sample_v, index - self._index)
         self._index = index

@@ -114,9 +114,10 @@ class NodeDriver(Driver):
         return Pointers(self._card.ctypes.data, read, write)
 
     def measure_exchanges(self, count: int) -> Exchanges:
-        """Measure `count` exchanges at the tick rate as the loop would make them; outputs ramp to safe values first.
+        """Open the node, whose outputs ramp to safe values, measure `count` exchanges at the tick rate, and close it.
 
-        Every exchange waits for its answer for up to MEASURING_WAIT_S, whatever `answer` says. Raises DriverError as
+        An exchange waits for its answer for up to MEASURING_WAIT_S, with both values of the option `answer`, and is
+        counted as lost without it. Raises DriverError as
         `open` does, and if the node ends the session.
         """
         pointers, durations_us, lost = self.open(), list[float](), 0
@@ -245,7 +246,8 @@ class NodeDriver(Driver):
     def _begin_session(self, link: Link, welcome: Welcome) -> int:
         """Send an OPEN every RETRY_S until the node is ready; return the sequence that it has answered.
 
-        Raises DriverError if the node is driven for longer than BUSY_S, refuses otherwise, or is not ready in time.
+        Raises DriverError if another loop drives the node for longer than BUSY_S, if the node refuses for another
+        reason, and if it is not ready within `wait_s`.
         """
         safe = tuple(scale.safe for scale in welcome.outputs)
         start_s, sequence = time.monotonic(), 0

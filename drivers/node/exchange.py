@@ -252,7 +252,7 @@ def _take_sample(card):
 
 @jit
 def _count_skipped(card, states, sequences, newest):
-    """Count the requests between the newest sample and sequence `newest` as lost, and mark them MISSING."""
+    """Mark unanswered requests after `card.newest` and before sequence `newest` as MISSING, count them as lost."""
     count = np.int64(np.uint32(newest - card.newest))
     for back in range(1, min(count, WINDOW)):
         sequence = np.uint32(newest - np.uint32(back))

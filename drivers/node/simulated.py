@@ -104,7 +104,7 @@ class SimulatedNode:
         return self._accept(content, sender, now_us)
 
     def _lack_of_access(self, content: Drive, sender: Hashable) -> int:
-        """Return the reason for which a DRIVE from an address is refused whatever its content; 0 if it has access."""
+        """Return why `sender` may not drive the node, judged by session, flags and address alone; 0 if it may."""
         if self._session:
             return 0 if (content.session, sender) == (self._session, self._sender) else frames.BUSY
         if content.session == 0:

@@ -71,7 +71,7 @@ def send_frame(card, length):
 
 @jit
 def receive_frame(card):
-    """Copy the next frame to `card.received` and return its length; EMPTY, FOREIGN, BROKEN or GONE without one."""
+    """Copy the next frame to `card.received` and return its length, else EMPTY, FOREIGN, BROKEN or GONE; never wait."""
     if card.is_serial == 0:
         return _receive_datagram(card)
     return _receive_line(card)

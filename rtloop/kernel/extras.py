@@ -104,7 +104,7 @@ def pass_extra_inputs(record):
 
 @jit_rare
 def set_marks(record, a, step_um, position_um):
-    """Set whether the marks of axis `a` are high: `step_um` is the reference's change since the tick before."""
+    """Set whether the marks of axis `a` are high, from the reference's change since the last tick and the position."""
     outputs = extra_outputs(record)
     for k in range(record.extra_output_count):
         if outputs[k].axis == a:

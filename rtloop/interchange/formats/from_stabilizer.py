@@ -26,7 +26,7 @@ SAMPLE_PERIOD_S = 1.28e-6
 
 
 def read_stabilizer(path: Path) -> Table:
-    """Return adc0, adc1, dac0, dac1 in V, `time` in s by SAMPLE_PERIOD_S, and `sample`, which counts missing ones too.
+    """Return adc0, adc1, dac0, dac1 in V, `time` in s by SAMPLE_PERIOD_S, and the index `sample`, with gaps.
 
     Raises UnreadableData for another format than the ADC and DAC codes, for frames of different lengths, and for a
     file that is too large.
