@@ -61,7 +61,7 @@ def node_read(context, values):
         _send_drive(card, ANSWER)
         _await_answer(card, card.deadline_ns)
     else:
-        _receive_all(card)
+        _receive_newest(card)
     is_held = card.newest != card.sequence
     card.held_in_a_row = card.held_in_a_row + 1 if is_held else 0
     card.held += 1 if is_held else 0
@@ -163,10 +163,13 @@ def _await_answer(card, duration_ns):
 
 
 @jit
-def _receive_all(card):
-    """Receive the frames that have come, at most MAX_FRAMES_PER_TICK."""
+def _receive_newest(card):
+    """Receive frames until the last request is answered or none is there, at most MAX_FRAMES_PER_TICK.
+
+    What came behind that answer, such as its double, waits for the next tick.
+    """
     for _ in range(MAX_FRAMES_PER_TICK):
-        if not _receive_one(card):
+        if not _receive_one(card) or card.newest == card.sequence:
             break
 
 

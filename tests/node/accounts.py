@@ -15,7 +15,8 @@ FRAMES_PER_TICK = 64
 def accounts(arrivals: list[list[Arrival]], first: int) -> list[list[int]]:
     """Return the counts of COUNTS after each tick, by their definitions; tick k awaits the answer to drive first + k.
 
-    A sample is lost if one with a higher sequence has come and it has not; late if it comes after such a one.
+    A tick takes what has come up to that answer; the rest waits for the next one. A sample is lost if one with a higher
+    sequence has come and it has not; late if it comes after such a one.
     """
     queue: list[Arrival] = []
     known: dict[str, list[int]] = {"firsts": [], "again": []}
@@ -23,7 +24,9 @@ def accounts(arrivals: list[list[Arrival]], first: int) -> list[list[int]]:
     rows = []
     for tick, arrived in enumerate(arrivals):
         queue += arrived
-        taken, queue = queue[:FRAMES_PER_TICK], queue[FRAMES_PER_TICK:]
+        awaited = [arrival.kind == "sample" and arrival.sequence == first + tick for arrival in queue]
+        count = min(awaited.index(True) + 1 if True in awaited else len(queue), FRAMES_PER_TICK)
+        taken, queue = queue[:count], queue[count:]
         for arrival in taken:
             invalid += arrival.kind == "invalid"
             foreign += arrival.kind == "foreign"

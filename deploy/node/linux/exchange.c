@@ -21,8 +21,8 @@ static const char help[] =
     "exchange HOST PORT: exchanges with a node over UDP\n"
     "  --count N         exchanges (10000)\n"
     "  --rate HZ         exchanges per second; 0: one after the other (1000)\n"
-    "  --same-tick       wait for the answer at once, without sleep (the default)\n"
-    "  --next-tick       take the answer in the next tick\n"
+    "  --same-tick       ask for a sample, wait for it without sleep, then send the codes (the default)\n"
+    "  --next-tick       send the codes; take the sample that answers them in the next tick\n"
     "  --hold US         hold of the node's watchdog (100000)\n"
     "  --priority N      real-time priority, 1 to 99, and locked memory\n";
 
@@ -168,7 +168,6 @@ static void open_session(void)
     if (!ready) {
         fail("node", "not READY");
     }
-    drive[12] = RTLOOP_APPLY | RTLOOP_ANSWER;
 }
 
 /* Park the session, and wait until the outputs are at their safe codes. */
@@ -214,23 +213,25 @@ static bool take_sample(int64_t *now_ns)
     return behind == 0;
 }
 
-/* Send the DRIVE of one tick; return its time. */
-static int64_t send_tick(void)
+/* Send a DRIVE with flags; return its time. */
+static int64_t send_tick(uint8_t flags)
 {
     int64_t now_ns = clock_ns();
+    drive[12] = flags;
     sent_ns[(sequence + 1) % (sizeof sent_ns / sizeof *sent_ns)] = now_ns;
     send_drive();
     return now_ns;
 }
 
-/* Do one exchange whose answer is awaited, at most until the end of its tick. */
+/* Ask for a sample, wait for it at most until the end of its tick, and send the codes, which need no answer. */
 static void tick_waiting(int64_t end_ns)
 {
     int64_t now_ns;
-    int64_t start_ns = send_tick();
+    int64_t start_ns = send_tick(RTLOOP_ANSWER);
     while (!take_sample(&now_ns) && now_ns < end_ns) {
     }
-    figures.calls_ns[figures.ticks++] = (float)(now_ns - start_ns);
+    send_tick(RTLOOP_APPLY);
+    figures.calls_ns[figures.ticks++] = (float)(clock_ns() - start_ns);
 }
 
 /* Take the answers that have come since the last tick, then send. */
@@ -243,7 +244,7 @@ static void tick_later(void)
         before = figures.answered;
         newest = take_sample(&now_ns);
     }
-    send_tick();
+    send_tick(RTLOOP_APPLY | RTLOOP_ANSWER);
     figures.calls_ns[figures.ticks++] = (float)(clock_ns() - start_ns);
 }
 
