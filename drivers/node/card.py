@@ -23,7 +23,7 @@ OBSERVED = (
 answered request until the loop had its answer."""
 
 _ADDRESSES = (
-    "peer", "sender", "sender_bytes", "sent", "received", "coded", "partial", "raw", "crc_table",
+    "sent", "received", "coded", "partial", "raw", "crc_table",
     "in_scales", "out_scales", "codes", "ring_sequence", "ring_state", "ring_ns", "timespec",
 )  # fmt: skip
 CARD = np.dtype(
@@ -32,7 +32,7 @@ CARD = np.dtype(
         *((name, np.int64) for name in COUNTS),
         ("fd", np.int64),
         ("is_serial", np.int64),
-        ("peer_bytes", np.int64),
+        ("strangers_fd", np.int64),  # a socket that gets what other senders than the node send to the loop's port
         ("inputs", np.int64),
         ("outputs", np.int64),
         ("digital_inputs", np.int64),
@@ -47,6 +47,7 @@ CARD = np.dtype(
         ("age_ns", np.int64),  # of the newest sample when the node sent it
         ("raw_length", np.int64),
         ("raw_position", np.int64),
+        ("reads_until_strangers", np.int64),  # reads before the next one that counts their datagrams
         ("frame_length", np.int64),  # bytes of the frame that a serial line has delivered so far; −1 to skip to its end
         ("session", np.uint32),
         ("boot", np.uint32),
@@ -63,21 +64,18 @@ SCALE = np.dtype(
     [("lowest", np.int64), ("highest", np.int64), ("volts_per_code", np.float64), ("offset_v", np.float64)]
 )
 """A channel's range of codes and its volts: offset_v + code · volts_per_code."""
-SENDER_BYTES = 128
-"""Room for the socket address of any sender."""
 
 
-def make_card(fd: int, peer: bytes, **values: Any) -> tuple[np.ndarray[Any, Any], dict[str, np.ndarray[Any, Any]]]:
+def make_card(
+    fd: int, strangers_fd: int | None, **values: Any
+) -> tuple[np.ndarray[Any, Any], dict[str, np.ndarray[Any, Any]]]:
     """Return a record CARD with its arrays, which must live as long as it does.
 
-    `peer` is the node's socket address as bytes, empty for a serial line. `values` are further fields; `in_scales` and
-    `out_scales` are sequences of Scale.
+    `fd` is connected to the node; `strangers_fd` is a socket of the same port for all others, None for a serial line.
+    `values` are further fields; `in_scales` and `out_scales` are sequences of Scale.
     """
     inputs, outputs = (_scale_array(values.pop(name)) for name in ("in_scales", "out_scales"))
     arrays: dict[str, np.ndarray[Any, Any]] = {
-        "peer": np.frombuffer(peer or b"\0", np.uint8).copy(),
-        "sender": np.zeros(SENDER_BYTES, np.uint8),
-        "sender_bytes": np.zeros(1, np.uint32),
         **{name: np.zeros(ROOM_BYTES // 8, np.uint64) for name in ("sent", "received", "coded", "partial")},
         "raw": np.zeros(RAW_BYTES, np.uint8),
         "crc_table": crc_table(),
@@ -90,7 +88,7 @@ def make_card(fd: int, peer: bytes, **values: Any) -> tuple[np.ndarray[Any, Any]
         "timespec": np.zeros(2, np.int64),
     }
     card = np.zeros(1, CARD)
-    card["fd"], card["is_serial"], card["peer_bytes"] = fd, not peer, len(peer)
+    card["fd"], card["is_serial"], card["strangers_fd"] = fd, strangers_fd is None, strangers_fd or 0
     card["inputs"], card["outputs"] = len(inputs), len(outputs)
     for name, value in values.items():
         card[name] = value

@@ -103,7 +103,7 @@ class NodeDriver(Driver):
         read, write = node_read.address, node_write.address
         last = self._begin_session(link, welcome)
         self._card, self._arrays = make_card(
-            link.fd, link.peer, in_scales=welcome.inputs, out_scales=welcome.outputs,
+            link.fd, link.strangers_fd, in_scales=welcome.inputs, out_scales=welcome.outputs,
             digital_inputs=options.digital_inputs, digital_outputs=options.digital_outputs,
             hold_ticks=options.hold_ticks, error_limit=options.error_limit, waits=options.waits,
             deadline_ns=round(options.deadline_us * US_PER_MS), hold_us=round(options.watchdog_ms * US_PER_MS),

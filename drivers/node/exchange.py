@@ -30,13 +30,15 @@ from rtloop.drivers.node.frames import (
     SAMPLE_FORMAT,
     SAMPLE_HEAD,
 )
-from rtloop.drivers.node.transport import BROKEN, EMPTY, FOREIGN, GONE, receive_frame, send_frame
+from rtloop.drivers.node.transport import BROKEN, EMPTY, GONE, receive_frame, send_frame, take_strangers
 from rtloop.foundation.native.compiled import cfunc, jit, jit_rare
 from rtloop.foundation.native.monotonic import monotonic_ns
 from rtloop.foundation.native.pointers import SIGNATURE, address_pointer, carray
 
 FAILED, GOOD, HELD = -1, 0, 1
 MAX_FRAMES_PER_TICK = 64
+STRANGERS_EVERY = 64
+"""Reads from one count of other senders' datagrams to the next: a system call that finds none takes 0.3 µs."""
 OPEN_TRIES, OPEN_WAIT_NS = 200, 5_000_000
 RISE, FALL = 2, 1
 """Steps of the error level for a tick without and with its answer (LinuxCNC, hm2_eth)."""
@@ -62,6 +64,10 @@ def node_read(context, values):
         _await_answer(card, card.deadline_ns)
     else:
         _receive_newest(card)
+    if card.reads_until_strangers == 0:
+        card.foreign += take_strangers(card, MAX_FRAMES_PER_TICK)
+        card.reads_until_strangers = STRANGERS_EVERY
+    card.reads_until_strangers -= 1
     is_held = card.newest != card.sequence
     card.held_in_a_row = card.held_in_a_row + 1 if is_held else 0
     card.held += 1 if is_held else 0
@@ -143,6 +149,8 @@ def _open_again(card):
     """
     while receive_frame(card) > GONE:
         pass  # Frames from before the first tick are old.
+    while take_strangers(card, MAX_FRAMES_PER_TICK) > 0:
+        pass
     for _ in range(OPEN_TRIES):
         _send_drive(card, OPEN | ANSWER)
         _await_answer(card, OPEN_WAIT_NS)
@@ -181,9 +189,7 @@ def _receive_one(card):
         card.failure = LINE_GONE
     if length in (EMPTY, GONE):
         return False
-    if length == FOREIGN:
-        card.foreign += 1
-    elif length == BROKEN or not _is_whole(card, length):
+    if length == BROKEN or not _is_whole(card, length):
         card.invalid += 1
     else:
         frame = carray(address_pointer(card.received), 1, REFUSAL)[0]

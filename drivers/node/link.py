@@ -11,7 +11,6 @@ import fcntl
 import os
 import select
 import socket
-import struct
 import termios
 import time
 import tty
@@ -34,8 +33,8 @@ class Link(ABC):
     """An open line to a node; `fd` is its file descriptor, which does not block."""
 
     fd: int
-    peer: bytes = b""
-    """The node's socket address as the C library's functions take it; empty for a serial line."""
+    strangers_fd: int | None = None
+    """A second socket of the same port, which gets the datagrams of all other senders; None for a serial line."""
 
     @abstractmethod
     def send(self, frame: bytes) -> None:
@@ -51,7 +50,10 @@ class Link(ABC):
 
 
 class UdpLink(Link):
-    """A line to a node: a UDP socket."""
+    """A line to a node: a UDP socket that is connected to it, and one of the same port for all other senders.
+
+    The system looks up a connected socket's route once, and a flood of strangers does not fill it.
+    """
 
     def __init__(self, options: UdpOptions) -> None:
         """Resolve the node's name and open a socket.
@@ -62,39 +64,54 @@ class UdpLink(Link):
             family, _, _, _, self._address = socket.getaddrinfo(options.host, options.port, type=socket.SOCK_DGRAM)[0]
         except OSError as error:
             raise DriverError(f"{options.label}: {error.strerror or error}; check driver.host") from None
-        self._socket = socket.socket(family, socket.SOCK_DGRAM)
+        self._socket, self._strangers = (socket.socket(family, socket.SOCK_DGRAM) for _ in range(2))
         try:
-            self._socket.setblocking(False)
-            self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, BUFFER_BYTES)
-            with contextlib.suppress(OSError):  # Some systems allow it to root alone.
-                self._socket.setsockopt(socket.SOL_SOCKET, SO_BUSY_POLL, BUSY_POLL_US)
-            self._socket.bind((options.bind or ("::" if family == socket.AF_INET6 else ""), 0))
+            self._connect(options.bind or ("::" if family == socket.AF_INET6 else ""))
         except OSError as error:
-            self._socket.close()
+            self.close()
             raise DriverError(f"{options.label}: bind {options.bind!r}: {error.strerror or error}") from None
-        self.fd, self.peer = self._socket.fileno(), _socket_address(family, self._address)
+        self.fd, self.strangers_fd = self._socket.fileno(), self._strangers.fileno()
+
+    def _connect(self, host: str) -> None:
+        """Bind both sockets to one free port of this computer's address `host`, and connect the first to the node."""
+        self._socket.setblocking(False)
+        self._strangers.setblocking(False)
+        self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, BUFFER_BYTES)
+        with contextlib.suppress(OSError):  # Some systems allow it to root alone.
+            self._socket.setsockopt(socket.SOL_SOCKET, SO_BUSY_POLL, BUSY_POLL_US)
+        self._socket.bind((host, 0))  # Alone at its port: sockets share one only if both allow it, here from now on.
+        for shared in (self._socket, self._strangers):
+            shared.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        self._strangers.bind(self._socket.getsockname())
+        for shared in (self._socket, self._strangers):
+            shared.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 0)
+        self._socket.connect(self._address)
+        with contextlib.suppress(BlockingIOError):
+            while True:
+                self._socket.recv(LARGEST_DATAGRAM)  # What strangers sent before the socket was connected.
 
     def send(self, frame: bytes) -> None:
-        """Send a frame as one datagram; a full queue loses it. Raises OSError for an address without a route."""
-        with contextlib.suppress(BlockingIOError):
-            self._socket.sendto(frame, self._address)
+        """Send a frame as one datagram; a full queue loses it, as does an earlier one that the node's system refused.
+
+        Raises OSError for an address without a route.
+        """
+        with contextlib.suppress(BlockingIOError, ConnectionRefusedError):
+            self._socket.send(frame)
 
     def receive(self, timeout_s: float) -> bytes | None:
         """Return the next datagram of the node's address, None if none comes within `timeout_s`."""
         deadline_s = time.monotonic() + timeout_s
         while True:
-            with contextlib.suppress(BlockingIOError):
-                data, address = self._socket.recvfrom(LARGEST_DATAGRAM)
-                if address[:2] == self._address[:2]:
-                    return data
-                continue
+            with contextlib.suppress(BlockingIOError, ConnectionRefusedError):  # Nobody listens there, perhaps yet.
+                return self._socket.recv(LARGEST_DATAGRAM)
             remaining_s = deadline_s - time.monotonic()
             if remaining_s <= 0 or not _wait_readable(self.fd, remaining_s):
                 return None
 
     def close(self) -> None:
-        """Close the socket of the line."""
+        """Close both sockets of the line."""
         self._socket.close()
+        self._strangers.close()
 
 
 class SerialLink(Link):
@@ -162,16 +179,6 @@ def open_link(options: NodeOptions) -> Link:
 def _wait_readable(fd: int, timeout_s: float) -> bool:
     """Wait until bytes can be read from `fd`, for at most `timeout_s`; return whether they can."""
     return bool(select.select([fd], [], [], timeout_s)[0])
-
-
-def _socket_address(family: int, address: tuple[object, ...]) -> bytes:
-    """Return the bytes of a socket address, IPv4 or IPv6, as the C library lays it out."""
-    host, port = address[:2]
-    packed = socket.inet_pton(family, str(host).partition("%")[0])
-    if family == socket.AF_INET:
-        return struct.pack("=H", family) + struct.pack("!H", port) + packed + bytes(8)
-    scope = address[3]
-    return struct.pack("=H", family) + struct.pack("!HI", port, 0) + packed + struct.pack("=I", scope)
 
 
 def _set_raw(fd: int, options: SerialOptions) -> None:

@@ -8,17 +8,15 @@ from typing import Any
 
 import numpy as np
 
-from rtloop.drivers.node.card import RAW_BYTES, ROOM_BYTES, SENDER_BYTES
+from rtloop.drivers.node.card import RAW_BYTES, ROOM_BYTES
 from rtloop.foundation.native.compiled import c_library_function, jit, jit_rare
 from rtloop.foundation.native.pointers import address_pointer, carray
 
 MSG_DONTWAIT = 0x40
-EMPTY, GONE, FOREIGN, BROKEN = -4, -3, -2, -1
-"""Results in place of a frame's length: no bytes have come, a serial line has ended, a datagram of another sender,
-bytes that are no frame."""
+EMPTY, GONE, BROKEN = -3, -2, -1
+"""Results in place of a frame's length: no bytes have come, a serial line has ended, bytes that are no frame."""
 SKIPPING = -1
 EINTR, EAGAIN = 4, 11
-FAMILY_INET = 2
 COBS_RUN = 254
 
 
@@ -43,16 +41,12 @@ def _errno_address_in_python() -> int:
 _errno_copy = ctypes.c_int32()
 
 
-_INT, _WORD, _SIZE = ctypes.c_int32, ctypes.c_ssize_t, ctypes.c_uint32
-_sendto = c_library_function(
-    "sendto",
-    "intp(int32, intp, intp, int32, intp, uint32)",
-    _library_call("sendto", _WORD, _INT, _WORD, _WORD, _INT, _WORD, _SIZE),
+_INT, _WORD = ctypes.c_int32, ctypes.c_ssize_t
+_send = c_library_function(
+    "send", "intp(int32, intp, intp, int32)", _library_call("send", _WORD, _INT, _WORD, _WORD, _INT)
 )
-_recvfrom = c_library_function(
-    "recvfrom",
-    "intp(int32, intp, intp, int32, intp, intp)",
-    _library_call("recvfrom", _WORD, _INT, _WORD, _WORD, _INT, _WORD, _WORD),
+_recv = c_library_function(
+    "recv", "intp(int32, intp, intp, int32)", _library_call("recv", _WORD, _INT, _WORD, _WORD, _INT)
 )
 _read = c_library_function("read", "intp(int32, intp, intp)", _library_call("read", _WORD, _INT, _WORD, _WORD))
 _write = c_library_function("write", "intp(int32, intp, intp)", _library_call("write", _WORD, _INT, _WORD, _WORD))
@@ -64,14 +58,14 @@ _errno_address = c_library_function("__errno_location", "intp()", _errno_address
 def send_frame(card, length):
     """Send the first `length` bytes at `card.sent`; return whether the system took all of them."""
     if card.is_serial == 0:
-        return _sendto(card.fd, card.sent, length, MSG_DONTWAIT, card.peer, card.peer_bytes) == length
+        return _send(card.fd, card.sent, length, MSG_DONTWAIT) == length
     coded_length = encode_cobs(card, length)
     return _write(card.fd, card.coded, coded_length) == coded_length
 
 
 @jit
 def receive_frame(card):
-    """Copy the next frame to `card.received` and return its length, else EMPTY, FOREIGN, BROKEN or GONE; never wait."""
+    """Copy the next frame to `card.received` and return its length, else EMPTY, BROKEN or GONE; never wait."""
     if card.is_serial == 0:
         return _receive_datagram(card)
     return _receive_line(card)
@@ -80,30 +74,24 @@ def receive_frame(card):
 @jit
 def _receive_datagram(card):
     """Receive a datagram from the node; see `receive_frame`. A datagram that is longer than any frame is BROKEN."""
-    size = carray(address_pointer(card.sender_bytes), 1, np.uint32)
-    size[0] = SENDER_BYTES
-    length = _recvfrom(card.fd, card.received, ROOM_BYTES, MSG_DONTWAIT, card.sender, card.sender_bytes)
+    length = _recv(card.fd, card.received, ROOM_BYTES, MSG_DONTWAIT)
     if length < 0:
         return EMPTY
-    if not _is_from_node(card, size[0]):
-        return FOREIGN
     return length if length < ROOM_BYTES else BROKEN
 
 
-@jit
-def _is_from_node(card, sender_bytes):
-    """Whether the last datagram's family, port and address are the node's; IPv6's flow label is not compared."""
-    if sender_bytes != card.peer_bytes:
-        return False
-    peer = carray(address_pointer(card.peer), card.peer_bytes, np.uint8)
-    sender = carray(address_pointer(card.sender), SENDER_BYTES, np.uint8)
-    is_equal = True
-    for i in range(4):
-        is_equal = is_equal and peer[i] == sender[i]
-    first, last = (4, 8) if peer[0] == FAMILY_INET else (8, 24)
-    for i in range(first, last):
-        is_equal = is_equal and peer[i] == sender[i]
-    return is_equal
+@jit_rare
+def take_strangers(card, largest):
+    """Receive what other senders than the node have sent to the loop's port; return the number of datagrams.
+
+    Takes at most `largest`. The bytes go to `card.received`, whose frame is lost. A serial line has no strangers.
+    """
+    count = 0
+    while count < largest and card.is_serial == 0:
+        if _recv(card.strangers_fd, card.received, ROOM_BYTES, MSG_DONTWAIT) < 0:
+            break
+        count += 1
+    return count
 
 
 @jit_rare

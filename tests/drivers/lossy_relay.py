@@ -217,7 +217,7 @@ class Relay:
             if parse_drive(data):
                 self._take_answer(self._give_node(data, LOOP, True), plan)
         if chance.random() < plan.strangers:  # A stranger answers the newest drive.
-            self._send(frame(SAMPLE, newest, sample_content(self._session, boot, codes)), Arrival("foreign"), True)
+            self._send(frame(SAMPLE, newest, sample_content(self._session, boot, codes)), Arrival("stranger"), True)
         if chance.random() < plan.strangers:  # A sample of another session, from the node's address.
             self._send(frame(SAMPLE, newest, sample_content(self._session ^ 1, boot, codes)), Arrival("foreign"))
         if chance.random() < plan.strangers:  # An answer that no drive has asked for.

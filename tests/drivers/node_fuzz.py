@@ -57,23 +57,20 @@ def fuzz(kind: str, seed: int, count: int) -> dict[str, float]:
     """
     draw = random.Random(seed)
     if kind == "udp":
-        loop, node = (socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in range(2))
-        for end in (loop, node):
+        loop, node, strangers = (socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in range(3))
+        for end in (loop, node, strangers):
             end.bind(("127.0.0.1", 0))
             end.setblocking(False)
-        address = node.getsockname()
-        peer = (
-            struct.pack("=H", socket.AF_INET) + struct.pack("!H", address[1]) + socket.inet_aton(address[0]) + bytes(8)
-        )
-        fd = loop.fileno()
+        loop.connect(node.getsockname())
+        fd, strangers_fd = loop.fileno(), strangers.fileno()
         send = lambda data: node.sendto(data, loop.getsockname())
     else:
         incoming, outgoing = os.pipe()
         os.set_blocking(incoming, False)
-        fd, peer = incoming, b""
+        fd, strangers_fd = incoming, None
         send = lambda data: os.write(outgoing, data if draw.random() < 0.1 else encode(data))
     card, arrays = make_card(
-        fd, peer, in_scales=SCALES, out_scales=SCALES, hold_ticks=1000, error_limit=1 << 40, session=SESSION,
+        fd, strangers_fd, in_scales=SCALES, out_scales=SCALES, hold_ticks=1000, error_limit=1 << 40, session=SESSION,
         boot=BOOT, hold_us=1000, running=1,
     )  # fmt: skip
     values, volts = np.zeros(INPUTS + 1 + len(OBSERVED)), np.zeros(INPUTS)

@@ -49,7 +49,7 @@ def parse_drive(data: bytes) -> DriveFrame | None:
 
 
 class Arrival(NamedTuple):
-    """A datagram that arrived at the loop: "sample" with its sequence and codes, "invalid" or "foreign"."""
+    """A datagram that arrived at the loop: "sample" with its sequence and codes, "invalid", "foreign" or "stranger"."""
 
     kind: str
     sequence: int = 0

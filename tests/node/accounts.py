@@ -12,6 +12,10 @@ FRAMES_PER_TICK = 64
 """Largest number of frames that the driver takes in a tick; the others wait for the next one."""
 
 
+STRANGERS_EVERY = 64
+"""Ticks from one count of other senders' datagrams to the next; the first is in the tick before those of `accounts`."""
+
+
 def accounts(arrivals: list[list[Arrival]], first: int) -> list[list[int]]:
     """Return the counts of COUNTS after each tick, by their definitions; tick k awaits the answer to drive first + k.
 
@@ -20,10 +24,11 @@ def accounts(arrivals: list[list[Arrival]], first: int) -> list[list[int]]:
     """
     queue: list[Arrival] = []
     known: dict[str, list[int]] = {"firsts": [], "again": []}
-    invalid = foreign = held = level = 0
+    invalid = foreign = held = level = strangers = 0
     rows = []
     for tick, arrived in enumerate(arrivals):
-        queue += arrived
+        queue += [arrival for arrival in arrived if arrival.kind != "stranger"]
+        strangers += sum(arrival.kind == "stranger" for arrival in arrived)
         awaited = [arrival.kind == "sample" and arrival.sequence == first + tick for arrival in queue]
         count = min(awaited.index(True) + 1 if True in awaited else len(queue), FRAMES_PER_TICK)
         taken, queue = queue[:count], queue[count:]
@@ -32,6 +37,8 @@ def accounts(arrivals: list[list[Arrival]], first: int) -> list[list[int]]:
             foreign += arrival.kind == "foreign"
             if arrival.kind == "sample":
                 known["again" if arrival.sequence in known["firsts"] else "firsts"].append(arrival.sequence)
+        if (tick + 1) % STRANGERS_EVERY == 0:
+            foreign, strangers = foreign + min(strangers, FRAMES_PER_TICK), max(strangers - FRAMES_PER_TICK, 0)
         firsts = known["firsts"]
         late = sum(number < highest for number, highest in zip(firsts, accumulate(firsts, max), strict=True))
         missing = max(firsts) - first + 1 - len(firsts)

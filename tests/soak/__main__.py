@@ -25,6 +25,7 @@ LONG_TESTS = {
     "laws": ("tests.soak.laws", "1,000 live changes of every shipped controller; 15 minutes a seed"),
     "live-changes": ("tests.soak.live_changes", "random changes for 10^8 ticks; 10 minutes, 1 GB"),
     "netem": ("tests.soak.netem", "the driver udp behind tc netem, counted on both sides (root); 5 minutes"),
+    "node-wire": ("tests.soak.node_wire", "delays, and 10^7 datagrams of which one in 10^6 is lost; 10 minutes"),
     "pages": ("tests.site.run_pages", "every command of every page that needs no hardware and no root; 20 minutes"),
     "panel-load": ("tests.soak.panel_load", "lateness of a paced run with and without four panels (root)"),
     "panel-triggers": ("tests.soak.panel_triggers", "the panel's trigger finds 10,000 pulses of one tick; 10 minutes"),
