@@ -37,16 +37,17 @@ def prepare_actuator(options: ServiceOptions, supervisor: Supervisor, live: Live
 
 def depolarise(options: DepolariseOptions, supervisor: Supervisor, live: LiveLaw, desk: Desk) -> None:
     """Erase the memory of all axes by the same sine, and wait until the outputs are at safe; raises as
-    `prepare_actuator`.
+    `prepare_actuator`. Clients' references are refused meanwhile.
     """
     rate_hz = live.prepared.plan.pacing.rate_hz
     sine_v = decaying_sine(options, rate_hz)
-    for axis in range(len(live.prepared.plan.axes)):
-        live.references.play_raw(axis, sine_v)
-    desk.submit(Kind.SET_MODE, values=[float(Mode.RAW)])
-    await_ticks(supervisor, sine_v.size, rate_hz)
-    desk.submit(Kind.SET_MODE, values=[float(Mode.OFF)])
-    _await_rest(supervisor)
+    with live.references.reserved("the actuator is depolarised"):
+        for axis in range(len(live.prepared.plan.axes)):
+            live.references.play_raw(axis, sine_v)
+        desk.submit(Kind.SET_MODE, values=[float(Mode.RAW)])
+        await_ticks(supervisor, sine_v.size, rate_hz)
+        desk.submit(Kind.SET_MODE, values=[float(Mode.OFF)])
+        _await_rest(supervisor)
 
 
 def decaying_sine(options: DepolariseOptions, rate_hz: float) -> npt.NDArray[np.float64]:

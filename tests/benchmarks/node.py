@@ -15,8 +15,10 @@ from typing import Any
 import numpy as np
 
 import rtloop
-from tests.benchmarks.configurations import RIG, ROOT, SINE, STEPS, changed, last_cpu, write
-from tests.benchmarks.measure import Effort, NotMeasured, in_turn, ratio, spread
+from rtloop.signals import Flag
+from tests.benchmarks.configurations import RIG, ROOT, SINE, STEPS, at_rate, changed, last_cpu, pinned, write
+from tests.benchmarks.measure import Effort, NotMeasured, in_turn, ratio, say, spread
+from tests.benchmarks.rates import ALLOWED, RATES_HZ, SPIN_US, WINDOWS, late_shares
 
 SECONDS, RATE_HZ = 4.0, 10_000
 HOLD_US = 5_000_000
@@ -56,6 +58,8 @@ def node(effort: Effort) -> dict[str, Any]:
 
     - `calls`: in the next tick's answer there is no wait; with the same tick's the wait for the node is within.
     - `apart_from_wait`: with the same tick's answer, the loop's read and write less the exchange that it waited for.
+    - `highest_hz`: the last rate of the ladder of `rates`, with the next tick's answer and spinning, at which less than
+      0.1 % of the ticks overran, were skipped or had no answer, in the median one-second window.
     """
     if shutil.which("cc") is None or shutil.which("make") is None:
         raise NotMeasured("a C compiler and make build the node: apt-get install build-essential")
@@ -78,15 +82,37 @@ def node(effort: Effort) -> dict[str, Any]:
                 if key == "same_tick":
                     for figure in ("apart_from_wait", "exchange_p50", "exchange_p99"):
                         found[key][f"{figure}_us"] = spread([row[figure] for row in rounds["rtloop"]])
+            found["highest_hz"] = _highest_hz(programs, port, max(round(effort.seconds(WINDOWS)), 2))
     return found
+
+
+def _highest_hz(folder: Path, port: int, windows: int) -> float:
+    """Return the last rate of the ladder before the first one that is not kept; 0 where none is."""
+    highest_hz = 0.0
+    for rate_hz in RATES_HZ:
+        driver, pins = DRIVER.format(port=port, answer="next tick"), pinned(last_cpu(), SPIN_US)
+        recording = _record(folder, windows + 0.5, (RIG, driver), at_rate(rate_hz), *pins)
+        deadline_ns, flags, missed, status = recording.read("deadline_ns", "flags", "periods_missed", "driver_status")
+        lost = late_shares(deadline_ns, flags, missed).lost
+        held = late_shares(deadline_ns, np.where(status == 1, int(Flag.OVERRUN), 0), np.zeros_like(missed)).overrun
+        say(f"{rate_hz} Hz: overrun or skipped {lost:.3%}, without an answer {held:.3%}")
+        if max(lost, held) >= ALLOWED:
+            break
+        highest_hz = float(rate_hz)
+    return highest_hz
+
+
+def _record(folder: Path, duration_s: float, *changes: tuple[str, str]) -> rtloop.Recording:
+    """Run the loop with its outputs off, and return the recording."""
+    config = write(folder, changed((STEPS, SINE), ('# mode = "closed_loop"', 'mode = "off"'), *changes))
+    (folder / "paper-spec.toml").write_text((ROOT / "deploy/paper-spec.toml").read_text())
+    return rtloop.load(rtloop.run(config, duration_s=duration_s, folder=folder / "recordings").recordings[0])
 
 
 def _loop_us(folder: Path, port: int, answer: str, duration_s: float) -> dict[str, float]:
     """Run the loop; return medians over its ticks in µs."""
-    text = changed((RIG, DRIVER.format(port=port, answer=answer)), (STEPS, SINE), ("# cpu = 1", f"cpu = {last_cpu()}"))
-    config = write(folder, text.replace('# mode = "closed_loop"', 'mode = "off"'))
-    (folder / "paper-spec.toml").write_text((ROOT / "deploy/paper-spec.toml").read_text())
-    recording = rtloop.load(rtloop.run(config, duration_s=duration_s, folder=folder / "recordings").recordings[0])
+    driver = RIG, DRIVER.format(port=port, answer=answer)
+    recording = _record(folder, duration_s, driver, *pinned(last_cpu()))
     read_us, write_us, exchange_us = (recording[name][100:] for name in ("read_us", "write_us", "node_exchange_us"))
     calls_us = read_us + write_us
     return {

@@ -6,12 +6,15 @@ import os
 import signal
 
 import numpy as np
+import pytest
 
 import rtloop
 from rtloop.configuration.service import DepolariseOptions
+from rtloop.errors import RtloopError
 from rtloop.service.preparation import decaying_sine
 from tests.faults.account import runs_in
 from tests.faults.bench import Bench
+from tests.faults.evidence import wait_for
 
 R = [0.095, 0.38, 0.84, 1.46, 2.21, 3.07, 4.01, 4.98, 5.96, 6.89, 7.76, 8.52, 9.14, 9.61, 9.9]
 P = [2.55, 0.57, 1.3, -1.57, 1.25, -0.054, -0.032, 0.66, 0.16, -0.77, 2.02, -1.63, -0.15, 2.99, -1.09]
@@ -60,3 +63,19 @@ def test_the_tare_survives_the_loop(tmp_path):
     assert abs(offsets_v[0][-1] - 0.3) < 0.001
     assert np.ptp(offsets_v[1]) < 1e-12
     assert abs(offsets_v[1][0] - offsets_v[0][-1]) < 1e-12
+
+
+def test_a_setpoint_while_the_actuator_is_depolarised_moves_nothing(tmp_path):
+    """4 µm would be 4 V in mode raw; the sine has 1 V."""
+    sine = "[service]\ndepolarise = { amplitude_v = 1.0, frequency_hz = 10.0, cycles = 50 }\n[recording]"
+    with Bench(tmp_path, ("[recording]", sine)) as bench:
+        wait_for(lambda: bench.seen().largest_v > 0.5, "the sine")
+        for resource, body in (("/setpoint", {"value": 4.0}), ("/waveform", {"samples": [4.0, 4.0]})):
+            with pytest.raises(RtloopError, match="the actuator is depolarised; send the request again"):
+                bench.client.post(resource, {"axis": "x"} | body)
+        largest_v = 1.0
+        while bench.status()["mode"] != "closed_loop":
+            assert largest_v < 1.1  # as seen before the mode was asked for
+            largest_v = bench.seen().largest_v
+        bench.client.post("/setpoint", {"axis": "x", "value": 4.0})
+        assert bench.stop() == 0, bench.log()

@@ -62,6 +62,8 @@ class LiveReferences:
         """Number of references set on each axis, which the loop accepted or may still start."""
         self._own_counts = [0] * len(plan.axes)
         """Those of them that the service itself set: sines that depolarise, and the ramps of a return."""
+        self._activity = ""
+        """What the service does to the outputs meanwhile; empty while clients may set references."""
 
     def set(self, axis: str, reference: Mapping[str, Any], *, restores: bool = False) -> int:
         """Start a generator, {kind, …} as in [axis.reference], on an axis. Returns its first tick.
@@ -135,6 +137,16 @@ class LiveReferences:
             if setting.samples is None:
                 return self._submit(number, values)
             return self._submit_table(number, values, setting.samples)
+
+    @contextmanager
+    def reserved(self, activity: str) -> Iterator[None]:
+        """Refuse the references of clients within, with `activity` as the reason: the loop would take µm for V."""
+        with self._staging.lock:
+            self._activity = activity
+        try:
+            yield
+        finally:
+            self._activity = ""
 
     @contextmanager
     def _own_change(self, number: int, replaces: int | None = None) -> Iterator[None]:
@@ -218,8 +230,10 @@ class LiveReferences:
 
         Table samples go to shared memory. `values` and `samples` as `generator` returns them, `restores` as in `set`.
         Raises ConfigError beyond limits.command_um (raw mode: beyond the drive's limits), for a setpoint beyond the
-        position interlock and for too many samples; Refusal, UnconfirmedCommand.
+        position interlock and for too many samples; Refusal within `reserved`; Refusal, UnconfirmedCommand.
         """
+        if self._activity:
+            raise Refusal(f"reference: {self._activity}; send the request again when that is done")
         options = self._prepared().configuration.axes[number]
         limits = options.limits
         lowest, highest = extent(values, samples)
