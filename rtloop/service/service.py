@@ -82,7 +82,7 @@ class Service:
         self.config, self._name = config, name
         self.configuration: Configuration = load(config, name)
         options = self.configuration.service
-        if self.configuration.schedule and (options.tare_s > 0 or options.depolarise is not None):
+        if self.configuration.schedule and self._has_preparation:
             fault = "schedule: not allowed with service.tare_s or service.depolarise, which use the first ticks"
             raise ConfigError(str(config), [fault])
         if self.configuration.schedule and options.recover is not None:
@@ -102,6 +102,8 @@ class Service:
         self.second_opinion = SecondOpinion()
         self.recovery = Recovery(self)
         self._is_preparing = False
+        self._requested_mode: Mode | None = None
+        """Mode that a client requested while the actuator was prepared."""
         self._desk: Desk | None = None
         self._end_requested, self._reload_requested = threading.Event(), threading.Event()
         self._reload_lock = threading.Lock()
@@ -141,6 +143,12 @@ class Service:
     def _has_died(self) -> bool:
         """Whether the present loop's process has died; parking its outputs was tried, its files may be unfinished."""
         return self.supervisor is not None and self.supervisor.error is not None
+
+    @property
+    def _has_preparation(self) -> bool:
+        """Whether the configuration depolarises or tares the actuator at a start."""
+        options = self.configuration.service
+        return options.depolarise is not None or options.tare_s > 0
 
     @property
     def is_moved(self) -> bool:
@@ -191,24 +199,31 @@ class Service:
         `mode` is the name of a Mode in lower case, such as "closed_loop". A reference in µm is meaningless in volts: on
         entry to and exit from mode raw, the present output is held. In a loop that is tripped or stops, mode off
         changes no output: all are safe, or ramp there. Raises Refusal while tripped or not armed (mode off is allowed
-        then, too), without a loop, where the driver refuses the writes of a ramp, and as `Desk.submit`. Any accepted
-        mode, and off, end a recovery.
+        then, too), while the actuator is prepared (off is allowed, and the loop is not started then), without a loop,
+        where the driver refuses the writes of a ramp, and as `Desk.submit`. Any accepted mode, and off, end a recovery.
         """
         target_mode = Mode[mode.upper()]
         if target_mode is not Mode.OFF and self.state is State.TRIPPED:
             raise Refusal(f"mode {mode}: the service is tripped; use reset first ({self.ctl('reset')})")
         if target_mode is not Mode.OFF and not self.armed:
             raise Refusal(f"mode {mode}: the outputs are not armed; use arm first ({self.ctl('arm')})")
+        if target_mode is not Mode.OFF and self._is_preparing and self._has_preparation:
+            raise Refusal(f"mode {mode}: the actuator is depolarised or tared; send the request again afterwards")
         self.recovery.end()
+        self._requested_mode = target_mode
+        return self._enter(target_mode)
+
+    def _enter(self, mode: Mode) -> int:
+        """Change the mode bumplessly. Returns the tick at which it took effect; raises as `set_mode`."""
         try:
-            return self.desk.submit(Kind.SET_MODE, values=[float(target_mode), 0.0, 1.0])
+            return self.desk.submit(Kind.SET_MODE, values=[float(mode), 0.0, 1.0])
         except RefusedByLoop as refusal:
-            if target_mode is not Mode.OFF:
+            if mode is not Mode.OFF:
                 raise
             row = None if self.supervisor is None else self.supervisor.latest()
             if row is not None and int(row[signals.FLAGS]) & Flag.WRITE_FAILED:
                 reason = "the driver refuses every write: the outputs do not move; use the emergency stop"
-                raise Refusal(f"mode {mode}: {reason}") from None
+                raise Refusal(f"mode off: {reason}") from None
             return refusal.tick
 
     def stop(self) -> int:
@@ -246,6 +261,8 @@ class Service:
         could not start: RtloopError, DriverError.
         """
         log.info("starting %s, which records into %s", self.configuration.name, recordings_folder(self.configuration))
+        if self.configuration.service.arm and self._has_preparation:
+            log.warning("the actuator is neither depolarised nor tared, because service.arm is true")
         recovery = self._start_thread(self._recover_leftovers)
         try:
             return self._serve()
@@ -446,16 +463,23 @@ class Service:
             log.info("%s: %d ticks recovered from %s", report["output"], report["ticks"], part_file.name)
 
     def _prepare_and_start(self) -> None:
-        """Depolarise and tare the actuator, set the configured references and mode; latch an RtloopError as a fault."""
+        """Depolarise and tare the actuator, set the configured references and mode; latch an RtloopError as a fault.
+
+        A mode that a client requests meanwhile, such as off, takes the place of the configured one.
+        """
         supervisor, live, desk = self.supervisor, self.live, self._desk
         if supervisor is None or live is None or desk is None:
             return
-        self._is_preparing = True
+        self._requested_mode, self._is_preparing = None, True
         try:
             prepare_actuator(self.configuration.service, supervisor, live, desk)
             for number in range(len(live.prepared.plan.axes)):
                 live.references.restore_configured(number)
-            self.start()
+            if self._requested_mode is None:
+                self._enter(Mode[self.configuration.loop.mode.upper()])
+            if self._requested_mode is not None:  # It came before, or while the configured mode was entered.
+                self._enter(self._requested_mode)
+                log.info("not started: mode %s was requested meanwhile", self._requested_mode.name.lower())
         except RtloopError as error:
             self.faults.append(str(error))
             log.error("%s", error)

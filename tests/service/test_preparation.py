@@ -79,3 +79,19 @@ def test_a_setpoint_while_the_actuator_is_depolarised_moves_nothing(tmp_path):
             largest_v = bench.seen().largest_v
         bench.client.post("/setpoint", {"axis": "x", "value": 4.0})
         assert bench.stop() == 0, bench.log()
+
+
+def test_a_stop_while_the_actuator_is_depolarised_is_not_undone_by_the_start(tmp_path):
+    sine = "[service]\ndepolarise = { amplitude_v = 2.0, frequency_hz = 20.0, cycles = 30 }\n[recording]"
+    with Bench(tmp_path, ("[recording]", sine)) as bench:
+        wait_for(lambda: bench.seen().largest_v > 0.5, "the sine")
+        with pytest.raises(RtloopError, match="mode closed_loop: the actuator is depolarised or tared; send"):
+            bench.client.post("/start")
+        bench.client.post("/stop")
+        wait_for(lambda: "not started: mode off was requested meanwhile" in bench.log(), "the end of the preparation")
+        ticks = bench.ticks
+        wait_for(lambda: bench.ticks > ticks + 1000, "ticks")
+        assert (bench.status()["mode"], bench.seen().last_v) == ("off", 0.0)
+        bench.client.post("/start")
+        bench.await_drive()
+        assert bench.stop() == 0, bench.log()
