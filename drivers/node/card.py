@@ -24,7 +24,7 @@ answered request until the loop had its answer."""
 
 _ADDRESSES = (
     "sent", "received", "coded", "partial", "raw", "crc_table",
-    "in_scales", "out_scales", "codes", "ring_sequence", "ring_state", "ring_ns", "timespec",
+    "in_scales", "out_scales", "codes", "ring_sequence", "ring_request", "ring_ns", "timespec",
 )  # fmt: skip
 CARD = np.dtype(
     [
@@ -44,6 +44,9 @@ CARD = np.dtype(
         ("running", np.int64),  # 1 from the first tick on
         ("failure", np.int64),  # 0, or why no sample comes any more; see `rtloop.drivers.node.failures`
         ("held_in_a_row", np.int64),
+        ("requests", np.int64),  # frames that asked for an answer, since the driver was opened
+        ("opening_request", np.int64),  # the last of them before the first tick
+        ("newest_request", np.int64),  # which of them the newest sample answers, from 1; 0 before the first
         ("age_ns", np.int64),  # of the newest sample when the node sent it
         ("raw_length", np.int64),
         ("raw_position", np.int64),
@@ -83,7 +86,7 @@ def make_card(
         "out_scales": outputs,
         "codes": np.zeros(len(inputs), np.int32),
         "ring_sequence": np.zeros(WINDOW, np.uint32),
-        "ring_state": np.zeros(WINDOW, np.int64),
+        "ring_request": np.zeros(WINDOW, np.int64),
         "ring_ns": np.zeros(WINDOW, np.int64),
         "timespec": np.zeros(2, np.int64),
     }

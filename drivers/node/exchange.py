@@ -42,7 +42,6 @@ STRANGERS_EVERY = 64
 OPEN_TRIES, OPEN_WAIT_NS = 200, 5_000_000
 RISE, FALL = 2, 1
 """Steps of the error level for a tick without and with its answer (LinuxCNC, hm2_eth)."""
-EXPECTED, ANSWERED, MISSING = 1, 2, 3
 HIGH_V, THRESHOLD_V = 5.0, 2.5
 """Volts that stand for a digital channel's 1, and those from which on an output is 1."""
 OBSERVED_COUNT = len(COUNTS)
@@ -123,9 +122,10 @@ def _send_drive(card, flags):
     check[0] = checksum(card, card.sent, length)
     if flags & ANSWER:
         card.sequence = card.last_sequence
+        card.requests += 1
         index = np.int64(card.sequence) % WINDOW
         carray(address_pointer(card.ring_sequence), WINDOW, np.uint32)[index] = card.sequence
-        carray(address_pointer(card.ring_state), WINDOW, np.int64)[index] = EXPECTED
+        carray(address_pointer(card.ring_request), WINDOW, np.int64)[index] = card.requests
         carray(address_pointer(card.ring_ns), WINDOW, np.int64)[index] = monotonic_ns(card.timespec)
     send_frame(card, length + CRC_BYTES)
 
@@ -158,6 +158,7 @@ def _open_again(card):
             break
     if card.newest != card.sequence and card.failure == 0:
         card.failure = SILENT
+    card.opening_request = card.requests
     card.lost = card.reordered = card.duplicated = card.invalid = card.foreign = card.held = card.error_level = 0
 
 
@@ -229,46 +230,36 @@ def _take_sample(card):
     frame = carray(address_pointer(card.received), 1, SAMPLE)[0]
     received = carray(address_pointer(card.received + SAMPLE_HEAD), card.inputs, np.int32)
     scales = carray(address_pointer(card.in_scales), card.inputs, SCALE)
-    states = carray(address_pointer(card.ring_state), WINDOW, np.int64)
+    requests = carray(address_pointer(card.ring_request), WINDOW, np.int64)
     sequences = carray(address_pointer(card.ring_sequence), WINDOW, np.uint32)
     index = np.int64(frame.sequence) % WINDOW
-    is_valid = sequences[index] == frame.sequence and states[index] != 0
+    is_valid = sequences[index] == frame.sequence and requests[index] != 0
     for i in range(card.inputs):
         is_valid = is_valid and scales[i].lowest <= received[i] <= scales[i].highest
     if not is_valid:
         card.invalid += 1
         return
-    if states[index] == ANSWERED:
+    request = requests[index]
+    if request < 0:
         card.duplicated += 1
         return
-    is_late = states[index] == MISSING
-    states[index] = ANSWERED
-    if is_late:
-        card.lost -= 1
-        card.reordered += 1
+    requests[index] = -request  # It is answered.
+    if request < card.newest_request:
+        if request > card.opening_request:
+            card.lost -= 1
+            card.reordered += 1
         return
     if not frame.bits & READY:
         card.failure = NOT_READY if card.running != 0 else 0
         return
-    _count_skipped(card, states, sequences, frame.sequence)
+    card.lost += request - card.newest_request - 1
+    card.newest_request = request
     card.newest, card.digital, card.age_ns = frame.sequence, frame.digital, frame.age_ns
     sent_ns = carray(address_pointer(card.ring_ns), WINDOW, np.int64)[index]
     card.exchange_ns = monotonic_ns(card.timespec) - sent_ns
     codes = carray(address_pointer(card.codes), card.inputs, np.int32)
     for i in range(card.inputs):
         codes[i] = received[i]
-
-
-@jit
-def _count_skipped(card, states, sequences, newest):
-    """Mark unanswered requests after `card.newest` and before sequence `newest` as MISSING, count them as lost."""
-    count = np.int64(np.uint32(newest - card.newest))
-    for back in range(1, min(count, WINDOW)):
-        sequence = np.uint32(newest - np.uint32(back))
-        index = np.int64(sequence) % WINDOW
-        if sequences[index] == sequence and states[index] == EXPECTED:
-            states[index] = MISSING
-            card.lost += 1
 
 
 @jit

@@ -212,6 +212,13 @@ def test_an_answer_after_more_than_a_thousand_requests_is_invalid():
     assert [run.column(name)[-1] for name in COUNTS[:5]] == [3, 1, 0, 1, 0]
 
 
+def test_each_of_thousands_of_lost_requests_counts():
+    with relayed(PythonNode()) as relay:
+        run = Run(relay, Script({("drive", k): () for k in range(5, 3005)}), hold_ticks=1, ticks=3010)
+    assert_counted(run, hold_ticks=1)
+    assert run.column("node_lost_samples")[-1] == 3000
+
+
 def test_datagrams_beyond_those_of_a_tick_wait_for_the_next_one():
     with relayed(PythonNode()) as relay:
         relay.floods = {10: 64, 20: 63, 30: 200}
