@@ -44,8 +44,8 @@ def depolarise(options: DepolariseOptions, supervisor: Supervisor, live: LiveLaw
     with live.references.reserved("the actuator is depolarised"):
         for axis in range(len(live.prepared.plan.axes)):
             live.references.play_raw(axis, sine_v)
-        desk.submit(Kind.SET_MODE, values=[float(Mode.RAW)])
-        await_ticks(supervisor, sine_v.size, rate_hz)
+        first_tick = desk.submit(Kind.SET_MODE, values=[float(Mode.RAW)])
+        await_ticks(supervisor, sine_v.size, rate_hz, raw_from_tick=first_tick)
         desk.submit(Kind.SET_MODE, values=[float(Mode.OFF)])
         _await_rest(supervisor)
 
@@ -57,12 +57,19 @@ def decaying_sine(options: DepolariseOptions, rate_hz: float) -> npt.NDArray[np.
     return options.amplitude_v * (1 - phase) * np.sin(2 * np.pi * options.cycles * phase)
 
 
-def await_ticks(supervisor: Supervisor, count: int, rate_hz: float) -> None:
-    """Wait until `count` more ticks were executed. Raises Refusal after a trip or the time limit."""
+def await_ticks(supervisor: Supervisor, count: int, rate_hz: float, raw_from_tick: int | None = None) -> None:
+    """Wait until `count` more ticks were executed. Raises Refusal after a trip or the time limit.
+
+    With `raw_from_tick`, also if a tick after that one has another mode than raw, because a client requested it.
+    """
     final_tick, limit_s = supervisor.ticks + count, 1.0 + TIMEOUT_FACTOR * count / rate_hz
     start_s = time.monotonic()
     while supervisor.ticks < final_tick:
         _require_progress(supervisor, start_s, limit_s)
+        row = supervisor.latest()
+        if raw_from_tick is not None and row is not None and row[signals.TICK] > raw_from_tick:
+            if row[signals.MODE] != Mode.RAW:
+                raise Refusal("preparing the actuator: ended, because another mode was requested")
         time.sleep(POLL_S)
 
 

@@ -472,19 +472,28 @@ class Service:
             return
         self._requested_mode, self._is_preparing = None, True
         try:
-            prepare_actuator(self.configuration.service, supervisor, live, desk)
+            try:
+                prepare_actuator(self.configuration.service, supervisor, live, desk)
+            except Refusal:
+                if self._requested_mode is None:
+                    raise
+            mode = Mode[self.configuration.loop.mode.upper()]
+            if mode is Mode.RAW and self._requested_mode is None:
+                self._enter(mode)  # The references that follow are in V then.
             for number in range(len(live.prepared.plan.axes)):
                 live.references.restore_configured(number)
             if self._requested_mode is None:
-                self._enter(Mode[self.configuration.loop.mode.upper()])
+                self._enter(mode)
             if self._requested_mode is not None:  # It came before, or while the configured mode was entered.
                 self._enter(self._requested_mode)
-                log.info("not started: mode %s was requested meanwhile", self._requested_mode.name.lower())
         except RtloopError as error:
-            self.faults.append(str(error))
-            log.error("%s", error)
+            if self._requested_mode is None and not self._end_requested.is_set():
+                self.faults.append(str(error))
+                log.error("%s", error)
         finally:
             self._is_preparing = False
+            if self._requested_mode is not None:
+                log.info("not started: mode %s was requested meanwhile", self._requested_mode.name.lower())
 
     def _judge_loop(self, prepared: Prepared) -> None:
         """Compute the second opinion. A disagreement brings the outputs to safe, and is latched as a fault."""
