@@ -66,11 +66,15 @@ def await_ticks(supervisor: Supervisor, count: int, rate_hz: float, raw_from_tic
     start_s = time.monotonic()
     while supervisor.ticks < final_tick:
         _require_progress(supervisor, start_s, limit_s)
-        row = supervisor.latest()
-        if raw_from_tick is not None and row is not None and row[signals.TICK] > raw_from_tick:
-            if row[signals.MODE] != Mode.RAW:
-                raise Refusal("preparing the actuator: ended, because another mode was requested")
+        if raw_from_tick is not None and _has_left_raw(supervisor, raw_from_tick):
+            raise Refusal("preparing the actuator: ended, because another mode was requested")
         time.sleep(POLL_S)
+
+
+def _has_left_raw(supervisor: Supervisor, from_tick: int) -> bool:
+    """Return whether the newest tick is after `from_tick` and its mode is not raw."""
+    row = supervisor.latest()
+    return row is not None and bool(row[signals.TICK] > from_tick and row[signals.MODE] != Mode.RAW)
 
 
 def _await_rest(supervisor: Supervisor) -> None:
