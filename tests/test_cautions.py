@@ -13,9 +13,11 @@ from rich.console import Console
 
 from rtloop.cli import main
 from rtloop.configuration.cautions import cautions
-from rtloop.configuration.file import parse
+from rtloop.configuration.file import load, parse
 from rtloop.configuration.prepare import prepare
 from rtloop.drivers.base import Channel
+from rtloop.errors import ConfigError
+from rtloop.service.service import Service
 from rtloop.workbench.axis_judgement import AxisJudgement
 from rtloop.workbench.check_text import print_axis
 from tests.asked import answer, run
@@ -99,6 +101,29 @@ def test_weights_whose_whole_stroke_is_noise_are_named() -> None:
 def test_a_reference_of_the_schedule_counts() -> None:
     (line,) = found(TEXT + SCHEDULE)
     assert line == "axis.x.reference from tick 500 on: reaches 43 µm, beyond limits.command_um = 42"
+
+
+SERVICE = "\n[service]\n"
+RECOVER = "[service.recover]\n"
+
+
+@pytest.mark.parametrize(
+    ("text", "warnings"),
+    [
+        (f"{SERVICE}tare_s = 1.0\n", []),
+        (f"{SERVICE}arm = true\ntare_s = 1.0\n", ["service.depolarise, service.tare_s: no effect with service.arm"]),
+        (f"{SERVICE}tare_s = 1.0\n{SCHEDULE.replace('-43', '-4')}", ["schedule: not allowed with service.tare_s or"]),
+        (f"{RECOVER}{SCHEDULE.replace('-43', '-4')}", ["schedule: not allowed with service.recover; its ticks"]),
+    ],
+)
+def test_check_warns_of_what_serve_refuses_or_leaves_out(tmp_path: Path, text: str, warnings: list[str]) -> None:
+    config = tmp_path / "stage.toml"
+    config.write_text(TEXT + text)
+    found = [line for line in cautions(prepare(load(config))) if "service" in line]
+    assert [line[: len(start)] for line, start in zip(found, warnings, strict=True)] == warnings
+    if "schedule" in text:
+        with pytest.raises(ConfigError, match=warnings[0]):
+            Service(config)
 
 
 def test_strict_makes_faults_of_them(tmp_path: Path) -> None:

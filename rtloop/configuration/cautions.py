@@ -46,7 +46,7 @@ def option_cautions(prepared: Prepared) -> list[str]:
     margin is computed.
     """
     configuration = prepared.configuration
-    warnings = [f"loop.{line}" for line in _pacing(configuration)]
+    warnings = [f"loop.{line}" for line in _pacing(configuration)] + list(_service(configuration))
     for axis, check in zip(configuration.axes, prepared.checks, strict=True):
         lines = (*_references(prepared, axis), *_reach(configuration, axis))
         warnings += [f"axis.{axis.name}.{line}" for line in lines]
@@ -74,6 +74,15 @@ def _pacing(configuration: Configuration) -> Iterator[str]:
             f"rate_hz: {configuration.loop.rate_hz:g} Hz; the highest rate that a measured machine kept with paced "
             f"ticks is {HIGHEST_MEASURED_HZ:g} Hz (docs/benchmarks.md)"
         )
+
+
+def _service(configuration: Configuration) -> Iterator[str]:
+    """Yield a warning for each option of [service] that a run ignores, and that `rtloop serve` refuses or ignores."""
+    options = configuration.service
+    if configuration.schedule:
+        yield from (f"{fault}: `rtloop serve` refuses it" for fault in options.faults_with_schedule())
+    elif options.arm and options.prepares:
+        yield "service.depolarise, service.tare_s: no effect with service.arm = true"
 
 
 def _margins(axis: AxisOptions, check: AxisCheck) -> Iterator[str]:

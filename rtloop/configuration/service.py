@@ -78,3 +78,19 @@ class ServiceOptions(Options):
         if self.recover is not None and self.recover.depolarise and self.depolarise is None:
             raise ValueError("recover.depolarise: true; allowed: with the sine of [service.depolarise]")
         return self
+
+    @property
+    def prepares(self) -> bool:
+        """Whether a start depolarises or tares the actuator, where nothing forbids it."""
+        return self.depolarise is not None or self.tare_s > 0
+
+    def faults_with_schedule(self) -> list[str]:
+        """Return why `rtloop serve` refuses these options in a configuration with a [[schedule]], a sentence each."""
+        faults = []
+        if self.prepares:
+            faults.append("schedule: not allowed with service.tare_s or service.depolarise, which use the first ticks")
+        if self.recover is not None:
+            faults.append(
+                "schedule: not allowed with service.recover, because its ticks do not come again after a trip"
+            )
+        return faults

@@ -81,13 +81,9 @@ class Service:
     def __init__(self, config: Path, duration_s: float | None = None, name: str | None = None) -> None:
         self.config, self._name = config, name
         self.configuration: Configuration = load(config, name)
-        options = self.configuration.service
-        if self.configuration.schedule and self._has_preparation:
-            fault = "schedule: not allowed with service.tare_s or service.depolarise, which use the first ticks"
-            raise ConfigError(str(config), [fault])
-        if self.configuration.schedule and options.recover is not None:
-            fault = "schedule: not allowed with service.recover, because its ticks do not come again after a trip"
-            raise ConfigError(str(config), [fault])
+        faults = self.configuration.service.faults_with_schedule() if self.configuration.schedule else []
+        if faults:
+            raise ConfigError(str(config), faults)
         self._duration_s = duration_s
         self.notifier = Notifier()
         self.lock = Lock()
@@ -143,12 +139,6 @@ class Service:
     def _has_died(self) -> bool:
         """Whether the present loop's process has died; parking its outputs was tried, its files may be unfinished."""
         return self.supervisor is not None and self.supervisor.error is not None
-
-    @property
-    def _has_preparation(self) -> bool:
-        """Whether the configuration depolarises or tares the actuator at a start."""
-        options = self.configuration.service
-        return options.depolarise is not None or options.tare_s > 0
 
     @property
     def is_moved(self) -> bool:
@@ -207,7 +197,7 @@ class Service:
             raise Refusal(f"mode {mode}: the service is tripped; use reset first ({self.ctl('reset')})")
         if target_mode is not Mode.OFF and not self.armed:
             raise Refusal(f"mode {mode}: the outputs are not armed; use arm first ({self.ctl('arm')})")
-        if target_mode is not Mode.OFF and self._is_preparing and self._has_preparation:
+        if target_mode is not Mode.OFF and self._is_preparing and self.configuration.service.prepares:
             raise Refusal(f"mode {mode}: the actuator is depolarised or tared; send the request again afterwards")
         self.recovery.end()
         self._requested_mode = target_mode
@@ -261,7 +251,7 @@ class Service:
         could not start: RtloopError, DriverError.
         """
         log.info("starting %s, which records into %s", self.configuration.name, recordings_folder(self.configuration))
-        if self.configuration.service.arm and self._has_preparation:
+        if self.configuration.service.arm and self.configuration.service.prepares:
             log.warning("the actuator is neither depolarised nor tared, because service.arm is true")
         recovery = self._start_thread(self._recover_leftovers)
         try:
