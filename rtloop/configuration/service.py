@@ -90,7 +90,5 @@ class ServiceOptions(Options):
         if self.prepares:
             faults.append("schedule: not allowed with service.tare_s or service.depolarise, which use the first ticks")
         if self.recover is not None:
-            faults.append(
-                "schedule: not allowed with service.recover, because its ticks do not come again after a trip"
-            )
+            faults.append("schedule: not allowed with service.recover; its ticks do not come again after a trip")
         return faults
