@@ -19,11 +19,12 @@ from typing import Any
 import numpy as np
 
 from rtloop.foundation.native.atomics import fence_acquire, fence_release, load_acquire, store_release
-from rtloop.foundation.native.compiled import jit
+from rtloop.foundation.native.compiled import jit, python_entry
 from rtloop.foundation.native.monotonic import monotonic_ns, sleep_until
+from rtloop.foundation.native.pointers import address_pointer, carray
 from rtloop.foundation.trusted import close_descriptor, open_file
 from rtloop.hil.options import BoardOptions
-from rtloop.hil.rig import advance, build_rig, sample
+from rtloop.hil.rig import COEFFICIENTS, STATE, advance, build_rig, sample
 from rtloop.hil.stages.noise import next_word, seed_word
 from rtloop.hil.witness import EVIDENCE, LEVEL, MAX_LEVELS, judge_write, record_level
 
@@ -55,6 +56,19 @@ WRITE = np.dtype([("ns", np.int64), ("codes", np.int64, (MAX_CHANNELS,))])
 NO_FAULT, FROZEN_INPUT, STUCK_OUTPUT = 0, 1, 2
 LOSSES = np.dtype([("word", np.uint64), ("dropped_share", np.float64), ("repeated_share", np.float64)])
 """State of the random generator, and the probabilities of a dropped and of a repeated sample."""
+_ADDRESSES = (
+    "coefficients", "state", "words", "sample_ns", "fifo", "adc_codes", "evidence", "levels", "losses", "actuator_v",
+    "timespec",
+)  # fmt: skip
+RUNNING_BOARD = np.dtype(
+    [
+        *((name, np.int64) for name in _ADDRESSES),
+        ("channels", np.int64),
+        ("start_ns", np.int64),
+        ("period_ns", np.float64),
+    ]
+)
+"""What the compiled board works on: addresses of its arrays, its first period in ns of CLOCK_MONOTONIC, its period."""
 _UNUSED_BITS, _UNIT = np.uint64(11), 2.0**-53
 
 
@@ -138,15 +152,19 @@ def serve(
         losses.word = seed_word(options.seed, "losses")
         losses.dropped_share, losses.repeated_share = options.dropped_share, options.repeated_share
         levels = np.zeros((MAX_CHANNELS, MAX_LEVELS), LEVEL).view(np.recarray)
-        arguments = (coefficients, state, memory.words, memory.sample_ns, memory.fifo, memory.adc_codes,
-                     memory.evidence, levels, losses, timespec.ctypes.data)  # fmt: skip
-        _advance_board(*arguments, time.monotonic_ns(), 1e9 / rate_hz, 0, 0)
+        arrays = (coefficients, state, memory.words, memory.sample_ns, memory.fifo, memory.adc_codes, memory.evidence,
+                  levels, losses, np.zeros(len(axes)), timespec)  # fmt: skip
+        board = np.zeros(1, RUNNING_BOARD)
+        for name, array in zip(_ADDRESSES, arrays, strict=True):
+            board[name] = array.ctypes.data
+        board["channels"], board["period_ns"] = len(axes), 1e9 / rate_hz
+        advance_board(board.ctypes.data, 0, 0)
         memory.facts["version"], memory.facts["channels"], memory.facts["rate_hz"] = VERSION, len(axes), rate_hz
         memory.facts["magic"] = MAGIC
         on_ready()
-        start_ns, index, slice_ticks = time.monotonic_ns(), 0, max(1, round(SLICE_S * rate_hz))
+        board["start_ns"], index, slice_ticks = time.monotonic_ns(), 0, max(1, round(SLICE_S * rate_hz))
         while not is_stopped():
-            index = _advance_board(*arguments, start_ns, 1e9 / rate_hz, index, slice_ticks)
+            index = advance_board(board.ctypes.data, index, slice_ticks)
         memory.facts["magic"] = 0
         return int(memory.words[SEQUENCE])
     finally:
@@ -166,31 +184,27 @@ def lock_role(fd: int, byte: int) -> bool:
     return True
 
 
-@jit
-def _advance_board(
-    coefficients,
-    state,
-    words,
-    sample_ns,
-    fifo,
-    adc_codes,
-    evidence,
-    levels,
-    losses,
-    timespec,
-    start_ns,
-    period_ns,
-    index,
-    periods,
-):
-    """Run `periods` periods of the board's clock from number `index` on; return the next index.
+@python_entry("int64(intp, int64, int64)")
+def advance_board(address, index, periods):
+    """Run `periods` periods of the clock of the RUNNING_BOARD at `address` from number `index` on; return the next one.
 
     Each period sleeps until its time, samples the ADCs, examines the controller's writes and advances the rig. After a
     stall, periods follow one another without sleep until the rig has caught up.
     """
-    actuator_v = np.zeros(coefficients.shape[0])
+    board = carray(address_pointer(address), 1, RUNNING_BOARD)[0]
+    channels, timespec = board.channels, board.timespec
+    coefficients = carray(address_pointer(board.coefficients), channels, COEFFICIENTS)
+    state = carray(address_pointer(board.state), channels, STATE)
+    words = carray(address_pointer(board.words), WORDS, np.uint64)
+    sample_ns = carray(address_pointer(board.sample_ns), 1, np.int64)
+    fifo = carray(address_pointer(board.fifo), FIFO, WRITE)
+    adc_codes = carray(address_pointer(board.adc_codes), MAX_CHANNELS, np.int64)
+    evidence = carray(address_pointer(board.evidence), MAX_CHANNELS, EVIDENCE)
+    levels = carray(address_pointer(board.levels), (MAX_CHANNELS, MAX_LEVELS), LEVEL)
+    losses = carray(address_pointer(board.losses), 1, LOSSES)
+    actuator_v = carray(address_pointer(board.actuator_v), channels, np.float64)
     for _ in range(periods):
-        wake_ns = start_ns + np.int64(index * period_ns)
+        wake_ns = board.start_ns + np.int64(index * board.period_ns)
         now_ns = monotonic_ns(timespec)
         while now_ns < wake_ns:
             now_ns = sleep_until(wake_ns, timespec)
@@ -202,7 +216,7 @@ def _advance_board(
         sequence = load_acquire(words, SEQUENCE)
         store_release(words, SEQUENCE, BUSY)
         fence_release()
-        for i in range(coefficients.shape[0]):
+        for i in range(channels):
             volts = sample(coefficients[i], state[i])
             if value_arrives and not frozen:
                 adc_codes[i] = np.int64(np.rint(volts / LSB_V))
@@ -210,8 +224,8 @@ def _advance_board(
         if time_arrives and not frozen:
             sample_ns[0] = now_ns
         store_release(words, SEQUENCE, sequence + np.uint64(1))
-        _observe_outputs(words, fifo, evidence, levels, coefficients.shape[0], fault != STUCK_OUTPUT, timespec)
-        for i in range(coefficients.shape[0]):
+        _observe_outputs(words, fifo, evidence, levels, channels, fault != STUCK_OUTPUT, timespec)
+        for i in range(channels):
             actuator_v[i] = evidence[i].last_v
         advance(coefficients, state, actuator_v)
         index += 1

@@ -29,6 +29,9 @@ MATHEMATICS = ("analysis", "configuration", "linear", "values.py")
 """Rooms and files that compute the loop and are not in the digest of the cache folder."""
 log = logging.getLogger("rtloop")
 
+UNCOMPARED = {"reference", "limits", "interlocks", "margins"}
+"""Options of an axis that change neither poles nor margins nor the step of its linear loop."""
+
 
 class SecondOpinion:
     """Second opinion on the loops of a service.
@@ -95,13 +98,14 @@ def _faults(prepared: Prepared) -> list[str]:
 def _digest(prepared: Prepared) -> str:
     """Return a digest (24 hexadecimal digits) of the numbers and options of the loops, and of the code that compares.
 
-    The code is MATHEMATICS and the version of python-control.
+    Options without an effect on the compared quantities, UNCOMPARED, are left out. The code is MATHEMATICS and the
+    version of python-control.
     """
-    digest = hashlib.sha256(
-        np.asarray(prepared.plan.coefficients).tobytes() + repr(prepared.configuration.laws).encode()
-    )
+    controllers = np.ascontiguousarray(np.asarray(prepared.plan.coefficients)["controller"])
+    digest = hashlib.sha256(controllers.tobytes() + repr(prepared.configuration.laws).encode())
     for axis, check in zip(prepared.configuration.axes, prepared.checks, strict=True):
-        digest.update(f"{axis!r} {check.delay_ticks} {prepared.plan.pacing.rate_hz}".encode())
+        options = axis.model_dump(exclude=UNCOMPARED)
+        digest.update(f"{options!r} {check.delay_ticks} {prepared.plan.pacing.rate_hz}".encode())
     for place in MATHEMATICS:
         source = PACKAGE / place
         for path in sorted(source.rglob("*.py")) if source.is_dir() else [source]:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from rtloop.configuration.file import load
+from rtloop.configuration.file import load, parse
 from rtloop.configuration.prepare import Prepared, prepare
 from rtloop.errors import UnavailableError
 from rtloop.service import second_opinion
@@ -56,6 +56,28 @@ def test_an_agreement_is_stored_and_a_disagreement_is_not(prepared: Prepared, mo
     another = SecondOpinion()
     another.compute(with_louder_controller(prepared))
     assert another.faults == ["never asked"]
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "is_same"),
+    [
+        ("command_um = 42.0", "command_um = 41.0", True),
+        ("position_um = 60.0", "position_um = 59.0", True),
+        ("dwell_s = ", "dwell_s = 1", True),
+        ("gain = 0.016", "gain = 0.0161", False),
+        ("rate_hz = 10000", "rate_hz = 10001", False),
+        ("# [axis.prefilter]", "[axis.prefilter]\ntaps = [0.5, 0.5]", False),
+        ("[axis.model]", "[axis.model]\ndelay_ticks = 1", False),
+    ],
+)
+def test_an_agreement_holds_for_another_reference_and_limits_alone(old: str, new: str, is_same: bool) -> None:
+    text = PAPER.read_text()
+    assert text.count(old) >= 1
+    digests = [
+        second_opinion._digest(prepare(parse(content, "paper", PAPER.parent, "paper.toml")))
+        for content in (text, text.replace(old, new, 1))
+    ]
+    assert (digests[0] == digests[1]) == is_same
 
 
 def test_arming_waits_for_the_opinion(monkeypatch: pytest.MonkeyPatch) -> None:
