@@ -65,15 +65,18 @@ class UdpLink(Link):
         except OSError as error:
             raise DriverError(f"{options.label}: {error.strerror or error}; check driver.host") from None
         self._socket, self._strangers = (socket.socket(family, socket.SOCK_DGRAM) for _ in range(2))
+        step = f"bind {options.bind!r}"
         try:
-            self._connect(options.bind or ("::" if family == socket.AF_INET6 else ""))
+            self._bind(options.bind or ("::" if family == socket.AF_INET6 else ""))
+            step = f"connect {options.host!r}"
+            self._connect()
         except OSError as error:
             self.close()
-            raise DriverError(f"{options.label}: bind {options.bind!r}: {error.strerror or error}") from None
+            raise DriverError(f"{options.label}: {step}: {error.strerror or error}") from None
         self.fd, self.strangers_fd = self._socket.fileno(), self._strangers.fileno()
 
-    def _connect(self, host: str) -> None:
-        """Bind both sockets to one free port of this computer's address `host`, and connect the first to the node."""
+    def _bind(self, host: str) -> None:
+        """Bind both sockets to one free port of this computer's address `host`, which no other socket can share."""
         self._socket.setblocking(False)
         self._strangers.setblocking(False)
         self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, BUFFER_BYTES)
@@ -85,6 +88,9 @@ class UdpLink(Link):
         self._strangers.bind(self._socket.getsockname())
         for shared in (self._socket, self._strangers):
             shared.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 0)
+
+    def _connect(self) -> None:
+        """Connect the first socket to the node, and discard what it has received from others."""
         self._socket.connect(self._address)
         with contextlib.suppress(BlockingIOError):
             while True:

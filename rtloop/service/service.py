@@ -193,15 +193,19 @@ class Service:
         where the driver refuses the writes of a ramp, and as `Desk.submit`. Any accepted mode, and off, end a recovery.
         """
         target_mode = Mode[mode.upper()]
-        if target_mode is not Mode.OFF and self.state is State.TRIPPED:
-            raise Refusal(f"mode {mode}: the service is tripped; use reset first ({self.ctl('reset')})")
-        if target_mode is not Mode.OFF and not self.armed:
-            raise Refusal(f"mode {mode}: the outputs are not armed; use arm first ({self.ctl('arm')})")
+        self._require_permission(target_mode)
         if target_mode is not Mode.OFF and self._is_preparing and self.configuration.service.prepares:
             raise Refusal(f"mode {mode}: the actuator is depolarised or tared; send the request again afterwards")
         self.recovery.end()
         self._requested_mode = target_mode
         return self._enter(target_mode)
+
+    def _require_permission(self, mode: Mode) -> None:
+        """Raise Refusal for a mode that drives, while the service is tripped or not armed."""
+        if mode is not Mode.OFF and self.state is State.TRIPPED:
+            raise Refusal(f"mode {mode.name.lower()}: the service is tripped; use reset first ({self.ctl('reset')})")
+        if mode is not Mode.OFF and not self.armed:
+            raise Refusal(f"mode {mode.name.lower()}: the outputs are not armed; use arm first ({self.ctl('arm')})")
 
     def _enter(self, mode: Mode) -> int:
         """Change the mode bumplessly. Returns the tick at which it took effect; raises as `set_mode`."""
@@ -315,6 +319,7 @@ class Service:
             plan = replace(prepared.plan, coefficients=coefficients, spare_samples=SPARE_SAMPLES)
             prepared = replace(prepared, plan=plan)
             supervisor = Supervisor(processes, prepared, new_recording_path(prepared, None), options.stall_ms / 1000)
+            self._requested_mode, self._is_preparing = None, needs_preparation
             try:
                 supervisor.start()
                 self._desk = Desk(supervisor.block, prepared.plan.pacing.rate_hz, supervisor.names)
@@ -325,6 +330,7 @@ class Service:
                 return self._watch(supervisor)
             finally:
                 self.supervisor = self._desk = self.live = None
+                self._is_preparing = False
                 supervisor.close()
 
     def _watch(self, supervisor: Supervisor) -> RunResult:
@@ -460,7 +466,6 @@ class Service:
         supervisor, live, desk = self.supervisor, self.live, self._desk
         if supervisor is None or live is None or desk is None:
             return
-        self._requested_mode, self._is_preparing = None, True
         try:
             try:
                 prepare_actuator(self.configuration.service, supervisor, live, desk)
@@ -468,6 +473,8 @@ class Service:
                 if self._requested_mode is None:
                     raise
             mode = Mode[self.configuration.loop.mode.upper()]
+            if self._requested_mode is None:
+                self._require_permission(mode)
             if mode is Mode.RAW and self._requested_mode is None:
                 self._enter(mode)  # The references that follow are in V then.
             for number in range(len(live.prepared.plan.axes)):
