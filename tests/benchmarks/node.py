@@ -42,16 +42,17 @@ um_per_v = 10.0
 """
 
 
-SPINNING, REAL_TIME = ("--spin",), ("chrt", "-f", "70")
+SPINNING, REAL_TIME = ((), ("--spin",)), (("chrt", "-f", "70"), ())
+"""What stands before the node's program and behind it: of a spinning node, of one in real time."""
 ALLOWED = 0.01
 
 
 @contextmanager
-def _node(programs: Path, *, spins: bool) -> Iterator[int]:
+def node_in_c(programs: Path, *, spins: bool, environment: dict[str, str] | None = None) -> Iterator[int]:
     """Run the node in C on processor 0, spinning, or asleep between frames and in real time; yield its port."""
-    command = [*(() if spins else REAL_TIME), programs / "rtloop-node", "--port", "0", "--hold", str(HOLD_US)]
-    command += SPINNING if spins else ()
-    with subprocess.Popen(["taskset", "-c", "0", *command], stdout=subprocess.PIPE, text=True) as process:
+    before, behind = SPINNING if spins else REAL_TIME
+    command = ["taskset", "-c", "0", *before, programs / "rtloop-node", "--port", "0", "--hold", str(HOLD_US), *behind]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environment) as process:
         assert process.stdout is not None
         yield json.loads(process.stdout.readline())["port"]
         process.terminate()
@@ -74,7 +75,7 @@ def node(effort: Effort) -> dict[str, Any]:
         programs = Path(name)
         make = ["make", "-C", ROOT / "deploy/node", "all", f"BUILD={programs}"]
         subprocess.run(make, check=True, capture_output=True)
-        with _node(programs, spins=True) as port:
+        with node_in_c(programs, spins=True) as port:
             for key, answer in ANSWERS.items():
                 actions = {
                     "rtloop": partial(_loop_us, programs, port, answer, duration_s),
@@ -88,7 +89,7 @@ def node(effort: Effort) -> dict[str, Any]:
                 if key == "same_tick":
                     for figure in ("apart_from_wait", "exchange_p50", "exchange_p99"):
                         found[key][f"{figure}_us"] = spread([row[figure] for row in rounds["rtloop"]])
-        with _node(programs, spins=False) as port:
+        with node_in_c(programs, spins=False) as port:
             found["highest_hz"] = _highest_hz(programs, port, max(round(effort.seconds(WINDOWS)), 2))
     return found
 
@@ -98,7 +99,7 @@ def _highest_hz(folder: Path, port: int, windows: int) -> float:
     highest_hz = 0.0
     for rate_hz in RATES_HZ:
         driver, pins = DRIVER.format(port=port, answer="next tick"), pinned(last_cpu())
-        recording = _record(folder, windows + 0.5, (RIG, driver), at_rate(rate_hz), *pins)
+        recording = record(folder, windows + 0.5, (RIG, driver), at_rate(rate_hz), *pins)
         deadline_ns, flags, missed, status = recording.read("deadline_ns", "flags", "periods_missed", "driver_status")
         lost = late_shares(deadline_ns, flags, missed).lost
         held = late_shares(deadline_ns, np.where(status == 1, int(Flag.OVERRUN), 0), np.zeros_like(missed)).overrun
@@ -109,7 +110,7 @@ def _highest_hz(folder: Path, port: int, windows: int) -> float:
     return highest_hz
 
 
-def _record(folder: Path, duration_s: float, *changes: tuple[str, str]) -> rtloop.Recording:
+def record(folder: Path, duration_s: float, *changes: tuple[str, str]) -> rtloop.Recording:
     """Run the loop with its outputs off, and return the recording."""
     config = write(folder, changed((STEPS, SINE), ('# mode = "closed_loop"', 'mode = "off"'), *changes))
     (folder / "paper-spec.toml").write_text((ROOT / "deploy/paper-spec.toml").read_text())
@@ -119,7 +120,7 @@ def _record(folder: Path, duration_s: float, *changes: tuple[str, str]) -> rtloo
 def _loop_us(folder: Path, port: int, answer: str, duration_s: float) -> dict[str, float]:
     """Run the loop; return medians over its ticks in µs."""
     driver = RIG, DRIVER.format(port=port, answer=answer)
-    recording = _record(folder, duration_s, driver, *pinned(last_cpu()))
+    recording = record(folder, duration_s, driver, *pinned(last_cpu()))
     read_us, write_us, exchange_us = (recording[name][100:] for name in ("read_us", "write_us", "node_exchange_us"))
     calls_us = read_us + write_us
     return {

@@ -30,14 +30,13 @@ import rtloop
 from rtloop.drivers.base import Wiring
 from rtloop.drivers.node.driver import UdpDriver
 from rtloop.drivers.node.options import UdpOptions
-from tests.benchmarks.configurations import RIG, ROOT, SINE, STEPS, at_rate, changed, last_cpu, write
-from tests.benchmarks.node import DRIVER, HOLD_US
+from tests.benchmarks.configurations import RIG, ROOT, at_rate, last_cpu, pinned
+from tests.benchmarks.node import DRIVER, node_in_c, record
 
 WIRE = Path(__file__).with_name("wire.c")
 DELAYS_US = (100.0, 300.0, 1000.0)
 ALLOWED_US = 20.0
 EXCHANGES, MEASURING_HZ = 2000, 1000.0
-REAL_TIME = ("chrt", "-f", "70") if os.geteuid() == 0 else ()
 NEVER = ("node_reordered_samples", "node_duplicated_samples", "node_invalid_frames", "node_foreign_frames")
 
 
@@ -65,30 +64,14 @@ def read_losses(file: Path) -> Losses:
 
 
 @contextmanager
-def node(
-    programs: Path, log: Path, *options: str, loss: float = 0.0, seed: int = 1, delay_us: float = 0.0
-) -> Iterator[int]:
+def node(programs: Path, log: Path, loss: float = 0.0, seed: int = 1, delay_us: float = 0.0) -> Iterator[int]:
     """Run the node behind a bad wire, on processor 0 before all that does not run in real time; yield its port."""
     environment = os.environ | {
         "LD_PRELOAD": str(programs / "wire.so"), "WIRE_FILE": str(log), "WIRE_LOSS": f"{loss:.17g}",
         "WIRE_SEED": str(seed), "WIRE_DELAY_US": f"{delay_us:g}",
     }  # fmt: skip
-    command = [
-        "taskset",
-        "-c",
-        "0",
-        *REAL_TIME,
-        programs / "rtloop-node",
-        "--port",
-        "0",
-        "--hold",
-        str(HOLD_US),
-        *options,
-    ]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environment) as process:
-        assert process.stdout is not None
-        yield json.loads(process.stdout.readline())["port"]
-        process.terminate()
+    with node_in_c(programs, spins=False, environment=environment) as port:
+        yield port
 
 
 def delays_are_kept(programs: Path, folder: Path) -> bool:
@@ -104,28 +87,17 @@ def delays_are_kept(programs: Path, folder: Path) -> bool:
     return all(abs(medians[delay_us] - medians[0.0] - delay_us) <= ALLOWED_US for delay_us in DELAYS_US)
 
 
-def record(port: int, folder: Path, duration_s: float, rate_hz: float) -> Path:
-    """Run the loop on the node; return the recording."""
-    text = changed(
-        (RIG, DRIVER.format(port=port, answer="next tick")), (STEPS, SINE), at_rate(rate_hz),
-        ("# cpu = 1", f"cpu = {last_cpu()}"), ('# mode = "closed_loop"', 'mode = "off"'),
-    )  # fmt: skip
-    (folder / "paper-spec.toml").write_text((ROOT / "deploy/paper-spec.toml").read_text())
-    return rtloop.run(write(folder, text), duration_s=duration_s, folder=folder / "recordings").recordings[0]
-
-
 def dropped_by_system(port: int) -> int:
     """Return how many datagrams Linux has dropped at a UDP port, because its program stood still."""
     rows = [line.split() for line in Path("/proc/net/udp").read_text().splitlines()[1:]]
     return sum(int(row[-1]) for row in rows if int(row[1].rpartition(":")[2], 16) == port)
 
 
-def judge(file: Path, losses: Losses, overflows: int) -> dict[str, Any]:
+def judge(recording: rtloop.Recording, losses: Losses, overflows: int) -> dict[str, Any]:
     """Return the figures of a run, with `good`: whether each loss is where it must be, and each lost answer explained.
 
     Linux drops drives of a node that stands still; an answer to one of more than a thousand drives ago is invalid.
     """
-    recording = rtloop.load(file)
     ticks, lost, status, exchange_us, missed = recording.read(
         "tick", "node_lost_samples", "driver_status", "node_exchange_us", "periods_missed"
     )
@@ -166,9 +138,11 @@ def main() -> None:
             good &= delays_are_kept(programs, folder)
         if given.only != "delays":
             with node(programs, folder / "losses", loss=given.loss, seed=given.seed) as port:
-                file = record(port, folder, given.datagrams / 2 / given.rate_hz, given.rate_hz)
+                driver = RIG, DRIVER.format(port=port, answer="next tick")
+                duration_s, changes = given.datagrams / 2 / given.rate_hz, (at_rate(given.rate_hz), *pinned(last_cpu()))
+                recording = record(folder, duration_s, driver, *changes)
                 overflows = dropped_by_system(port)
-            found = judge(file, read_losses(folder / "losses"), overflows)
+            found = judge(recording, read_losses(folder / "losses"), overflows)
             print(json.dumps(found, indent=1))
             good &= found["good"]
     sys.exit(0 if good else 1)
