@@ -76,7 +76,7 @@ class UdpLink(Link):
         self.fd, self.strangers_fd = self._socket.fileno(), self._strangers.fileno()
 
     def _bind(self, host: str) -> None:
-        """Bind both sockets to one free port of this computer's address `host`, which no other socket can share."""
+        """Bind both sockets to one free port of this computer's address `host`; other sockets cannot share it."""
         self._socket.setblocking(False)
         self._strangers.setblocking(False)
         self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, BUFFER_BYTES)
