@@ -19,7 +19,7 @@ from rtloop.service import daemon
 from rtloop.service.desk import Refusal, RefusedByLoop
 from rtloop.service.notify import Notifier
 from rtloop.service.service import Service
-from rtloop.signals import FLAGS, Flag
+from rtloop.signals import FLAGS, MODE, Flag
 from rtloop.supervision.child import Child
 from tests.service.test_run import PAPER
 
@@ -90,7 +90,8 @@ def busy_service() -> Service:
     """A service whose loop takes no more commands."""
     service = Service(PAPER)
     service._desk = cast(Any, SimpleNamespace(submit=fill_queue))
-    service.supervisor = cast(Any, SimpleNamespace(latest=lambda: np.zeros(FLAGS + 1)))
+    service.supervisor = cast(Any, SimpleNamespace(latest=lambda: np.zeros(max(FLAGS, MODE) + 1), error=None))
+    service.armed = True
     prepared = SimpleNamespace(plan=SimpleNamespace(axes="x"))
     references = SimpleNamespace(restore_configured=fill_queue)
     service.live = cast(Any, SimpleNamespace(prepared=prepared, references=references))
