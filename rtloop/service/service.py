@@ -54,6 +54,8 @@ STATUS_PERIOD_S = 1.0
 READY_TICKS = 10
 RESTART_PAUSE_S = 0.2
 SPARE_SAMPLES = 1 << 20
+BUILDER_PAUSE_S = 5.0
+"""Time from READY to the start of the limited process, so that it takes no processor from the loop's first seconds."""
 RECOVERY_TIMEOUT_S = 10.0
 """Time for recovering unfinished recordings after the last loop; the next start continues."""
 log = logging.getLogger("rtloop")
@@ -388,14 +390,15 @@ class Service:
     def _notify_systemd(self, supervisor: Supervisor) -> None:
         """Send systemd the messages that are due; called at every poll.
 
-        READY goes once, after READY_TICKS; then two threads start the limited process and judge the loop. WATCHDOG and
-        STATUS go periodically, WATCHDOG not while the ticks stand still, unless the loop has ended or was ordered to
-        end. The first ticks of a loop restore the watchdog's time, which is START_TIMEOUT_S while a loop is restarted.
+        READY goes once, after READY_TICKS; then two threads judge the loop and, later, start the limited process.
+        WATCHDOG and STATUS go periodically, WATCHDOG not while the ticks stand still, unless the loop has ended or was
+        ordered to end. The first ticks of a loop restore the watchdog's time, which is START_TIMEOUT_S while a loop is
+        restarted.
         """
         if not self._is_ready and supervisor.ticks >= READY_TICKS:
             self._is_ready = True
             self.notifier.send(READY=1)
-            self._start_thread(prepare_builder)
+            self._start_thread(self._prepare_builder)
             self._start_thread(lambda: self._judge_loop(supervisor.prepared))
         if self._reported_ticks == 0 and supervisor.ticks:
             self.notifier.limit_watchdog()
@@ -491,6 +494,11 @@ class Service:
             self._is_preparing = False
             if self._requested_mode is not None:
                 log.info("not started: mode %s was requested meanwhile", self._requested_mode.name.lower())
+
+    def _prepare_builder(self) -> None:
+        """Start the limited process after BUILDER_PAUSE_S, unless the service ends before; an earlier job starts it."""
+        if not self._end_requested.wait(BUILDER_PAUSE_S):
+            prepare_builder()
 
     def _judge_loop(self, prepared: Prepared) -> None:
         """Compute the second opinion. A disagreement brings the outputs to safe, and is latched as a fault."""

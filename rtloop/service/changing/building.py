@@ -1,6 +1,7 @@
 """Building and analysing a changed configuration in the limited process, which is killed if it takes too long.
 
-The process starts once the loop runs, so that it does not delay the loop's start, and ends with the service.
+The process starts some seconds after the loop, so that it does not delay the loop's start, or with the first change;
+it ends with the service.
 """
 
 from __future__ import annotations
