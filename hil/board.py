@@ -277,7 +277,9 @@ def _observe_outputs(words, fifo, evidence, levels, channels, follows, timespec)
 def examine_writes(words, fifo, evidence, levels, channels, write_count, now_ns, follows):
     """Enter all writes up to number `write_count`, not examined before, in the evidence; all were made before `now_ns`.
 
-    Writes that the FIFO no longer has, or that come too fast to be compared, are counted in `MISSED_WRITES`.
+    `evidence` (channels,), `levels` (channels, MAX_LEVELS) and the number EXAMINED in `words` change. Without `follows`
+    the outputs are stuck: they keep their voltages. Writes that the FIFO no longer has, or that come too fast to be
+    compared, are counted in the word MISSED_WRITES.
     """
     examined_count = words[EXAMINED]
     if write_count - examined_count > np.uint64(FIFO):

@@ -7,6 +7,7 @@ Sample n does not show drive n yet: the delay is one period longer than with an 
 
 from __future__ import annotations
 
+import contextlib
 import math
 import time
 from collections.abc import Mapping, Sequence
@@ -152,10 +153,11 @@ class CanDriver(PythonDriver):
             self._close_bus()
 
     def _close_bus(self) -> None:
-        """Close the bus if it is open."""
-        if self._bus is not None:
-            self._bus.shutdown()
-            self._bus = None
+        """Close the bus if it is open. An error of closing is ignored: no frame depends on it any more."""
+        bus, self._bus = self._bus, None
+        if bus is not None:
+            with contextlib.suppress(*BUS_ERRORS):
+                bus.shutdown()
 
     def _await_node(self) -> None:
         """Send the safe values every RETRY_S until the node answers.

@@ -225,8 +225,8 @@ class NodeDriver(Driver):
                 lsb_v = abs(scale.volts_per_code)
                 if not lsb_v > 0 or abs(lowest_v - range_v[0]) > 2 * lsb_v or abs(highest_v - range_v[1]) > 2 * lsb_v:
                     raise DriverError(
-                        f"{options.label}: channel {i} of the node's {name.split('_')[0]}s has {lowest_v:.6g} … "
-                        f"{highest_v:.6g} V; driver.{name} is {list(range_v)}"
+                        f"{options.label}: driver.{name} is {list(range_v)}; allowed: the node's range of channel {i}, "
+                        f"[{lowest_v:.6g}, {highest_v:.6g}]"
                     )
         for i, scale in enumerate(welcome.outputs):
             if abs(scale.volts(scale.safe) - options.safe_v) > 2 * abs(scale.volts_per_code):
@@ -326,7 +326,11 @@ class SerialDriver(NodeDriver):
         return float("inf") if baud is None else baud / (BITS_PER_BYTE * longest)
 
     def _require_rate(self, link: Link, welcome: Welcome) -> None:
-        """Measure PROBES exchanges, and raise DriverError if their median takes longer than a period of the loop."""
+        """Measure PROBES exchanges with the node.
+
+        Raises DriverError if fewer than half of them are answered, each within RETRY_S, or if the median of the
+        answered ones takes longer than a period of the loop.
+        """
         durations_s = []
         for sequence in range(1, self.PROBES + 1):
             start_s = time.monotonic()

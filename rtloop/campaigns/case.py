@@ -217,8 +217,8 @@ def _require_equal(computed_um: Real, recorded_um: Real) -> None:
     """
     if not np.array_equal(computed_um, recorded_um, equal_nan=True):
         raise ValueError(
-            "lateness: periods were missed in which the actuator moved, and its motion is not recorded; allowed with "
-            "missed periods: driver.latency_ticks = 0, no creep, no lost drive"
+            "the actuator moved in periods without a tick, and no record has this motion; "
+            "set driver.latency_ticks to 0, and leave out creep and a loss of drive, or make the ticks less late"
         )
 
 

@@ -88,9 +88,11 @@ class Dispatcher:
         return len(self._running)
 
     def _collect(self, completed: Iterable[Future[Any]]) -> int:
-        """Store the results of tasks that ended; return the number of items that are done by them.
+        """Store the results of tasks that ended; return the number of items that this call stored or set aside.
 
-        Where a worker died, all other tasks are awaited, since some workers die together; then new ones are started.
+        If a worker died, all other tasks are awaited and stored, since some workers die together. The workers are then
+        replaced, and the items of the dead ones run again, each alone, or are set aside. Raises the error of a task,
+        UnavailableError if the scheduler is gone, and the errors of the job.
         """
         died: list[Task] = []
         done = sum(self._store_result(future, died) for future in completed)

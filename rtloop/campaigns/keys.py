@@ -47,7 +47,9 @@ def _set_value(tables: dict[str, Any], key: str, value: Any) -> None:
     elif isinstance(node, dict):
         node[last] = value
     else:
-        raise ValueError(f"{key}: {node!r} has no part {last!r}; allowed: keys of tables, entries of lists")
+        raise ValueError(
+            f"{key}: {last!r} follows the value {node!r}, which is neither a table nor a list; end the key before"
+        )
 
 
 def _step(node: Any, part: str, key: str) -> Any:
@@ -56,7 +58,9 @@ def _step(node: Any, part: str, key: str) -> Any:
         return node[part]
     if isinstance(node, list):
         return node[_list_index(node, part, key)]
-    raise ValueError(f"{key}: {node!r} has no part {part!r}; allowed: keys of tables, entries of lists")
+    raise ValueError(
+        f"{key}: {part!r} follows the value {node!r}, which is neither a table nor a list; end the key before"
+    )
 
 
 def _list_index(entries: list[Any], part: str, key: str) -> int:

@@ -134,9 +134,10 @@ def _rig_values(values: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _tables_at_rest(campaign: Campaign) -> dict[str, Any]:
-    """Return the tables of the configuration in closed loop, all axes at rest at 0, without schedule and switches.
+    """Return the tables of a campaign's configuration, in closed loop, with all axes at rest at 0, without a schedule.
 
-    The campaign's lateness of ticks, if any, is in them.
+    The keys HARDWARE_SWITCHES of [loop] and ROTATION of [recording] are left out. The campaign's lateness of ticks, if
+    any, is in [loop].
     """
     tables = parse_toml(campaign.configuration_text)
     tables["loop"] = {key: value for key, value in tables["loop"].items() if key not in HARDWARE_SWITCHES}

@@ -114,7 +114,7 @@ def _examine(
     print_result(report, as_json, lambda report: _print_report(report, examination.columns, examination.good_verdict))
     if report["pending"]:
         remedy = ": the same command continues" if out else "; use --out FOLDER to continue later"
-        click.echo(f"stopped, {count_text(report['pending'], 'recording')} left{remedy}", err=True)
+        click.echo(f"stopped, {count_text(report['pending'], 'recording')} not examined yet{remedy}", err=True)
         return STOPPED
     return LoopFault.exit_code if set(report["counts"]) - {examination.good_verdict} else 0
 

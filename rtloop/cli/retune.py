@@ -123,7 +123,7 @@ def _print_proposal(proposal: Proposal) -> None:
         if gain_percent is not None:
             distance = f"{gain_percent:+.2f} % from the model's"
         span = f"between {gain['from_um']:.4g} and {gain['to_um']:.4g} µm"
-        click.echo(f"gain {gain['value']:.4f} ± {gain['std']:.4f} {span}, {distance}")
+        click.echo(f"static gain of the plant {gain['value']:.4f} ± {gain['std']:.4f} {span}, {distance}")
     step_table = table("step from the held reference", "settling / ms", "overshoot / %", "largest v per unit")
     rows = {
         "with the taps in force": proposal.before,

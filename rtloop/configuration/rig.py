@@ -19,7 +19,10 @@ from rtloop.linear.transfer import Transfer
 
 
 def rig_options(configuration: Configuration) -> RigOptions | None:
-    """Return the options of the rig, which may run behind a bus or a board; None for a driver without one."""
+    """Return the driver's options if they can describe a simulated rig, else None.
+
+    The options of a bus, a node or a board can, even if hardware is connected there: see `simulated_plant`.
+    """
     options = configuration.driver_options
     return options if isinstance(options, RigOptions) else None
 

@@ -138,9 +138,10 @@ def _plan_experiment(
     specification = setting.specification.model_dump(mode="json", exclude_defaults=True)
 
     def plan_run(run: Run, is_last: bool) -> PlannedRun:
-        """Store the tables of a run, and return it with its configuration; with `plan_next` if `is_last`.
+        """Store the tables of samples that a run plays, and return the run with its configuration.
 
-        Raises OutputError, and ConfigError for an invalid configuration.
+        The tables become npy files; the run's references, changed in place, name them. The result has `plan_next` if
+        `is_last`. Raises OutputError if a file cannot be written, ConfigError for an invalid configuration.
         """
         store_tables(run, folder / base.name)
         configuration = derive_configuration(

@@ -101,7 +101,11 @@ class Setting:
         )
 
     def largest_drive(self, direction: float) -> tuple[float, str]:
-        """Return the largest slow drive in V, from rest, towards ±1, and the key with its value that limits it."""
+        """Return the largest magnitude in V of a slow drive from 0 V towards ±1, and the key that limits it.
+
+        The key comes with its value, such as "limits.drive_v = 10": the drive's limit, or the interlock that trips
+        earlier, by the initial loading curve.
+        """
         limits = self.axis.limits
         largest_v, reason = (limits.drive_v, f"limits.drive_v = {limits.drive_v:g}")
         if direction < 0:

@@ -204,7 +204,12 @@ def _select_columns(table: Table, path: Path, selection: ColumnSelection) -> dic
 
 
 def _time_columns(table: Table, path: Path, selection: ColumnSelection) -> set[str | None]:
-    """Return the names of the columns that hold times, and are no signals; it may contain None."""
+    """Return the names of the columns that hold times, and are no signals; None stands for a column that is missing.
+
+    These are the table's column of times and that of `selection.time`; for a table from a recording, its ticks and
+    deadlines and the file's own column of times. Raises UnreadableData if the column of `selection.time` is not found,
+    is ambiguous, or has a unit that is unknown or does not fit.
+    """
     if is_from_recording(table):
         return {*RECORDING_TIME_COLUMNS, table.time}
     time_column_name = None if selection.time is None else map_column(table, path, "time", selection.time).name

@@ -108,7 +108,9 @@ class Layout:
         """
         data = bytes(snapshot)
         if len(data) != self.snapshot_bytes(axes):
-            raise ValueError(f"it has {len(data)} bytes; allowed for {axes} axes: {self.snapshot_bytes(axes)}")
+            raise ValueError(
+                f"the snapshot has {len(data)} bytes; allowed for {axes} axes: {self.snapshot_bytes(axes)}"
+            )
         offset, parts = 8, []
         for dtype, count in ((self.coefficients, axes), (self.state, axes), (LOOP_STATE, 1)):
             parts.append(copy_records(np.frombuffer(data, dtype, count, offset)))

@@ -70,9 +70,10 @@ class Transfer:
 
     @classmethod
     def from_transfer_function(cls, numerator: npt.ArrayLike, denominator: npt.ArrayLike) -> Transfer:
-        """Return the quotient of two real polynomials in s, highest power first; factors are more accurate.
+        """Return the quotient of two real polynomials in s, highest power first; `from_factors` is more accurate.
 
-        Raises ValueError like `from_factors`.
+        Raises ValueError for a coefficient that is not finite, a zero denominator, more zeros than poles, and an order
+        above MAX_ORDER.
         """
         return cls.from_factors(1.0, [numerator], [denominator])
 

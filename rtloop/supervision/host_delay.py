@@ -144,6 +144,8 @@ def require_margins(prepared: Prepared) -> None:
         elif spent is None:
             faults.append(f"{key}: the axis's margin is unknown; use a linear controller and a model")
         elif spent.is_spent:
-            faults.append(f"{key}: {spent.text}; no margin is left")
+            faults.append(
+                f"{key}: {spent.text}; no margin of stability is left; use a lower rate or a slower controller"
+            )
     if faults:
         raise ConfigError(configuration.source, faults)

@@ -70,9 +70,9 @@ def replay_on_the_rig(
 def make_trust(files: Sequence[Path], trusts_recorded: bool) -> TrustedLaws:
     """Return the laws whose code a replay may run: those in `files`, with `trusts_recorded` also the recorded ones.
 
-    The files run first in the limited process, which is killed if a law does not return. Raises InputFileError for an
-    unreadable file, RecordingError for one without a valid law, ConfigError for a law that does not end or ends the
-    process.
+    The files run first in the limited process, which is killed if a law does not return. A file without a law adds
+    none. Raises InputFileError for an unreadable file, RecordingError for one that cannot be run or has a mistake in a
+    law, ConfigError for a law that does not end, ends the process, prints too much, or leaves a thread or process.
     """
     texts = {str(path): read_text(path) for path in files}
     for file, text in texts.items():

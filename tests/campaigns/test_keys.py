@@ -22,7 +22,7 @@ def test_values_are_set_in_a_copy():
 @pytest.mark.parametrize(
     ("key", "named"),
     [
-        ("driver.kind.more", "driver.kind.more: 'sim' has no part 'more'"),
+        ("driver.kind.more", "driver.kind.more: 'more' follows the value 'sim', which is neither a table nor a list"),
         ("driver.plant.hysteresis.history_v.2", "no entry '2'; allowed: 0 … 1"),
         ("axis.y.limits.drive_v", "axis.y.limits.drive_v: no entry 'y'; allowed: x"),
     ],

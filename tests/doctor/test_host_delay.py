@@ -110,7 +110,9 @@ def test_a_required_margin_needs_a_known_delay_that_leaves_some() -> None:
     store_host_delay(asking.configuration, lateness_us=MARGIN_US - 20.0)
     require_margins(asking)
     store_host_delay(asking.configuration, lateness_us=MARGIN_US + 20.0)
-    with pytest.raises(ConfigError, match=r"require_margin: measured on this host: 215\d µs late .* no margin is left"):
+    with pytest.raises(
+        ConfigError, match=r"require_margin: measured on this host: 215\d µs late .* no margin of stability is left"
+    ):
         require_margins(asking)
     with pytest.raises(ConfigError, match="the axis's margin is unknown"):
         require_margins(replace(asking, checks=(replace(asking.checks[0], on_model=None),)))
@@ -130,7 +132,7 @@ def test_the_delay_of_an_exchange_is_spent_and_forbids_a_run_where_it_is_all(exc
     )
     assert spent.is_spent == (exchange_us > MARGIN_US)
     if spent.is_spent:
-        with pytest.raises(ConfigError, match=r"require_margin: .* no margin is left"):
+        with pytest.raises(ConfigError, match=r"require_margin: .* no margin of stability is left"):
             require_margins(asking)
     else:
         require_margins(asking)

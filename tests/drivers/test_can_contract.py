@@ -16,6 +16,7 @@ from pathlib import Path
 
 import can
 import pytest
+from can.interfaces.udp_multicast import UdpMulticastBus
 
 from rtloop.drivers.base import Driver, Wiring
 from rtloop.drivers.can.driver import CanDriver
@@ -149,6 +150,26 @@ def test_an_intruder_fails_the_driver(node):
     assert "another controller drives this node" in str(driver.error)
     wait_for(lambda: node.seen[1] == 0.0, "a parked output")
     driver.open()  # where it is alone again
+    driver.close()
+
+
+def test_a_bus_that_fails_at_its_closing_is_closed_and_its_outputs_are_safe(node, monkeypatch: pytest.MonkeyPatch):
+    driver, closings = node.driver(), list[int]()
+    calls = DriverCalls(driver.open(), driver.facts)
+    assert calls.write([3.0]) == 0
+    wait_for(lambda: node.seen[1] == pytest.approx(3.0, abs=2e-4), "the drive")
+    shut_down = UdpMulticastBus.shutdown
+
+    def fail(bus: UdpMulticastBus) -> None:
+        shut_down(bus)
+        closings.append(1)
+        raise can.CanOperationError("the interface is gone")
+
+    monkeypatch.setattr(UdpMulticastBus, "shutdown", fail)
+    driver.close()
+    assert (node.seen[1], closings) == (0.0, [1])
+    monkeypatch.undo()
+    driver.open()
     driver.close()
 
 

@@ -60,9 +60,10 @@ def make_grid(
 ) -> LineGrid:
     """Return odd lines between two frequencies, evenly on a logarithmic scale, dense about `near_hz`.
 
-    One of SILENT_INTERVAL candidates stays silent, chosen at random by `seed`; `silent` has all harmonics, even ones
-    too, that are not excited. Raises ValueError for fewer than three odd lines, for frequencies that do not rise from
-    above 0, and for a band beyond HIGHEST_PART of the rate.
+    The period is rounded to whole samples. One of SILENT_INTERVAL candidates stays silent, chosen at random by `seed`.
+    `silent` has the harmonics, even ones too, that are not excited, from one below the lowest odd line of the band to
+    one above the highest. Raises ValueError for fewer than three odd lines, for frequencies that do not rise from above
+    0, and for a band beyond HIGHEST_PART of the rate.
     """
     samples = round(period_s * rate_hz)
     if not 0 < from_hz < to_hz <= HIGHEST_PART * rate_hz:

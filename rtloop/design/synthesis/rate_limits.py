@@ -26,7 +26,10 @@ LARGEST_SENSITIVITY = 3.0
 
 
 def dead_time(delay_s: float, order: int) -> Transfer:
-    """Return Padé's all-pass for exp(−s·delay_s), of `order` at most MOST_DEAD_TIME_ORDER; 1 without a delay."""
+    """Return Padé's all-pass for exp(−s·delay_s) with `order` poles, but at most MOST_DEAD_TIME_ORDER.
+
+    It is 1 for a delay of 0 and for an order of 0.
+    """
     n = min(order, MOST_DEAD_TIME_ORDER)
     if delay_s == 0 or n == 0:
         return Transfer.from_zpk([], [], 1.0)

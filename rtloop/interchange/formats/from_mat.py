@@ -53,7 +53,8 @@ def read_mat(path: Path, group: str | None = None) -> Table:
 def _load_variables(path: Path, head: bytes) -> dict[str, Any]:
     """Return the variables of a file of version 5 or older by name, structures as dicts.
 
-    Raises UnreadableData if it is no MAT file, damaged or larger than MAX_BYTES.
+    `head` is the begin of the file, at least HEADER_BYTES, which tells the version. Raises UnreadableData if it is no
+    MAT file, damaged, or larger than MAX_BYTES when unpacked; OSError if it cannot be opened.
     """
     from scipy.io import loadmat
 

@@ -150,7 +150,11 @@ class PrandtlIshlinskii(Feedforward):
     output, update, enter = inverse_drive, update_model, enter_at_drive
 
     def build(self) -> Mapping[str, Any]:
-        """Return thresholds and weights of the model and of its inverse, padded to whole blocks."""
+        """Return thresholds and weights of the model and of its inverse, each (plays,), play count and dead band.
+
+        `play_count` is rounded up to a multiple of LANES; the record has zeros behind the arrays. `dead_band_v` is 0
+        unless the option `dead_band` is "exact".
+        """
         options: PrandtlIshlinskiiOptions = self.options
         forward, inverse = options.models()
         return {

@@ -30,9 +30,13 @@ class TickAccount:
             self._tick_count += len(chunk.rows)
             return None
         if ticks.first < self._next_tick:
-            raise DamagedChunk(f"out of order: tick {ticks.first}; allowed: tick {self._next_tick} or later")
+            raise DamagedChunk(
+                f"ticks out of order: a block begins with tick {ticks.first}; allowed: tick {self._next_tick} or later"
+            )
         if ticks.last >= self._end:
-            raise DamagedChunk(f"out of order: tick {ticks.last}, but the run ended before tick {self._end}")
+            raise DamagedChunk(
+                f"ticks out of order: a block ends with tick {ticks.last}, but the run ended before tick {self._end}"
+            )
         self._next_tick = ticks.last + 1
         self._tick_count += len(chunk.rows)
         return ticks

@@ -248,11 +248,12 @@ class LiveLaw:
             raise ConfigError("change", describe(error, f"axis.{raw['name']}", raw)) from None
 
     def _swap(self, number: int, axis: AxisOptions) -> int:
-        """Build and verify the configuration with a changed axis, and load its coefficients. Returns the load's tick.
+        """Build and verify the configuration with other options of axis `number`, and load its coefficients.
 
-        Raises ConfigError for faults of the configuration, DriverError, UnavailableError if building takes too long,
-        Refusal if a restart is needed or the loop refuses, UnconfirmedCommand if the loop stands still and may still
-        load it.
+        Returns the tick of the load; `prepared` then has the new options. The build lock must be held. Raises
+        ConfigError for faults of the configuration, DriverError, UnavailableError if the building process takes too
+        long, prints too much or ends, Refusal if a restart is needed or the loop refuses: these change nothing. Raises
+        UnconfirmedCommand if the loop stands still: `prepared` then has the new options, since it may still load them.
         """
         prepared = prepare_limited(self._changed_configuration(number, axis))
         with self._staging.lock:

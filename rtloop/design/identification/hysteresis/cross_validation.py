@@ -99,9 +99,10 @@ def _residual_columns(recording: Equations, common: SharedGains, own_gains: Real
 
 
 def _remove_play_offsets(recording: Equations, errors_um: Real) -> Real:
-    """Subtract from column 1 its mean over each stretch, because plays alone leave the offset open.
+    """Subtract from the errors of the plays alone their mean over each stretch, because plays leave the offset open.
 
-    `errors_um` (blocks, 2) is changed in place and returned.
+    `errors_um` (blocks, 2) has the errors of the whole model and of its plays alone. Column 1 is changed in place where
+    memory is known; the array is returned.
     """
     for stretch in (recording.offsets.T > 0) & recording.is_known:
         errors_um[stretch, 1] -= np.mean(errors_um[stretch, 1])
