@@ -100,10 +100,10 @@ class Channel(ChannelData):
 
 
 class NumberChannel(Channel, ChannelDouble):
-    """A channel with a double."""
+    """A channel whose value is a number of double precision."""
 
     def from_client(self, value: Any) -> float:
-        """Return the number."""
+        """Return the client's value as a float."""
         return float(value)
 
 

@@ -91,11 +91,11 @@ def test_out_of_raw_mode_the_held_position_is_the_setpoint_and_not_the_volts(ben
     bench.references.set("x", SINE)
     bench.set_mode(Mode.RAW)
     with pytest.raises(Refusal, match=r"reference of axis x: in V, of mode raw; allowed: µm"):
-        bench.references.held_value(0)
+        bench.references.constant_reference_um(0)
     bench.references.set("x", {"kind": "hold", "value": 6.0})
     bench.loop.run(2000)
     bench.set_mode(Mode.CLOSED_LOOP)
-    held_um = bench.references.held_value(0)
+    held_um = bench.references.constant_reference_um(0)
     assert held_um == bench.setpoint_of_loop()
     assert abs(held_um - 6.0) > 1.0
     assert bench.loop.column(bench.loop.run(1), "x_reference_um")[0] == held_um
@@ -112,7 +112,7 @@ def test_off_after_raw_mode_the_volts_are_no_setpoint(bench: Bench) -> None:
 
 def test_a_scheduled_setpoint_is_the_held_one() -> None:
     entry = '[[schedule]]\nat_tick = 5\naxis = "x"\nreference = { kind = "hold", value = 7.5 }\n'
-    assert Bench(ONE_AXIS + entry).references.held_value(0) == 7.5
+    assert Bench(ONE_AXIS + entry).references.constant_reference_um(0) == 7.5
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -138,10 +138,10 @@ def test_the_service_knows_the_references_of_the_loop_after_any_commands(seed: i
             setpoint_um = bench.setpoint_of_loop(number)
             if setpoint_um is None:
                 with pytest.raises(Refusal, match=r"in V, of mode raw|kind is (sine|table|triangle)"):
-                    bench.references.held_value(number)
+                    bench.references.constant_reference_um(number)
             else:
                 setpoints += 1
-                assert bench.references.held_value(number) == setpoint_um
+                assert bench.references.constant_reference_um(number) == setpoint_um
     assert setpoints > 50
 
 
@@ -154,9 +154,9 @@ def test_after_lost_events_the_reference_is_unknown_until_mode_and_setpoint_are_
                  lambda: bench.set_mode(Mode.CLOSED_LOOP)):  # fmt: skip
         step()
         with pytest.raises(Refusal, match="reference of axis x: unknown, because events of the loop were lost"):
-            bench.references.held_value(0)
+            bench.references.constant_reference_um(0)
     bench.references.set("x", {"kind": "hold", "value": 2.0})
-    assert bench.references.held_value(0) == 2.0
+    assert bench.references.constant_reference_um(0) == 2.0
 
 
 def test_a_setpoint_that_is_set_just_now_is_read_from_a_record_that_has_it(
@@ -168,7 +168,7 @@ def test_a_setpoint_that_is_set_just_now_is_read_from_a_record_that_has_it(
     bench.references.set("x", {"kind": "hold", "value": 9.0})
     records = [stale, stale]
     monkeypatch.setattr(Staging, "newest_record", property(lambda s: records.pop() if records else newest.__get__(s)))
-    assert (bench.references.held_value(0), records) == (9.0, [])
+    assert (bench.references.constant_reference_um(0), records) == (9.0, [])
 
     def sleep(duration_s: float) -> None:
         now_s[0] += duration_s
@@ -176,7 +176,7 @@ def test_a_setpoint_that_is_set_just_now_is_read_from_a_record_that_has_it(
     monkeypatch.setattr(Staging, "newest_record", stale)
     monkeypatch.setattr(active_references, "time", SimpleNamespace(monotonic=lambda: now_s[0], sleep=sleep))
     with pytest.raises(Refusal, match="the loop stands still after a change of the reference"):
-        bench.references.held_value(0)
+        bench.references.constant_reference_um(0)
 
 
 @pytest.mark.parametrize("failure", [WITHDRAWN, QueueFull("256 commands wait for the loop already"), UNCONFIRMED])

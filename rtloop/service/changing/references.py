@@ -61,9 +61,9 @@ class LiveReferences:
         self._set_counts = [0] * len(plan.axes)
         """Number of references set on each axis, which the loop accepted or may still start."""
         self._own_counts = [0] * len(plan.axes)
-        """Those of them that the service itself set: sines that depolarise, and the ramps of a return."""
+        """Number of these references that the service itself set: sines that depolarise, and the ramps of a return."""
         self._activity = ""
-        """What the service does to the outputs meanwhile; empty while clients may set references."""
+        """Reason for refusing the references of clients, in words; empty while clients may set references."""
 
     def set(self, axis: str, reference: Mapping[str, Any], *, restores: bool = False) -> int:
         """Start a generator, {kind, …} as in [axis.reference], on an axis. Returns its first tick.
@@ -101,7 +101,7 @@ class LiveReferences:
         Limits are not checked. Returns the tick of the first sample. Raises Refusal, UnconfirmedCommand; ConfigError
         for too many samples.
         """
-        with self._own_change(number):
+        with self._service_change(number):
             return self._submit_table(number, [Generator.TABLE, 0, samples_v.size, 1.0, 0.0], samples_v)
 
     def play_once(self, number: int, samples: Samples, hold_ticks: int, replaces: int) -> int:
@@ -112,7 +112,7 @@ class LiveReferences:
         many samples.
         """
         count, columns = samples.shape
-        with self._own_change(number, replaces):
+        with self._service_change(number, replaces):
             values = [Generator.TABLE, 0, count, hold_ticks, 0.0, float(columns == 2)]
             return self._submit_table(number, values, samples.T.ravel())
 
@@ -132,7 +132,7 @@ class LiveReferences:
 
         The loop must have the same configured tables. `replaces` and errors as in `play_once`.
         """
-        with self._own_change(number, replaces):
+        with self._service_change(number, replaces):
             values = list(setting.values)
             if setting.samples is None:
                 return self._submit(number, values)
@@ -149,7 +149,7 @@ class LiveReferences:
             self._activity = ""
 
     @contextmanager
-    def _own_change(self, number: int, replaces: int | None = None) -> Iterator[None]:
+    def _service_change(self, number: int, replaces: int | None = None) -> Iterator[None]:
         """Hold the staging lock, and count the references set on axis `number` within as the service's own.
 
         Raises ReferenceReplaced if `replaces` is given and clients have set another number of references.
@@ -191,7 +191,7 @@ class LiveReferences:
         with self._staging.lock:
             return self._submit(number, [float(generator["kind"]), *generator["parameters"].tolist()])
 
-    def held_value(self, number: int) -> float:
+    def constant_reference_um(self, number: int) -> float:
         """Return the constant reference that the loop has for axis `number`, µm.
 
         Raises Refusal if it is not constant, is in V, is unknown, or the loop stands still.

@@ -38,7 +38,7 @@ class Player:
         self.axis = live.prepared.plan.axes[number]
         self.rate_hz = live.prepared.configuration.loop.rate_hz
         self._set_count = live.references.set_count(number)  # First: a reference that is set now is another client's.
-        self.hold_um = live.references.held_value(number)
+        self.hold_um = live.references.constant_reference_um(number)
 
     @property
     def next_tick(self) -> int:

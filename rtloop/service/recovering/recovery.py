@@ -144,7 +144,7 @@ class Recovery:
             return
         self._causes = trip.causes
         reason = self._obstacle(trip, options)
-        if reason is None and self._left(options) == 0:
+        if reason is None and self._count_remaining(options) == 0:
             reason = StepReason.COUNT
         if reason is None and self._former is None:
             self._former = None if trip.mode is None else record_former_state(trip.mode, live)
@@ -225,7 +225,7 @@ class Recovery:
             return True
 
     def end(self) -> None:
-        """End a recovery that is under way, because a client takes over: none of its commands is sent from now on."""
+        """End a recovery that is under way, because a client takes over; the recovery sends no command afterwards."""
         with self._guard:
             if self._former is not None:
                 is_returning = self._state is RecoveryState.RETURNING
@@ -304,7 +304,7 @@ class Recovery:
             options = self._options
             return None if options is None else {
                 "state": self._state.value,
-                "left": self._left(options),
+                "left": self._count_remaining(options),
                 "confirmed": 0 if self._confirmation is None else self._confirmation.count,
                 "confirmations": options.confirmations,
                 "causes": signals.trip_causes(self._causes),
@@ -316,7 +316,7 @@ class Recovery:
         """The policy in the present configuration; None if recovery is off."""
         return self._host.configuration.service.recover
 
-    def _left(self, options: RecoverOptions) -> int:
+    def _count_remaining(self, options: RecoverOptions) -> int:
         """Return the number of recoveries left within the hour; the guard must be held."""
         while self._begun_s and self._now_s() - self._begun_s[0] >= HOUR_S:
             self._begun_s.popleft()
@@ -338,7 +338,7 @@ class Recovery:
     def _add_step(self, step: RecoveryStep, reason: StepReason = StepReason.NONE) -> None:
         """Add a step to be reported, and log it; the guard must be held."""
         options = self._options
-        left = 0 if options is None else self._left(options)
+        left = 0 if options is None else self._count_remaining(options)
         self._steps.append(Step(step, reason, left, self._causes))
         causes, text = ", ".join(signals.trip_causes(self._causes)), REASON_TEXTS.get(reason)
         is_bad = step in (RecoveryStep.LATCHED, RecoveryStep.UNSOUND)
@@ -347,7 +347,7 @@ class Recovery:
 
 
 def _are_allowed(trip: Trip, options: RecoverOptions) -> bool:
-    """Return whether the policy covers all causes of a trip, and those that followed it."""
+    """Return whether the policy covers the first causes of a trip and the later ones."""
     first, allowed = set(signals.trip_causes(trip.first_causes)), set(options.causes)
     followers = {STANDSTILL} if first & STANDSTILL_CAUSES else set()
     return first <= allowed and set(signals.trip_causes(trip.causes)) <= allowed | followers
