@@ -23,6 +23,7 @@ from rtloop.service.desk import Refusal, UnconfirmedCommand
 from rtloop.service.measuring import player as player_module
 from rtloop.service.measuring.player import Player
 from rtloop.signals import Mode
+from rtloop.supervision.supervisor import Supervisor
 from tests.engine.harness import AXIS, CONTROLLER, IDEAL, LoopBench, prepare_text, text
 
 TWO_AXES = (Path(__file__).resolve().parents[2] / "deploy" / "two-axis.toml").read_text(encoding="utf-8")
@@ -76,7 +77,8 @@ class Bench:
         return float(generator["parameters"][0]) if is_setpoint else None
 
     def player(self) -> Player:
-        supervisor: Any = SimpleNamespace(ticks=0, block=self.loop.block)
+        supervisor: Any = SimpleNamespace(ticks=int(self.loop.block.ring("ticks").head[0]), block=self.loop.block)
+        supervisor.newest = lambda count: Supervisor.newest(supervisor, count)
         live: Any = SimpleNamespace(prepared=self.prepared, references=self.references)
         return Player(supervisor, live, 0, "response")
 
@@ -107,7 +109,7 @@ def test_off_after_raw_mode_the_volts_are_no_setpoint(bench: Bench) -> None:
     bench.references.set("x", {"kind": "hold", "value": 6.0})
     bench.set_mode(Mode.OFF)
     with pytest.raises(Refusal, match="in V, of mode raw"):
-        bench.player()
+        bench.references.constant_reference_um(0)
 
 
 def test_a_scheduled_setpoint_is_the_held_one() -> None:
@@ -245,3 +247,14 @@ def test_samples_that_the_loop_may_play_are_not_overwritten(bench: Bench) -> Non
     bench.desk.before_submit = lambda: seen_um.append(bench.loop.block["table"][first : first + 10].tolist())
     bench.references.set_waveform("x", np.full((10, 1), 2.0), 1, True)
     assert seen_um == [[6.0] * 10]
+
+
+@pytest.mark.parametrize("mode", [Mode.FEEDFORWARD, Mode.RAW, Mode.OFF])
+def test_a_measurement_in_another_mode_is_refused_before_it_moves_anything(bench: Bench, mode: Mode) -> None:
+    bench.loop.run(10)
+    assert bench.player().hold_um == bench.setpoint_of_loop()
+    bench.set_mode(mode)
+    bench.loop.run(10)
+    with pytest.raises(Refusal, match="response: the mode is not closed_loop"):
+        bench.player()
+    assert bench.references.set_count(0) == 0

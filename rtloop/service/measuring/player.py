@@ -29,12 +29,16 @@ LIMITED_SIGNALS = {Flag.COMMAND_LIMITED: "command", Flag.DRIVE_LIMITED: "drive",
 class Player:
     """Player on axis `number` about its setpoint `hold_um`, µm; messages begin with `activity`, such as "response".
 
-    Raises Refusal if the axis has no constant reference, ClientDisconnected if the client has disconnected.
+    Raises Refusal if the loop is in another mode than closed_loop or the axis has no constant reference,
+    ClientDisconnected if the client has disconnected.
     """
 
     def __init__(self, supervisor: Supervisor, live: LiveLaw, number: int, activity: str) -> None:
         require_client(activity)
         self._supervisor, self._live, self._number, self._activity = supervisor, live, number, activity
+        newest = supervisor.newest(1)
+        if len(newest):
+            self._require_closed_loop(newest)
         self.axis = live.prepared.plan.axes[number]
         self.rate_hz = live.prepared.configuration.loop.rate_hz
         self._set_count = live.references.set_count(number)  # First: a reference that is set now is another client's.
@@ -140,8 +144,12 @@ class Player:
         flags = np.bitwise_or.reduce(rows[:, signals.FLAGS].astype(np.int64))
         if causes := signals.trip_causes(flags):
             raise Refusal(f"{self._activity}: the loop tripped ({', '.join(causes)}); use `rtloop ctl reset` first")
-        if np.any(rows[:, signals.MODE] != Mode.CLOSED_LOOP):
-            raise Refusal(f"{self._activity}: the mode is not closed_loop; use `rtloop ctl mode closed_loop` first")
+        self._require_closed_loop(rows)
         if limited := [name for flag, name in LIMITED_SIGNALS.items() if flags & flag]:
             remedy = "use another setpoint, or less or slower motion"
             raise Refusal(f"{self._activity}: a limit changed the {' and the '.join(limited)}; {remedy}")
+
+    def _require_closed_loop(self, rows: Real) -> None:
+        """Raise Refusal if a record (ticks, columns) is of another mode than closed_loop."""
+        if np.any(rows[:, signals.MODE] != Mode.CLOSED_LOOP):
+            raise Refusal(f"{self._activity}: the mode is not closed_loop; use `rtloop ctl mode closed_loop` first")
