@@ -120,7 +120,9 @@ def test_margins_and_motion_are_those_of_the_rig(bench: Bench, shown: Shown) -> 
     for name in ("gain_margin", "phase_margin_deg", "modulus_margin"):
         margin = found["margins"][name]
         assert 0.0 < margin["std"] < 0.02 * true[name], margin
-        assert abs(margin["value"] - true[name]) < 5.0 * margin["std"], margin
+        error = abs(margin["value"] - true[name])
+        assert error < 0.05 * true[name], margin
+        assert error < 8.0 * margin["std"], margin  # of four periods: Student's t leaves 5 of them too often
     assert found["resonance"]["hz"] == pytest.approx(LOOP.hz, rel=0.002)
     assert found["model"] is None
     assert reference_um(bench) == HELD_UM
