@@ -9,6 +9,7 @@ import sys
 import tempfile
 import tracemalloc
 from collections.abc import Callable
+from contextlib import closing
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -23,6 +24,7 @@ from rtloop.interchange.export import export
 from rtloop.recording.cutting.cut import cut
 from rtloop.recording.errors import RecordingError
 from rtloop.recording.file import conversion, layout
+from rtloop.recording.file.mcap.chunks import McapSource
 from rtloop.recording.file.recover import recover
 from rtloop.recording.load import load
 from rtloop.recording.replay.replay import replay
@@ -172,6 +174,23 @@ def test_a_full_temporary_folder_is_an_error_with_the_remedy(run: Run, path: Pat
     with pytest.raises(
         RecordingError, match=r"rewritten\.mcap: no room to convert the file .*set TMPDIR to another folder"
     ):
+        load(write(path, run.messages))
+
+
+def test_a_copy_that_is_damaged_on_the_way_is_an_error_with_a_sentence(
+    run: Run, path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    convert, damaged = layout.open_converted_copy, tmp_path / "copy.mcap"
+
+    def damage(source: McapSource) -> McapSource:
+        with closing(convert(source)) as copy:
+            data = bytearray(copy.read(0, copy.size))
+        data[30:60] = bytes(30)  # within the header's record
+        damaged.write_bytes(data)
+        return McapSource(damaged)
+
+    monkeypatch.setattr(layout, "open_converted_copy", damage)
+    with pytest.raises(RecordingError, match=r"rewritten\.mcap: cannot be converted \(.+\); use another copy"):
         load(write(path, run.messages))
 
 

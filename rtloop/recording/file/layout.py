@@ -89,12 +89,14 @@ def open_layout(source: McapSource) -> tuple[McapSource, OwnLayout]:
 def _open_converted(source: McapSource) -> tuple[McapSource, OwnLayout]:
     """Return a converted copy of `source` and its layout, and close `source`.
 
-    Raises RecordingError if the file cannot be converted, DamagedChunk if the copy is unreadable; `source` stays open
-    then.
+    Raises RecordingError if the file cannot be converted or the copy is unreadable; `source` stays open then.
     """
     copy = open_converted_copy(source)
     try:
         layout = OwnLayout(copy)
+    except DamagedChunk as damage:
+        copy.close()
+        raise RecordingError(f"{source.path}: cannot be converted ({damage}); use another copy") from damage
     except BaseException:
         copy.close()
         raise
