@@ -57,7 +57,7 @@ tools: $(TESTED) ## what some tests need besides (as root): strace, Chromium, Pl
 bench: $(VENV)/.bench ## every benchmark: half an hour, as root for real-time scheduling
 	$(BIN)/python -m tests.benchmarks
 
-faults: $(TESTED) ## about forty faults on real processes, and a table of the outcomes: four minutes, as root for the full disk
+faults: $(TESTED) ## 74 faults on real processes, and a table of the outcomes: ten minutes, as root for the full disk
 	$(BIN)/python -m tests.faults $(FLAGS)
 
 soak: $(TESTED) ## long tests: NAME=day FLAGS="--hours 1"; without NAME, a list of them
