@@ -33,6 +33,7 @@ def inner_imports(module: str, function: str) -> set[str]:
         ("rtloop.cli.check:check", ()),
         ("rtloop.workbench.check_text:print_axis,_print_analyses", ()),
         ("rtloop.cli.experiment:run_experiments,_load_stage,_record", ("uvicorn",)),
+        ("rtloop.cli.replay:replay", ("scipy", "rtloop.configuration")),
         ("rtloop.service.daemon", ()),
         ("rtloop.engine.process", ("scipy",)),
         ("rtloop.recording.capture.recorder", ("scipy", "pydantic")),

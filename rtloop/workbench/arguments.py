@@ -9,11 +9,13 @@ import math
 from collections.abc import Sequence
 from numbers import Integral, Real
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from rtloop.configuration.file import Configuration, load
 from rtloop.errors import RtloopError
 from rtloop.recording.load import Recording
+
+if TYPE_CHECKING:
+    from rtloop.configuration.file import Configuration
 
 FileName = str | Path
 """The name of a file."""
@@ -40,6 +42,8 @@ def load_configuration(configuration: FileName | Configuration, argument: str) -
 
     Raises InputFileError, ConfigError with all faults, RtloopError for another value.
     """
+    from rtloop.configuration.file import Configuration, load
+
     if isinstance(configuration, Configuration):
         return configuration
     return load(as_path(configuration, f"{argument}: configuration"))

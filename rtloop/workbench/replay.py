@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Literal, overload
+from typing import TYPE_CHECKING, Literal, overload
 
-from rtloop.configuration.file import Configuration
 from rtloop.recording.file.run_readers import RecordingPaths, ReportTicks
 from rtloop.recording.load import Recording, load
+from rtloop.recording.replay.laws import NO_TRUST
 from rtloop.recording.replay.spans import replay_on_cores
 from rtloop.workbench.arguments import FileName, as_paths, recording_paths, require_count
-from rtloop.workbench.other_law import make_trust, replay_on_the_rig, replay_with_other_law
 from rtloop.workbench.replay_results import LawComparison, ReplayResult, Resimulation
+
+if TYPE_CHECKING:
+    from rtloop.configuration.file import Configuration
 
 
 @overload
@@ -81,11 +83,15 @@ def replay(
     (True, 7000, None)
     """
     require_count(jobs, "replay: jobs", 1)
-    files = recording_paths(recording, "replay: recording")
-    trust = make_trust(as_paths(law, "replay: law"), trust_recorded_law)
-    if resimulate:
-        return Resimulation(replay_on_the_rig(files, config, progress, trust))
-    if config is not None:
-        return LawComparison(replay_with_other_law(files, config, progress))
+    files, law_files = recording_paths(recording, "replay: recording"), as_paths(law, "replay: law")
+    trust = NO_TRUST
+    if law_files or trust_recorded_law or resimulate or config is not None:  # A usual replay needs no configuration.
+        from rtloop.workbench.other_law import make_trust, replay_on_the_rig, replay_with_other_law
+
+        trust = make_trust(law_files, trust_recorded_law)
+        if resimulate:
+            return Resimulation(replay_on_the_rig(files, config, progress, trust))
+        if config is not None:
+            return LawComparison(replay_with_other_law(files, config, progress))
     loaded = load(files)
     return ReplayResult(files[0], loaded, replay_on_cores(loaded, progress, trust, jobs))
