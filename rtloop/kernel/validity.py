@@ -22,9 +22,9 @@ class Allowed(NamedTuple):
         steps = f"a multiple of {self.step} from " if self.step > 1 else ""
         return f"{steps}{self.low} to {self.high}"
 
-    def faults(self, values: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
-        """Return which of `values` are not allowed, as booleans of their shape."""
-        return (values < self.low) | (values > self.high) | (values % self.step != 0)
+    def allows(self, value: int) -> bool:
+        """Return whether a number is allowed."""
+        return self.low <= value <= self.high and value % self.step == 0
 
 
 class Bits(NamedTuple):
@@ -36,9 +36,9 @@ class Bits(NamedTuple):
         """Return the rule in words, such as "bits of 0x1f"."""
         return f"bits of {self.mask:#x}"
 
-    def faults(self, values: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
-        """Return which of `values` have bits outside the mask, as booleans of their shape."""
-        return (values & ~self.mask) != 0
+    def allows(self, value: int) -> bool:
+        """Return whether a number has no bits outside the mask."""
+        return value & ~self.mask == 0
 
 
 SWITCH = Allowed(0, 1)
@@ -51,7 +51,6 @@ def require_allowed(owner: str, record: Any, allowed: Mapping[str, Allowed | Bit
     `owner` names the record in the message.
     """
     for name, rule in allowed.items():
-        values = np.atleast_1d(record[name])
-        faults = rule.faults(values)
-        if faults.any():
-            raise ValueError(f"{name} of {owner}: {int(values[faults][0])}; allowed: {rule}")
+        for value in np.ravel(record[name]).tolist():  # Most fields hold one number, for which arrays are slow.
+            if not rule.allows(value):
+                raise ValueError(f"{name} of {owner}: {value}; allowed: {rule}")

@@ -152,18 +152,18 @@ class RecordedSignals:
                 self._signals[name] = signal
         return [self._signals[name] for name in names]
 
-    def blocks(self, names: Sequence[str] | None = None) -> Generator[Rows]:
+    def blocks(self, names: Sequence[str] | None = None, *, ahead: bool = True) -> Generator[Rows]:
         """Yield arrays (n, names) of the ticks, in order, for recordings larger than memory; None reads all columns.
 
-        Nothing is cached. Damaged chunks are skipped and added to `problems`. Raises RecordingError for an unknown name
-        and for a file that cannot be read.
+        Nothing is cached. Damaged chunks are skipped and added to `problems`. With `ahead`, threads decompress the next
+        chunks. Raises RecordingError for an unknown name and for a file that cannot be read.
         """
         if self.is_part:
             yield from self.between(self.columns if names is None else names, self._start_s, self._end_s)
             return
         with self._open_readers() as readers:
             for reader in readers:
-                yield from reader.blocks(names)
+                yield from reader.blocks(names, ahead=ahead)
 
     def between(self, names: Sequence[str], start_s: float, end_s: float) -> Generator[Rows]:
         """Yield arrays (n, names) of the ticks due from `start_s` to `end_s`, both included, in s since the start.

@@ -10,9 +10,9 @@ from __future__ import annotations
 import hashlib
 import math
 from collections import deque
-from collections.abc import Iterable, Iterator, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
-from functools import cached_property
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any, NamedTuple, Self
 
@@ -38,6 +38,8 @@ from rtloop.recording.file.topics.ticks import LARGEST, TickLayout, Ticks
 from rtloop.recording.file.topics.validation import MalformedText, parse_event
 
 Rows = Real
+ReadTicks = Callable[[], Ticks | None]
+"""Function that returns the ticks of a chunk, or None for a chunk without ticks; it may raise DamagedChunk."""
 WORKERS = 3
 AHEAD = 16
 """Number of chunks that are decompressed ahead of the reader."""
@@ -147,19 +149,23 @@ class Reader:
         start_ns, end_ns = start_s * 1e9 + self.start_unix_ns, end_s * 1e9 + self.start_unix_ns
         return [entry for entry in self.tick_chunks if overlaps(entry, start_ns, end_ns)]
 
-    def blocks(self, names: Sequence[str] | None = None, entries: Iterable[ChunkEntry] | None = None) -> Iterator[Rows]:
+    def blocks(
+        self, names: Sequence[str] | None = None, entries: Iterable[ChunkEntry] | None = None, *, ahead: bool = True
+    ) -> Iterator[Rows]:
         """Yield arrays (n, names) float64 of the ticks, in order; all columns in recorded order without `names`.
 
         Ticks may be missing between rows. Ticks that an earlier file of the run holds are left out. `entries` restricts
-        the ticks to some of `tick_chunks`; without it, their number is compared with the recorder's. Decompression runs
-        ahead in threads. Raises RecordingError for an unknown name and, unless tolerant, for a damaged chunk or a wrong
+        the ticks to some of `tick_chunks`; without it, their number is compared with the recorder's. With `ahead`,
+        threads decompress the next chunks; a process that shares its processors with others needs none. Raises
+        RecordingError for an unknown name and, unless tolerant, for a damaged chunk or a wrong
         number of ticks.
         """
         columns = self._require_columns(self.columns if names is None else names)
         account = TickAccount(self.first_tick, self.totals, self._end_of_repetition)
-        for entry, future in self._decompress_ahead(self.tick_chunks if entries is None else entries, columns):
+        read = self._read_ahead if ahead else self._read_in_turn
+        for entry, read_ticks in read(self.tick_chunks if entries is None else entries, columns):
             try:
-                ticks = future.result()
+                ticks = read_ticks()
                 if ticks is not None and (ticks := account.add(ticks)) is not None:
                     yield ticks.rows
             except DamagedChunk as reason:
@@ -266,21 +272,25 @@ class Reader:
             return self._tick_layout.parse_ticks(content, self.columns)
         return self._valid_messages(split_messages(content))
 
-    def _decompress_ahead(
+    def _read_ahead(
         self, entries: Iterable[ChunkEntry], names: Sequence[str]
-    ) -> Iterator[tuple[ChunkEntry, Future[Ticks | None]]]:
-        """Yield each entry with the future of its ticks with columns `names`, decompressed ahead in threads.
-
-        The future holds None for a chunk without ticks, or raises DamagedChunk.
-        """
-        queue: deque[tuple[ChunkEntry, Future[Ticks | None]]] = deque()
+    ) -> Iterator[tuple[ChunkEntry, ReadTicks]]:
+        """Yield each entry with a function that returns its ticks with columns `names`, read ahead in threads."""
+        queue: deque[tuple[ChunkEntry, ReadTicks]] = deque()
         with ThreadPoolExecutor(WORKERS) as pool:
             for entry in entries:
-                queue.append((entry, pool.submit(self._read_ticks, entry, names)))
+                queue.append((entry, pool.submit(self._read_ticks, entry, names).result))
                 if len(queue) >= AHEAD:
                     yield queue.popleft()
             while queue:
                 yield queue.popleft()
+
+    def _read_in_turn(
+        self, entries: Iterable[ChunkEntry], names: Sequence[str]
+    ) -> Iterator[tuple[ChunkEntry, ReadTicks]]:
+        """Yield each entry with a function that reads its ticks with columns `names`, and returns them."""
+        for entry in entries:
+            yield entry, partial(self._read_ticks, entry, names)
 
     def _read_ticks(self, entry: ChunkEntry, names: Sequence[str]) -> Ticks | None:
         """Columns `names` of the ticks of a chunk; None if it holds messages of the slow topics.

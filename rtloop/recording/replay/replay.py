@@ -8,7 +8,7 @@ the next snapshot.
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import closing
+from contextlib import closing, contextmanager
 from typing import Any
 
 import numpy as np
@@ -56,10 +56,17 @@ def snapshot_law(snapshot: Snapshot, recording: Recording, laws: Sequence[LawRef
     Raises RecordingError for a wrong size or values that are not allowed.
     """
     layout = law_layout(laws)
-    try:
+    with _snapshot_faults(snapshot, recording):
         _, *law = layout.split_snapshot(snapshot.data, len(recording.header["axes"]))
         coefficients, axes, state = law
         return LawMemory(layout, bind_functions(laws), coefficients, axes, state, header_extras(recording.header))
+
+
+@contextmanager
+def _snapshot_faults(snapshot: Snapshot, recording: Recording) -> Iterator[None]:
+    """Convert a ValueError inside the block to a RecordingError that names the snapshot."""
+    try:
+        yield
     except ValueError as error:
         raise RecordingError(
             f"{recording.paths[0]}: the snapshot of the law at tick {snapshot.tick} cannot be used: {error}"
@@ -133,7 +140,7 @@ class Replay:
         Raises RecordingError if there is no tick to compare.
         """
         expected = self._recording.extents[0].first_tick
-        with closing(self._recording.blocks()) as blocks:
+        with closing(self._recording.blocks(ahead=False)) as blocks:
             for block in blocks:
                 for rows in split_at_gaps(block):
                     first = int(rows[0, signals.TICK])
@@ -247,10 +254,11 @@ class Replay:
         if self._next_snapshot is None or self._next_snapshot.tick != tick:
             return None
         snapshot, self._next_snapshot = self._next_snapshot, next(self._snapshots, None)
-        law = snapshot_law(snapshot, self._recording, self._laws)
         if self._rerun is None:
-            self._start_rerun(snapshot.tick, law)
+            self._start_rerun(snapshot.tick, snapshot_law(snapshot, self._recording, self._laws))
             return None
+        with _snapshot_faults(snapshot, self._recording):
+            law_layout(self._laws).split_snapshot(snapshot.data, len(self._recording.header["axes"]))
         self._rerun.expect_snapshot(snapshot.data)
         return snapshot
 

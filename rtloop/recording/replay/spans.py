@@ -221,7 +221,7 @@ def _span_rows(readers: Sequence[Reader], span: Span) -> Iterator[Rows]:
     for reader in readers:
         entries = reader.tick_chunks[chunks_before:]
         chunks_before = max(chunks_before - len(reader.tick_chunks), 0)
-        for rows in reader.blocks(None, entries):
+        for rows in reader.blocks(None, entries, ahead=False):
             ticks = rows[:, signals.TICK]
             begin = int((ticks < span.first_tick).sum())
             end = len(rows) if span.last_tick is None else int((ticks <= span.last_tick).sum())
