@@ -9,9 +9,11 @@ import os
 import subprocess
 import sys
 import textwrap
+from pathlib import Path
 
 import pytest
 
+ROOT = Path(__file__).parents[1]
 HEAVY = ("scipy.signal", "scipy.stats", "scipy.optimize", "scipy.interpolate", "numba", "matplotlib", "pyarrow")
 
 
@@ -29,12 +31,12 @@ def inner_imports(module: str, function: str) -> set[str]:
         ("rtloop.cli", ("numpy", "pydantic")),
         ("rtloop.client", ("numpy", "pydantic")),
         ("rtloop.client.connection", ("numpy", "pydantic")),
-        ("rtloop.cli.run:run_configuration", ("uvicorn",)),
-        ("rtloop.cli.check:check", ()),
-        ("rtloop.workbench.check_text:print_axis,_print_analyses", ()),
-        ("rtloop.cli.experiment:run_experiments,_load_stage,_record", ("uvicorn",)),
+        ("rtloop.cli.run:run_configuration", ("scipy", "uvicorn")),
+        ("rtloop.cli.check:check", ("scipy",)),
+        ("rtloop.workbench.check_text:print_axis,_print_analyses", ("scipy",)),
+        ("rtloop.cli.experiment:run_experiments,_load_stage,_record", ("scipy", "uvicorn")),
         ("rtloop.cli.replay:replay", ("scipy", "rtloop.configuration")),
-        ("rtloop.service.daemon", ()),
+        ("rtloop.service.daemon", ("scipy",)),
         ("rtloop.engine.process", ("scipy",)),
         ("rtloop.recording.capture.recorder", ("scipy", "pydantic")),
     ],
@@ -46,6 +48,19 @@ def test_nothing_heavy(module: str, others: tuple[str, ...]):
     program = f"import sys, {', '.join(modules)}; print(*sys.modules)"
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
     assert not {*HEAVY, *others} & {*done.stdout.split()}
+
+
+@pytest.mark.parametrize(("arguments", "others"), [(("check", "deploy/paper.toml"), ("scipy", "control", "uvicorn"))])
+def test_nothing_heavy_while_a_command_runs(arguments: tuple[str, ...], others: tuple[str, ...]):
+    program = """
+import sys
+from rtloop.cli import main
+main(sys.argv[1:], standalone_mode=False)
+print(*sys.modules, file=sys.stderr)
+"""
+    command = [sys.executable, "-c", program, *arguments]
+    done = subprocess.run(command, capture_output=True, text=True, check=True, cwd=ROOT)
+    assert not {*HEAVY, *others} & {*done.stderr.split()}
 
 
 def test_the_command_line_computes_with_one_thread():

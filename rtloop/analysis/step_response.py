@@ -10,10 +10,10 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from scipy.linalg import expm
 
 from rtloop.analysis.closed_loop import Loop
 from rtloop.foundation.arrays import Real
+from rtloop.linear.matrices import matrix_exponential
 
 SETTLING_BAND = 0.05
 SAMPLE_COUNT = 1 << 16
@@ -87,7 +87,7 @@ def position_after_step(loop: Loop, time_s: float) -> float:
     """
     if loop.period_s is None:
         a, b, c, _ = loop.matrices
-        return float(c[0] @ expm(_joint_matrix(a, b, 0.0) * time_s)[:-1, -1])
+        return float(c[0] @ matrix_exponential(_joint_matrix(a, b, 0.0) * time_s)[:-1, -1])
     response = step_response(loop, time_s + loop.period_s)
     return float(response.position[np.flatnonzero(response.time_s <= time_s + 1e-9 * loop.period_s)[-1]])
 
@@ -110,7 +110,7 @@ def _settling_time_s(response: StepResponse, final: float) -> float:
 def _continuous_response(loop: Loop, interval_s: float) -> StepResponse:
     """Return SAMPLE_COUNT samples of the step response from rest, `interval_s` apart."""
     a, b, c, d = loop.matrices
-    states = _state_sequence(np.asarray(expm(_joint_matrix(a, b, 0.0) * interval_s), dtype=float), SAMPLE_COUNT)
+    states = _state_sequence(matrix_exponential(_joint_matrix(a, b, 0.0) * interval_s), SAMPLE_COUNT)
     position, command = c @ states + d[:, None]
     return StepResponse(interval_s * np.arange(SAMPLE_COUNT, dtype=float), position, command)
 

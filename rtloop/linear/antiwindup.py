@@ -13,7 +13,6 @@ import math
 
 import numpy as np
 import numpy.typing as npt
-from scipy.linalg import solve_discrete_are
 
 from rtloop.foundation.arrays import Real
 from rtloop.linear.realisation import Form, System, blocks
@@ -138,6 +137,8 @@ def _weights(part: System) -> Real:
 
 def _covariance(a: Real, c: Real, driving: Real, noise: Real) -> Real:
     """Return W (n, n) = A W Aᵀ − A W Cᵀ(C W Cᵀ + noise)⁻¹C W Aᵀ + driving. Raises ValueError if there is none."""
+    from scipy.linalg import solve_discrete_are  # a tenth of a second of import, for few controllers
+
     try:
         return solve_discrete_are(a.T, c.T, driving, noise)
     except (np.linalg.LinAlgError, ValueError):

@@ -8,10 +8,10 @@ from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from scipy.linalg import block_diag
 
 from rtloop.foundation.arrays import Complex, Real
 from rtloop.linear.discretise import bilinear_factor
+from rtloop.linear.matrices import block_diagonal
 from rtloop.linear.realisation import System
 
 DC_OFFSET = 1e-9
@@ -45,7 +45,7 @@ class CoupledSystem(NamedTuple):
 def block_diagonal_system(systems: list[System]) -> CoupledSystem:
     """Combine independent systems of one input and one output each into one, with the states in the same order."""
     return CoupledSystem(
-        np.asarray(block_diag(*(system.a for system in systems))),
+        block_diagonal([system.a for system in systems]),
         _state_columns([system.b for system in systems]),
         _state_columns([system.c for system in systems]).T,
         np.diag([system.d for system in systems]),

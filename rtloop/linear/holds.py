@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from scipy.linalg import expm
 
 from rtloop.foundation.arrays import Complex
 from rtloop.foundation.modal import ModalSystem
@@ -44,6 +43,8 @@ def hold_matrices(system: System, period_s: float, ramp: bool) -> System:
 
     The exponential of [A b 0; 0 0 1/T; 0 0 0]·T contains the responses to a step and to a ramp (Van Loan 1978).
     """
+    from scipy.linalg import expm  # a tenth of a second of import, for controllers with repeated poles alone
+
     n = system.b.size
     joint = np.zeros((n + 2, n + 2))
     joint[:n, :n], joint[:n, n], joint[n, n + 1] = system.a * period_s, system.b * period_s, 1.0

@@ -11,9 +11,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rtloop.analysis.closed_loop import realise_transfer
-from rtloop.design.synthesis.hinf.augment import GeneralisedPlant, Matrices, augment
-from rtloop.design.synthesis.hinf.norm import hinf_norm
+from rtloop.design.synthesis.hinf.augment import GeneralisedPlant, augment
+from rtloop.design.synthesis.hinf.norm import weighted_norm
 from rtloop.design.synthesis.hinf.normal_form import normalise
 from rtloop.design.synthesis.hinf.solver import Hinf, NoController, smallest_gamma, synthesise_hinf
 from rtloop.design.synthesis.rate_limits import LARGEST_SENSITIVITY, dead_time, drop_fast_roots, is_runnable
@@ -87,14 +86,6 @@ def synthesise(
         f"to {full.order} gives a stable sampled loop with max |S| ≤ {LARGEST_SENSITIVITY:g}; use a longer "
         "settling_ms, a smaller bandwidth_hz or a higher rate"
     )
-
-
-def weighted_norm(standard: GeneralisedPlant, controller: Transfer) -> float:
-    """Return the H∞ norm of the weighted closed loop, ‖F_l(P, C)‖∞ of eq (9): the factor by which the worst
-    specification is missed; infinite if unstable.
-    """
-    a, b, c, d = realise_transfer(controller)
-    return hinf_norm(standard.close_loop(Matrices(a, b[:, None], c[None, :], np.array([[d]])))).norm
 
 
 def _reduce_and_finish(

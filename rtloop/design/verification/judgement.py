@@ -6,7 +6,6 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from scipy.linalg import solve_discrete_lyapunov
 
 from rtloop.analysis.closed_loop import Loop
 from rtloop.analysis.margins import loop_margins
@@ -14,6 +13,7 @@ from rtloop.analysis.search import zero_between
 from rtloop.analysis.step_response import step_metrics
 from rtloop.design.synthesis.specification import SensorOptions, SpecificationOptions
 from rtloop.foundation.arrays import Real
+from rtloop.linear.matrices import stationary_covariance
 
 
 class Limit(NamedTuple):
@@ -146,5 +146,5 @@ def noise_gains(loop: Loop) -> Real:
     sampled loop.
     """
     a, b, c, d = loop.matrices
-    covariance = c @ solve_discrete_lyapunov(a, np.outer(b, b), method="bilinear") @ c.T
+    covariance = c @ stationary_covariance(a, np.outer(b, b)) @ c.T
     return np.sqrt(np.diag(covariance) + d**2)

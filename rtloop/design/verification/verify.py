@@ -17,8 +17,8 @@ from rtloop.analysis.comparison import compare_controllers
 from rtloop.analysis.coupled_loop import SimultaneousMargins
 from rtloop.analysis.perturbation import PercentRange, loop_builder, plant_changes, stability_range
 from rtloop.design.synthesis.hinf.augment import augment
+from rtloop.design.synthesis.hinf.norm import weighted_norm
 from rtloop.design.synthesis.specification import QUANTITIES, DesignOptions, build_weights
-from rtloop.design.synthesis.synthesise import weighted_norm
 from rtloop.design.synthesis.weights import Weights
 from rtloop.design.verification.judgement import Limit, loop_quantities, required_limits, specified_quantities
 from rtloop.design.verification.robustness import (

@@ -14,11 +14,11 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from scipy.linalg import block_diag
 
 from rtloop.analysis.closed_loop import realise_transfer
 from rtloop.design.synthesis.weights import Weights
 from rtloop.foundation.arrays import Complex, Real
+from rtloop.linear.matrices import block_diagonal
 from rtloop.linear.transfer import Transfer
 
 
@@ -86,7 +86,7 @@ def augment(plant: Transfer, weights: Weights) -> GeneralisedPlant:
     g, w1, w2, w3 = (realise_transfer(part) for part in (plant, weights.tracking, weights.command, weights.disturbance))
     zeros_g, zeros_2, zeros_3 = np.zeros(g.b.size), np.zeros(w2.b.size), np.zeros(w3.b.size)
     error = np.concatenate([-g.c, 0 * w1.b, zeros_2, -w3.c])  # e without x_d and without the direct part of W3
-    a = np.asarray(block_diag(g.a, w1.a, w2.a, w3.a), dtype=float)
+    a = block_diagonal([g.a, w1.a, w2.a, w3.a])
     a[g.b.size : g.b.size + w1.b.size] += np.outer(w1.b, error)
     b1 = np.column_stack([
         np.concatenate([zeros_g, w1.b, zeros_2, zeros_3]),

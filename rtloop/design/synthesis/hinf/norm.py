@@ -1,4 +1,4 @@
-"""The H∞ norm of a stable system: the largest singular value of its frequency response.
+"""The H∞ norm of a stable system, and of a weighted loop: the largest singular value of its frequency response.
 
 Bruinsma & Steinbuch 1990 (after Boyd, Balakrishnan & Kabamba 1989): γ is exceeded somewhere if and only if a
 Hamiltonian matrix has eigenvalues on the imaginary axis, and those are the frequencies at which a singular value
@@ -12,8 +12,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rtloop.design.synthesis.hinf.augment import Matrices
+from rtloop.analysis.closed_loop import realise_transfer
+from rtloop.design.synthesis.hinf.augment import GeneralisedPlant, Matrices
 from rtloop.foundation.arrays import Real
+from rtloop.linear.transfer import Transfer
 
 
 class Peak(NamedTuple):
@@ -42,6 +44,14 @@ def hinf_norm(system: Matrices, tolerance: float = 1e-6) -> Peak:
             highest, _highest_gain(system, np.concatenate([middles, np.sqrt(crossings[1:] * crossings[:-1])]))
         )
     return highest
+
+
+def weighted_norm(standard: GeneralisedPlant, controller: Transfer) -> float:
+    """Return the H∞ norm of the weighted closed loop, ‖F_l(P, C)‖∞ of eq (9): the factor by which the worst
+    specification is missed; infinite if unstable.
+    """
+    a, b, c, d = realise_transfer(controller)
+    return hinf_norm(standard.close_loop(Matrices(a, b[:, None], c[None, :], np.array([[d]])))).norm
 
 
 def _highest_gain(system: Matrices, omega: Real) -> Peak:
