@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from importlib import import_module
-from importlib.metadata import entry_points
 
 from rtloop.drivers.base import Driver
 from rtloop.drivers.errors import MissingLibrary
@@ -24,6 +23,8 @@ def kinds() -> dict[str, str]:
 
     A third party cannot replace a built-in kind.
     """
+    from importlib.metadata import entry_points  # Only a driver that is not built in needs it.
+
     installed = {point.name: point.value for point in entry_points(group=GROUP)}
     return dict(sorted({**installed, **BUILT_IN}.items()))
 

@@ -53,5 +53,7 @@ def few_simulated_steps(monkeypatch: pytest.MonkeyPatch) -> None:
 
     All of them are simulated in tests/design/test_simulated.py, and for the report in tests/design/test_verify.py.
     """
+    from rtloop.design.verification import simulation
+
     for name in ("CYCLES", "DRAWS", "MORE_DRAWS"):
-        monkeypatch.setattr(f"rtloop.design.verification.simulation.{name}", 1)
+        monkeypatch.setattr(simulation, name, 1)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import importlib
+import importlib.metadata
 import inspect
 import os
 import subprocess
@@ -12,6 +13,8 @@ import textwrap
 from pathlib import Path
 
 import pytest
+
+from rtloop.foundation.native import cache
 
 ROOT = Path(__file__).parents[1]
 HEAVY = ("scipy.signal", "scipy.stats", "scipy.optimize", "scipy.interpolate", "numba", "matplotlib", "pyarrow")
@@ -61,6 +64,18 @@ print(*sys.modules, file=sys.stderr)
     command = [sys.executable, "-c", program, *arguments]
     done = subprocess.run(command, capture_output=True, text=True, check=True, cwd=ROOT)
     assert not {*HEAVY, *others} & {*done.stderr.split()}
+
+
+def test_the_versions_in_the_digest_of_a_cache_are_those_of_the_metadata():
+    for package in ("numba", "llvmlite"):
+        assert cache.installed_version(package) == importlib.metadata.version(package)
+    assert cache.installed_version("rtloop") == importlib.metadata.version("rtloop")  # whose folder may lie elsewhere
+
+
+def test_pydantic_loads_no_plug_ins_under_the_command_line():
+    program = "import rtloop.cli; from pydantic.plugin import _loader; print(*_loader.get_plugins(), _loader._plugins)"
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "None"
 
 
 def test_the_command_line_computes_with_one_thread():

@@ -20,7 +20,7 @@ import numpy.typing as npt
 
 from rtloop.analysis.held_plant import IntersampleOutput, hold_plant
 from rtloop.analysis.reference import UNFILTERED, ReferencePath
-from rtloop.foundation.arrays import Complex, Real
+from rtloop.foundation.arrays import Complex, Real, rising_grid
 from rtloop.linear.discretise import DiscreteController
 from rtloop.linear.realisation import System, imaginary_axis_points, realise
 from rtloop.linear.sampled import SampledController
@@ -178,7 +178,7 @@ class Loop:
         upper = roots[roots.imag > 0]
         widths = np.maximum(np.abs(upper.real), 1e-6 * np.abs(upper))
         grids += [np.abs(upper.imag[:, None] + np.outer(widths, offsets)).ravel() / (2 * math.pi)]
-        hz = np.unique(np.concatenate(grids))
+        hz = rising_grid(grids)
         return hz[(hz > 0) & (hz <= top)]
 
 

@@ -12,7 +12,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from rtloop.foundation.arrays import Complex, Real
+from rtloop.foundation.arrays import Complex, Real, rising_grid
 from rtloop.linear.discretise import DiscreteController
 from rtloop.linear.transfer import Transfer
 from rtloop.values import to_jsonable
@@ -93,7 +93,7 @@ def _frequencies(transfer: Transfer, limit_hz: float) -> Real:
     hz = [np.geomspace(1e-5 * limit_hz, 0.9999 * limit_hz, 1000)]
     for root in _light_pairs(np.concatenate([transfer.zeros, transfer.poles])):
         hz.append((abs(root) + np.linspace(-5, 5, 41) * max(-root.real, 1e-4 * abs(root))) / (2 * math.pi))
-    grid = np.unique(np.concatenate(hz))
+    grid = rising_grid(hz)
     return grid[(grid > 0) & (grid < limit_hz)]
 
 

@@ -23,7 +23,7 @@ from rtloop.analysis.closed_loop import Injection, Loop
 from rtloop.analysis.held_plant import HeldPlant, IntersampleOutput, hold_plant
 from rtloop.analysis.margins import find_maximum
 from rtloop.analysis.reference import UNFILTERED, ReferencePath
-from rtloop.foundation.arrays import Complex, Real
+from rtloop.foundation.arrays import Complex, Real, rising_grid
 from rtloop.linear.coupled_systems import DC_OFFSET, CoupledSystem, SampledCoupledSystem, block_diagonal_system
 from rtloop.linear.realisation import System
 from rtloop.linear.transfer import Transfer
@@ -212,7 +212,7 @@ class CoupledLoop:
         """Margins for simultaneous changes of all axes, at their worst frequencies; all NaN if the loop is unstable."""
         if not self.is_stable:
             return SimultaneousMargins(*[np.nan] * len(SimultaneousMargins._fields))
-        hz = np.unique(np.concatenate([self.axis_loop(i).frequencies for i in range(self.axis_count)]))
+        hz = rising_grid([self.axis_loop(i).frequencies for i in range(self.axis_count)])
         identity = np.eye(self.axis_count)
         peak, peak_hz = find_maximum(lambda f: _largest_singular_value(self.sensitivity(f)), hz)
         tracking, _ = find_maximum(lambda f: _largest_singular_value(identity - self.sensitivity(f)), hz)

@@ -49,6 +49,8 @@ from rtloop.version import __version__
 
 # matrices here have tens of rows: a library's threads wait for each other longer than they compute, on the loop's cores
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+# pydantic would read the metadata of all installed packages, in each process, for plug-ins that no option needs
+os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")
 
 
 @click.group(context_settings={"help_option_names": ["-h", "--help"]})

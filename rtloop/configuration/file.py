@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from difflib import get_close_matches
 from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
@@ -318,6 +317,8 @@ def _fault(detail: Any, prefix: str, raw: Any, known_keys: set[str], missing_bes
     if detail["type"] == "missing":
         return f"{key}: missing; this key is required"
     if detail["type"] == "extra_forbidden":
+        from difflib import get_close_matches
+
         suggestions = get_close_matches(path[-1], missing_beside, n=1)
         if path[-1] in known_keys and not suggestions:
             return f"{key}: unknown key in this table; {path[-1]} belongs in another table"

@@ -34,7 +34,7 @@ def _nested_numbers(value: Any) -> Iterator[int | float]:
 class Options(BaseModel):
     """Base of all models of options; immutable, without unknown keys, with numbers of bounded magnitude."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False)
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False, defer_build=True)
 
     @field_validator("*")
     @classmethod

@@ -9,6 +9,9 @@ from pydantic import Field, PrivateAttr
 from rtloop.foundation.options import Options
 from rtloop.hysteresis.play_model import PlayModel
 
+SHIPPED_PREFIX = "rtloop."
+"""Prefix of the modules of this package; the module of a user law has another name."""
+
 
 class LawOptions(Options):
     """Base class of the options of a law."""
@@ -18,6 +21,12 @@ class LawOptions(Options):
     file: str | None = None
     """Python file that defines the law, relative to the configuration's."""
     _law: Any = PrivateAttr(None)
+
+    @classmethod
+    def __pydantic_init_subclass__(cls, **_: Any) -> None:
+        """Build the validator of a user law's options with their class, so that a fault is reported with its line."""
+        if not cls.__module__.startswith(SHIPPED_PREFIX):
+            cls.model_rebuild(raise_errors=False)  # A name that the text defines further down is no fault.
 
     @property
     def law(self) -> Any:

@@ -13,10 +13,8 @@ import sys
 import traceback
 from collections.abc import Sequence
 from dataclasses import dataclass
-from difflib import get_close_matches
 from functools import cache
 from importlib import import_module
-from importlib.metadata import entry_points
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -24,7 +22,6 @@ from typing import Any
 from rtloop.kernel.memory import Layout
 from rtloop.laws.contract import Law
 from rtloop.laws.limited.announcement import announce, is_limited
-from rtloop.laws.mistakes import find_mistakes, missing_law
 from rtloop.laws.options import LawOptions
 
 GROUP = "rtloop.laws"
@@ -71,6 +68,8 @@ def kinds() -> dict[str, str]:
 
     A third party cannot replace a built-in kind.
     """
+    from importlib.metadata import entry_points  # Only a law that is not shipped needs it.
+
     installed = {point.name: point.value for point in entry_points(group=GROUP)}
     return dict(sorted({**installed, **BUILT_IN}.items()))
 
@@ -120,6 +119,8 @@ def law_from_text(text: str, file: str, kind: str | None = None) -> LawReference
     if kind not in laws:
         if laws:
             raise ValueError(f"{file}: defines the laws {', '.join(laws)}; set kind to one of them")
+        from rtloop.laws.mistakes import missing_law
+
         mistake = missing_law(text, vars(_module(text, file)))
         place, message = ("", "defines no law") if mistake is None else (f", line {mistake.line}", mistake.message)
         raise ValueError(f"{file}{place}: {message}")
@@ -166,6 +167,8 @@ def _module(text: str, file: str) -> ModuleType:
     except Exception as error:
         del sys.modules[name]
         raise ValueError(f"{file}{_line(error, file)}: {_message(error)}") from error
+    from rtloop.laws.mistakes import find_mistakes  # Only user laws have mistakes.
+
     for mistake in find_mistakes(text, vars(module)):
         del sys.modules[name]
         raise ValueError(f"{file}, line {mistake.line}: {mistake.message}")
@@ -195,5 +198,7 @@ def _message(error: Exception) -> str:
     absent = re.search(r"cannot import name '(\w+)' from '([\w.]+)'", text)
     if absent is None:
         return text
+    from difflib import get_close_matches
+
     near = get_close_matches(absent[1], vars(sys.modules[absent[2]]), 1)
     return f"{type(error).__name__}: {absent[0]}" + (f"; did you mean {near[0]}?" if near else "")

@@ -1,4 +1,4 @@
-"""Functions of matrices agree with scipy's, which compute them in other ways."""
+"""Functions of matrices and grids agree with those of scipy and numpy, which compute them in other ways."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scipy.linalg import block_diag, expm, solve_discrete_lyapunov
 
+from rtloop.foundation.arrays import rising_grid
 from rtloop.linear.matrices import block_diagonal, matrix_exponential, stationary_covariance
 
 
@@ -45,3 +46,8 @@ def test_a_first_order_filter_has_the_variance_of_a_geometric_series():
 def test_blocks_stand_along_the_diagonal():
     blocks = [np.arange(4.0).reshape(2, 2) + 1, np.empty((0, 0)), np.array([[7.0]])]
     assert np.array_equal(block_diagonal(blocks), np.asarray(block_diag(*[block for block in blocks if block.size])))
+
+
+@pytest.mark.parametrize("parts", [[[3.0, 1.0], [2.0, 1.0]], [[5.0]], [[], [0.0, -0.0, 1.0]], [[]]])
+def test_a_rising_grid_has_each_number_once(parts: list[list[float]]):
+    assert np.array_equal(rising_grid([np.array(part) for part in parts]), np.unique(np.concatenate(parts)))

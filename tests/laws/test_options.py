@@ -13,6 +13,7 @@ from rtloop.errors import ConfigError
 from rtloop.laws import binding
 from rtloop.laws.conformance import Bench
 from rtloop.laws.limited_return import LimitedLoop
+from rtloop.laws.registry import law_from_text
 from rtloop.laws.shipped.coupled import Coupled
 from rtloop.laws.shipped.options import CoupledOptions, PrandtlIshlinskiiOptions
 from rtloop.laws.shipped.pid import PidOptions
@@ -29,6 +30,16 @@ LOOP = {"gain": 1.0, "numerator": [[1.0]], "denominator": [[1.0, 30.0]]}
 def test_options_that_belong_to_no_law_reach_another_process() -> None:
     options = PidOptions(ki_per_s=150.0)
     assert pickle.loads(pickle.dumps(options)) == options
+
+
+def test_an_option_of_a_type_that_no_file_can_hold_is_refused_with_its_line() -> None:
+    text = """import io
+from rtloop.laws.options import ControllerOptions
+class MineOptions(ControllerOptions):
+    stream: io.StringIO
+"""
+    with pytest.raises(ValueError, match=r"mine\.py, line 3: .*StringIO"):
+        law_from_text(text, "mine.py")
 
 
 @pytest.mark.parametrize("gain", [0.0, -0.5, 1.0 + 1e-9, np.nan])

@@ -12,7 +12,7 @@ import hashlib
 import os
 import platform
 import tempfile
-from importlib.metadata import version
+from importlib.util import find_spec
 from pathlib import Path
 
 import llvmlite.binding
@@ -39,9 +39,25 @@ def source_digest() -> str:
             if path.name == OPTIONS:
                 continue
             digest.update(path.relative_to(PACKAGE).as_posix().encode() + b"\0" + path.read_bytes() + b"\0")
-    for fact in (version("numba"), version("llvmlite"), platform.python_version(), cpu_identity()):
+    for fact in (installed_version("numba"), installed_version("llvmlite"), platform.python_version(), cpu_identity()):
         digest.update(fact.encode() + b"\0")
     return digest.hexdigest()[:24]
+
+
+def installed_version(package: str) -> str:
+    """Return the version of an installed package, which is not imported, from the name of its folder of metadata.
+
+    Without that folder, or with several, the metadata are read: importing their reader takes longer than the rest of
+    the digest. Raises PackageNotFoundError for a package without metadata.
+    """
+    spec, ending = find_spec(package), ".dist-info"
+    if spec is not None and spec.origin is not None:
+        folders = [*Path(spec.origin).parents[1].glob(f"{package}-*{ending}")]
+        if len(folders) == 1:
+            return folders[0].name.removeprefix(f"{package}-").removesuffix(ending)
+    from importlib.metadata import version
+
+    return version(package)
 
 
 def cpu_identity() -> str:

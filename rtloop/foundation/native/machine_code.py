@@ -9,8 +9,6 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-import llvmlite.binding as llvm
-
 from rtloop.foundation.native import cache_files as stored
 
 _engines: list[Any] = []
@@ -30,6 +28,8 @@ def load(name: str) -> int | None:
         return None
     if machine_code is None:
         return None
+    import llvmlite.binding as llvm  # Most commands call no kernel, and need not load LLVM.
+
     engine = _create_engine("")
     engine.add_object_file(llvm.ObjectFileRef.from_data(machine_code))
     engine.finalize_object()
@@ -45,6 +45,8 @@ def assemble(text: str, name: str) -> int:
 
 def _create_engine(text: str) -> Any:
     """Return an LLVM engine that contains a text in LLVM's assembly language, and keep it alive."""
+    import llvmlite.binding as llvm
+
     machine = _target_machine()  # first: the text is parsed for this processor
     engine = llvm.create_mcjit_compiler(llvm.parse_assembly(text), machine)
     _engines.append(engine)
@@ -61,6 +63,8 @@ def _path(name: str) -> Path:
 @cache
 def _target_machine() -> Any:
     """Return LLVM's machine for this processor, created by the first call."""
+    import llvmlite.binding as llvm
+
     llvm.initialize_native_target()
     llvm.initialize_native_asmprinter()
     return llvm.Target.from_default_triple().create_target_machine(jit=True)

@@ -11,7 +11,6 @@ from __future__ import annotations
 import operator
 import re
 from collections.abc import Sequence
-from difflib import get_close_matches
 from typing import NamedTuple
 
 import numpy as np
@@ -71,6 +70,8 @@ def signal_problem(text: str, columns: Sequence[str]) -> str | None:
     comparison = parse_comparison(text)
     if comparison is None or comparison.signal in columns:
         return None
+    from difflib import get_close_matches
+
     suggestions = get_close_matches(comparison.signal, columns, n=1)
     hint = f"; did you mean {suggestions[0]}?" if suggestions else ""
     return f"{text!r}: no signal {comparison.signal!r}{hint}; there are {', '.join(columns)}"

@@ -54,7 +54,7 @@ Name = Annotated[str, Field(max_length=100)]
 class Body(BaseModel):
     """Base class of request bodies: unknown fields, conversions and NaN are refused."""
 
-    model_config = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
+    model_config = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False, defer_build=True)
     can_stop: ClassVar[bool] = False
     """Whether `is_stop` can be true."""
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from rtloop.analysis.closed_loop import realise_transfer
 from rtloop.design.synthesis.hinf.augment import GeneralisedPlant, Matrices
-from rtloop.foundation.arrays import Real
+from rtloop.foundation.arrays import Real, rising_grid
 from rtloop.linear.transfer import Transfer
 
 
@@ -74,5 +74,5 @@ def _crossings(system: Matrices, gamma: float) -> Real:
     hamiltonian = np.block([[a, np.zeros((n, n))], [-c.T @ c, -a.T]]) + np.vstack([b, -c.T @ d]) @ inner
     values = np.linalg.eigvals(hamiltonian)
     upper = np.abs(values.real) < 1e-8 * np.abs(values)
-    frequencies = np.unique(np.abs(values[upper].imag))
+    frequencies = rising_grid([np.abs(values[upper].imag)])
     return np.concatenate([[0.0], frequencies]) if frequencies.size % 2 else frequencies

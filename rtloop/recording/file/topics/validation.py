@@ -55,7 +55,7 @@ class MalformedText(ValueError):
 class _CheckedModel(BaseModel):
     """Model that ignores unknown keys: a later version may have more."""
 
-    model_config = ConfigDict(strict=True, extra="allow", allow_inf_nan=False)
+    model_config = ConfigDict(strict=True, extra="allow", allow_inf_nan=False, defer_build=True)
 
 
 class _HostModel(_CheckedModel):
