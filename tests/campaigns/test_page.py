@@ -6,6 +6,7 @@ import base64
 import dataclasses
 import math
 import re
+import shutil
 import sys
 from html.parser import HTMLParser
 from pathlib import Path
@@ -35,7 +36,7 @@ amplitude_um = 5.0
 frequency_hz = 50.0
 periods = 2.0
 """
-RIGS = 12
+RIGS, FEW_RIGS = 12, 4
 ONE_KEY = '"driver.plant.hysteresis.truth" = { choice = ["nominal", "residual"] }'
 
 
@@ -127,6 +128,26 @@ def page(campaign, tmp_path_factory):
     return make_page(campaign[1], tmp_path_factory.mktemp("pages") / "of a campaign" / "page.html")
 
 
+@pytest.fixture(scope="module")
+def paper(tmp_path_factory):
+    """Results of a campaign of the paper's controller."""
+    folder = tmp_path_factory.mktemp("paper")
+    return store(make_runner(folder), folder / "results")
+
+
+@pytest.fixture(scope="module")
+def robust(tmp_path_factory):
+    """Results of a campaign in which no rig fails."""
+    folder = tmp_path_factory.mktemp("robust")
+    return store(make_runner(folder, configuration=ROOT / "deploy/robust.toml"), folder / "results")
+
+
+@pytest.fixture
+def coarse_pictures(monkeypatch):
+    """Pictures of few points, for a test that looks at other things than the pictures of all points of `page`."""
+    monkeypatch.setattr("rtloop.design.palette.DPI", 20)
+
+
 def rows(folder) -> list[dict]:
     return pyarrow.parquet.read_table(folder / "results").to_pylist()
 
@@ -176,9 +197,9 @@ def test_causes_and_worst_rigs_are_listed_with_pictures_of_their_recordings(camp
     assert f"rig {worst}: reference and true position" in page.attributes("img", "alt")
 
 
-def test_a_damaged_recording_is_named_on_the_page(campaign, tmp_path):
-    runner, _, worst = campaign
-    copy = store(runner, tmp_path / "copy")
+def test_a_damaged_recording_is_named_on_the_page(coarse_pictures, campaign, tmp_path):
+    _, results, worst = campaign
+    copy = shutil.copytree(results, tmp_path / "copy", ignore=shutil.ignore_patterns("worst"))
     (copy / "worst").mkdir()
     (copy / "worst" / f"rig-{worst:09d}-scan.mcap").write_bytes(b"<i>nothing</i>")
     page = make_page(copy, tmp_path / "page.html")
@@ -186,16 +207,15 @@ def test_a_damaged_recording_is_named_on_the_page(campaign, tmp_path):
     assert re.search(rf"rig-{worst:09d}-scan\.mcap: .* Recordings: rig-{worst:09d}-scan\.mcap", page.text)
 
 
-def test_a_campaign_without_failures_has_a_page(tmp_path):
-    runner = make_runner(tmp_path, configuration=ROOT / "deploy/robust.toml")
-    page = make_page(store(runner, tmp_path / "results"), tmp_path / "page.html")
+def test_a_campaign_without_failures_has_a_page(coarse_pictures, robust, tmp_path):
+    page = make_page(robust, tmp_path / "page.html")
     require_whole(page)
     assert f"{RIGS} of {RIGS} rigs pass: yield 100 %" in page.text
     assert "as all rigs pass" in page.text
     assert "Causes of failure" not in page.text
 
 
-def test_a_campaign_without_limits_has_a_page(tmp_path):
+def test_a_campaign_without_limits_has_a_page(coarse_pictures, tmp_path):
     runner = make_runner(tmp_path, experiments=SCAN, without_limits=True, uncertain=ONE_KEY)
     page = make_page(store(runner, tmp_path / "results"), tmp_path / "page.html")
     require_whole(page)
@@ -204,19 +224,19 @@ def test_a_campaign_without_limits_has_a_page(tmp_path):
     assert len(page.pictures) == 1
 
 
-def test_crashed_and_refused_rigs_are_listed_with_their_reasons(tmp_path):
-    runner = make_runner(tmp_path)
-    cases = [runner.run(rig) for rig in range(1, RIGS - 1)]
+def test_crashed_and_refused_rigs_are_listed_with_their_reasons(coarse_pictures, tmp_path):
+    runner = make_runner(tmp_path, keys=f"rigs = {FEW_RIGS}")
+    cases = [runner.run(rig) for rig in range(1, FEW_RIGS)]
     fields = {"figures": {}, "trips": {}, "missed": (), "ratio": math.nan}
-    cases.append(dataclasses.replace(runner.run(RIGS - 1), **fields, refusal="<u>no rig</u>"))
-    cases.append(crashed_case(RIGS, runner.sample_values(RIGS)))
+    cases[-1] = dataclasses.replace(cases[-1], **fields, refusal="<u>no rig</u>")
+    cases.append(crashed_case(FEW_RIGS, runner.sample_values(FEW_RIGS)))
     page = make_page(store(runner, tmp_path / "results", cases), tmp_path / "page.html")
     require_whole(page)
-    assert f"{RIGS - 1} <u>no rig</u>" in page.text
+    assert f"{FEW_RIGS - 1} <u>no rig</u>" in page.text
     assert "<u>" not in page.source
-    assert f"{RIGS} its worker process died" in page.text
+    assert f"{FEW_RIGS} its worker process died" in page.text
     assert "1 crashed, which counts as failed, and 1 could not run, which does not count." in page.text
-    assert f"of {RIGS - 1} rigs pass" in page.text
+    assert f"of {FEW_RIGS - 1} rigs pass" in page.text
 
 
 def test_a_campaign_whose_rigs_cannot_run_has_a_page(tmp_path):
@@ -228,7 +248,7 @@ def test_a_campaign_whose_rigs_cannot_run_has_a_page(tmp_path):
     assert "No rig could run, so that there is no yield." in page.text
 
 
-def test_saltellis_design_shows_indices_and_counts_its_independent_rows(tmp_path):
+def test_saltellis_design_shows_indices_and_counts_its_independent_rows(coarse_pictures, tmp_path):
     runner = make_runner(tmp_path, keys='rigs = 20\nsampling = "saltelli"', configuration=ROOT / "deploy/robust.toml")
     page = make_page(store(runner, tmp_path / "results"), tmp_path / "page.html")
     require_whole(page)
@@ -238,9 +258,7 @@ def test_saltellis_design_shows_indices_and_counts_its_independent_rows(tmp_path
     assert "sensitivity indices by key" in page.attributes("img", "alt")
 
 
-def test_two_campaigns_are_compared_on_one_page(tmp_path):
-    paper = store(make_runner(tmp_path), tmp_path / "paper")
-    robust = store(make_runner(tmp_path, configuration=ROOT / "deploy/robust.toml"), tmp_path / "robust")
+def test_two_campaigns_are_compared_on_one_page(coarse_pictures, paper, robust, tmp_path):
     path = tmp_path / "comparison.html"
     assert run("campaign", "compare", paper, robust, "--page", path).exit_code == 0
     page = Page(path)
@@ -325,12 +343,38 @@ def test_total_indices_rank_keys_where_they_exist(campaign):
     assert rank_keys(["a", "b"], columns, summary).keys == ["b", "a"]
 
 
+VALUES = [
+    [],
+    [0.0, 0.0],
+    [1.0],
+    [1.0, 1.0 + 1e-16],
+    [math.inf, math.nan],
+    [1e-9, 1e9],
+    [0.0, 3.0, math.inf],
+    [5.0, 5.0],
+]
+LIMITS = [0.0, 5.0, 1e9, math.inf]
+
+
 @pytest.mark.parametrize(
-    "values",
-    [[], [0.0, 0.0], [1.0], [1.0, 1.0 + 1e-16], [math.inf, math.nan], [1e-9, 1e9], [0.0, 3.0, math.inf], [5.0, 5.0]],
+    ("values", "limit"),
+    [(values, LIMITS[i % len(LIMITS)]) for i, values in enumerate(VALUES)]
+    + [(values, limit) for values in ([1e-9, 1e9], [5.0, 5.0]) for limit in LIMITS[2:]],
 )
-@pytest.mark.parametrize("limit", [0.0, 5.0, 1e9, math.inf])
+def test_a_figure_has_a_picture(values, limit):
+    require_pictures(values, limit)
+
+
+@pytest.mark.soak
+@pytest.mark.parametrize("values", VALUES)
+@pytest.mark.parametrize("limit", LIMITS)
 def test_every_figure_has_a_picture(values, limit):
+    """Every kind of values beside every kind of limit: a picture takes a quarter of a second."""
+    require_pictures(values, limit)
+
+
+def require_pictures(values, limit):
+    """Require a histogram in both themes, and a picture of pairs."""
     figure = FigureValues("a $x$ <b>", np.array(values), limit, math.inf)
     pictures = draw_histogram(figure)
     assert pictures["light"] != pictures["dark"]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import os
 import signal
 import socket
@@ -18,6 +19,9 @@ from tests.faults.configuration import ROOT
 from tests.faults.evidence import wait_for
 
 HOST, TIMEOUT_S = "127.0.0.1", 120.0
+SEARCHES = 240
+"""How often a client asks for a channel within the time-out. caproto asks twice, and a lost datagram costs a minute."""
+client.search = functools.partial(client.search, max_retries=SEARCHES)
 UM_PER_V = 4.3
 """Of the simulated actuator, which has no hysteresis."""
 CONFIGURATION = f"""
