@@ -12,9 +12,9 @@ PREFILTER = "[axis.prefilter]\ntaps = [0.5, 0.3, 0.2]\n"
 TICKS = 25_000
 
 
-def bench(seed: int = 1) -> LoopBench:
+def bench(seed: int = 1, rate_hz: float = 10_000) -> LoopBench:
     """Return a loop on the paper's noisy rig."""
-    return LoopBench(text(AXIS, CONTROLLER, MATCHED, PREFILTER, SINE, seed=seed))
+    return LoopBench(text(AXIS, CONTROLLER, MATCHED, PREFILTER, SINE, seed=seed, rate_hz=rate_hz))
 
 
 def test_the_same_seed_gives_the_same_bytes():
@@ -31,10 +31,10 @@ def test_pieces_give_the_same_bytes_as_a_whole():
 
 
 def test_a_snapshot_a_second_each_at_the_state_before_its_tick():
-    loop = bench()
-    rows = loop.run(TICKS)
+    loop = bench(rate_hz=4000)
+    rows = loop.run(10_000)
     snapshots = loop.drain("snapshots")
-    assert [loop.plan.layout.split_snapshot(snapshot, 1)[0] for snapshot in snapshots] == [0, 10_000, 20_000]
+    assert [loop.plan.layout.split_snapshot(snapshot, 1)[0] for snapshot in snapshots] == [0, 4000, 8000]
     for snapshot in snapshots:
         tick, coefficients, axes, state = loop.plan.layout.split_snapshot(snapshot, 1)
         law = LawBench(coefficients)

@@ -16,8 +16,6 @@ from rtloop.cli import main
 from rtloop.drivers.registry import BUILT_IN as DRIVERS
 from rtloop.laws.registry import BUILT_IN as LAWS
 
-jsonschema = pytest.importorskip("jsonschema", reason="jsonschema is not installed")
-
 DEPLOY = Path(__file__).resolve().parents[2] / "deploy"
 RAW = {path.relative_to(DEPLOY): tomllib.loads(path.read_text()) for path in sorted(DEPLOY.glob("**/*.toml"))}
 CONFIGURATIONS = {str(path): raw for path, raw in RAW.items() if "loop" in raw}
@@ -25,6 +23,8 @@ CONFIGURATIONS = {str(path): raw for path, raw in RAW.items() if "loop" in raw}
 
 @pytest.fixture(scope="module")
 def validator() -> Any:
+    # a second and a half of import, which every process of `make test` that collects this file would take
+    jsonschema = pytest.importorskip("jsonschema", reason="jsonschema is not installed")
     result = CliRunner().invoke(main, ["schema"])
     assert result.exit_code == 0
     kind = jsonschema.Draft202012Validator

@@ -14,7 +14,7 @@ from tests.syscalls.mutants import MUTANTS, Mutant
 from tests.syscalls.sampling import SEED, plan, sample
 from tests.syscalls.traced import unavailable
 
-SAMPLE = 100
+SAMPLE = 60
 MISSED = 10
 """One try in so many may miss its call: in which order threads run depends on time."""
 SAMPLED = [component for component in COMPONENTS.values() if component.share]
