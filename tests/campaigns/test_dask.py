@@ -9,6 +9,7 @@ import subprocess
 import sys
 import time
 from functools import partial
+from importlib.util import find_spec
 
 import pytest
 
@@ -16,7 +17,7 @@ from tests.campaigns.bad_recordings import dask_cluster
 from tests.campaigns.campaign_files import result_files, rtloop, write_campaign
 from tests.campaigns.test_workers import KILLING_RIG, killing
 
-pytest.importorskip("distributed")
+pytestmark = pytest.mark.skipif(find_spec("distributed") is None, reason="distributed is not installed")
 
 
 @pytest.fixture(scope="module")
@@ -122,19 +123,33 @@ def test_a_worker_without_the_package_is_named(campaign, tmp_path, monkeypatch):
     assert "Traceback" not in errors
 
 
-@pytest.mark.parametrize(
-    ("address", "named"),
-    [
-        ("tcp://127.0.0.1:1", "scheduler tcp://127.0.0.1:1: Connection refused; start it"),
-        ("nonsense://x", "scheduler: nonsense://x; allowed: tcp://HOST:PORT"),
-        ("tcp://127.0.0.1:99999", "scheduler tcp://127.0.0.1:99999: "),
-        ("tcp://no-such-host:8786", "scheduler tcp://no-such-host:8786: "),
-    ],
-)
-def test_a_scheduler_that_cannot_be_reached_is_named(campaign, tmp_path, address, named):
-    process = rtloop("campaign", "run", campaign, "--scheduler", address, folder=tmp_path)
-    _, errors = process.communicate(timeout=60)
-    assert (process.returncode, named in errors, "Traceback" in errors) == (69, True, False), errors
+OUT_OF_REACH = {
+    "tcp://127.0.0.1:1": "scheduler tcp://127.0.0.1:1: Connection refused; start it",
+    "nonsense://x": "scheduler: nonsense://x; allowed: tcp://HOST:PORT",
+    "tcp://127.0.0.1:99999": "scheduler tcp://127.0.0.1:99999: ",
+    "tcp://no-such-host:8786": "scheduler tcp://no-such-host:8786: ",
+}
+EACH = """
+import sys
+from rtloop.cli import main
+campaign, *addresses = sys.argv[1:]
+for address in addresses:
+    print("=", address, file=sys.stderr)
+    try:
+        main(["campaign", "run", campaign, "--scheduler", address])
+    except SystemExit as end:
+        print("exit", end.code, file=sys.stderr)
+"""
+"""Asks each scheduler from one process, which imports Dask once."""
+
+
+def test_a_scheduler_that_cannot_be_reached_is_named(campaign, tmp_path):
+    command = [sys.executable, "-c", EACH, str(campaign), *OUT_OF_REACH]
+    asked = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=200, check=True)
+    told = {text.split()[0]: text for text in asked.stderr.split("= ")[1:]}
+    assert told.keys() == OUT_OF_REACH.keys()
+    for address, text in told.items():
+        assert (OUT_OF_REACH[address] in text, "exit 69" in text, "Traceback" in text) == (True, True, False), text
 
 
 @pytest.mark.soak

@@ -15,6 +15,7 @@ import pytest
 from rtloop import campaign as rtloop_campaign
 from rtloop.campaigns.campaign_file import load_campaign
 from rtloop.campaigns.unit import OtherVersion, WorkerFacts, run_unit
+from tests.asked import run
 from tests.campaigns.campaign_files import result_files, rtloop, write_campaign
 from tests.users import ROOT_ONLY
 
@@ -192,10 +193,10 @@ def test_a_full_disk_loses_no_result_and_the_same_command_continues(campaign, ex
         (["campaign", "rerun", "stage.toml", "61"], 2, "RIG: 61; allowed: 0 … 60"),
     ],
 )
-def test_a_mistake_of_the_command_line_is_named(campaign, arguments, code, named):
-    process = rtloop(*arguments, folder=campaign.parent)
-    _, errors = process.communicate(timeout=60)
-    assert (process.returncode, named in errors, "Traceback" in errors) == (code, True, False), errors
+def test_a_mistake_of_the_command_line_is_named(campaign, arguments, code, named, monkeypatch):
+    monkeypatch.chdir(campaign.parent)
+    ran = run(*arguments)
+    assert (ran.exit_code, named in ran.stderr) == (code, True), ran.output
 
 
 def test_a_campaign_from_python_returns_the_rows_of_its_files(campaign, expected, tmp_path, monkeypatch):

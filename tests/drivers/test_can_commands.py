@@ -14,6 +14,7 @@ import rtloop as project
 from rtloop.configuration.file import load
 from rtloop.configuration.prepare import prepare
 from rtloop.errors import ConfigError
+from tests.asked import answer, run
 from tests.drivers.can_bench import configuration, free_port
 from tests.drivers.processes import completed, rtloop
 
@@ -57,8 +58,7 @@ def test_a_run_over_the_bus_loses_nothing_and_replays(config, first):
         assert recording[name][-1] == 0, name
     assert 0 < recording["sample_age_us"].min() < recording["sample_age_us"].max() < math.inf
     assert recording["x_drive_v"][-1] > 1.0
-    code, out, err = run_command("replay", summary["recording"], "--json")
-    assert (code, json.loads(out)["identical"]) == (0, True), err
+    assert answer("replay", summary["recording"])["identical"] is True
 
 
 BAD = {
@@ -84,8 +84,8 @@ def test_a_bad_configuration_is_refused(config, fault):
 
 
 def test_a_rate_above_the_bus_is_refused_by_the_command(tmp_path):
-    code, _, err = run_command("check", configuration(tmp_path, free_port(), rate_hz=4800.0))
-    assert (code, "4800 Hz; allowed with driver 'can': at most 4761.9 Hz" in err) == (78, True)
+    ran = run("check", configuration(tmp_path, free_port(), rate_hz=4800.0))
+    assert (ran.exit_code, "4800 Hz; allowed with driver 'can': at most 4761.9 Hz" in ran.stderr) == (78, True)
 
 
 @pytest.mark.parametrize(

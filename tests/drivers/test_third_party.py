@@ -13,6 +13,7 @@ import rtloop
 from rtloop.drivers.base import Driver, Wiring
 from rtloop.drivers.contract import DriverContract
 from rtloop.drivers.registry import driver_class
+from rtloop.recording.replay.replay import replay
 from tests.drivers.installing import install
 from tests.drivers.processes import completed
 from tests.one_axis import one_axis
@@ -70,6 +71,5 @@ def test_it_closes_the_loop_and_replays(installed, tmp_path, rate_hz):
     recording = rtloop.load(summary["recording"])
     ends = recording["x_true_position_um"].reshape(4, -1)[:, -50:].mean(axis=1)
     assert np.allclose(ends, [10.0, -10.0, 10.0, -10.0], atol=0.1)
-    verdict = json.loads(run(installed, "replay", summary["recording"], "--json"))
-    assert verdict["identical"] is True
-    assert verdict["ticks"] == 2 * rate_hz
+    verdict = replay(recording)
+    assert (verdict.identical, verdict.ticks) == (True, 2 * rate_hz)

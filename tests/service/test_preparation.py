@@ -65,22 +65,14 @@ def test_the_tare_survives_the_loop(tmp_path):
     assert abs(offsets_v[1][0] - offsets_v[0][-1]) < 1e-12
 
 
-def test_a_setpoint_while_the_actuator_is_depolarised_moves_nothing(tmp_path):
-    """4 µm would be 4 V in mode raw; the sine has 1 V."""
-    sine = "[service]\ndepolarise = { amplitude_v = 1.0, cycles = 100 }\n[recording]"
+def test_while_the_actuator_is_depolarised_setpoints_move_nothing_and_no_start_undoes_a_stop(tmp_path):
+    """4 µm would be 4 V in mode raw; the sine has 2 V."""
+    sine = "[service]\ndepolarise = { amplitude_v = 2.0, cycles = 1000 }\n[recording]"
     with Bench(tmp_path, ("[recording]", sine)) as bench:
         wait_for(lambda: bench.seen().largest_v > 0.5, "the sine")
         for resource, body in (("/setpoint", {"value": 4.0}), ("/waveform", {"samples": [4.0, 4.0]})):
             with pytest.raises(RtloopError, match="the actuator is depolarised; send the request again"):
                 bench.client.post(resource, {"axis": "x"} | body)
-        assert bench.seen().largest_v < 1.1
-        assert bench.stop() == 0, bench.log()
-
-
-def test_a_stop_while_the_actuator_is_depolarised_is_not_undone_by_the_start(tmp_path):
-    sine = "[service]\ndepolarise = { amplitude_v = 2.0, cycles = 1000 }\n[recording]"
-    with Bench(tmp_path, ("[recording]", sine)) as bench:
-        wait_for(lambda: bench.seen().largest_v > 0.5, "the sine")
         with pytest.raises(RtloopError, match="mode closed_loop: the actuator is depolarised or tared; send"):
             bench.client.post("/start")
         bench.client.post("/stop")
@@ -88,6 +80,7 @@ def test_a_stop_while_the_actuator_is_depolarised_is_not_undone_by_the_start(tmp
         ticks = bench.ticks
         wait_for(lambda: bench.ticks > ticks + 1000, "ticks")
         assert (bench.status()["mode"], bench.seen().last_v) == ("off", 0.0)
+        assert bench.seen().largest_v < 2.1
         bench.client.post("/start")
         bench.await_drive()
         assert bench.stop() == 0, bench.log()
