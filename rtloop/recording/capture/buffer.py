@@ -30,9 +30,10 @@ class TickSpans:
         """Take rows (n, columns) of ticks, or, if not None, intervals (n, columns, 3: minimum, maximum, mean)."""
         if intervals is None:
             self._first = self._last = rows[:, : DEADLINE + 1]
+            self.tick_count = len(rows)
         else:
             self._first, self._last = intervals[:, : DEADLINE + 1, MINIMUM], intervals[:, : DEADLINE + 1, MAXIMUM]
-        self.tick_count = int((self._last[:, TICK] - self._first[:, TICK] + 1).sum())
+            self.tick_count = int((self._last[:, TICK] - self._first[:, TICK] + 1).sum())
 
     @property
     def end(self) -> int:
@@ -41,6 +42,8 @@ class TickSpans:
 
     def gaps(self, expected: int) -> list[tuple[int, int]]:
         """Return the missing ranges (first tick, count) from tick `expected` on, before and between the ticks."""
+        if self.tick_count and self.end - expected == self.tick_count:  # The usual case: the ticks ascend.
+            return []
         return missing_ranges(self._first[:, TICK], expected, self._last[:, TICK])
 
     def tick_time(self, tick: int, rate_hz: float) -> TickTime:

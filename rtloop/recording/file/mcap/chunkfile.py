@@ -10,7 +10,6 @@ from __future__ import annotations
 import contextlib
 import errno
 import os
-import zlib
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -20,6 +19,7 @@ import zstandard
 from mcap.records import Channel, ChunkIndex, Header, McapRecord, Schema, Statistics
 
 from rtloop.errors import OutputError
+from rtloop.foundation.native.crc32 import crc32
 from rtloop.foundation.trusted import UntrustedPath, close_descriptor, replace_file
 from rtloop.recording.file.mcap.container import (
     CHUNK_HEAD,
@@ -250,7 +250,7 @@ class ChunkFile:
                 os.ftruncate(self._fd, self.size)
             raise self._output_error(error) from None
         self.size += len(data)
-        self._crc = zlib.crc32(data, self._crc)
+        self._crc = crc32(data, self._crc)
 
     def _statistics(self) -> Statistics:
         """Statistics record over the written chunks, one or more."""

@@ -9,7 +9,6 @@ from __future__ import annotations
 import io
 import struct
 import threading
-import zlib
 from collections.abc import Iterable, Iterator, Sequence
 from typing import NamedTuple
 
@@ -25,6 +24,8 @@ from mcap.records import (
     Statistics,
     SummaryOffset,
 )
+
+from rtloop.foundation.native.crc32 import crc32
 
 MAGIC = b"\x89MCAP0\r\n"
 PREFIX = struct.Struct("<BQ")
@@ -84,7 +85,7 @@ def pack_chunk(records: bytes | memoryview, start: int, end: int, compressor: zs
     """Pack a chunk record with the packed `records`; `start` and `end` are their first and last log time in ns."""
     data = compressor.compress(records)
     length = CHUNK_HEAD.size - PREFIX.size + len(data)
-    crc = zlib.crc32(records)
+    crc = crc32(records)
     return CHUNK_HEAD.pack(Opcode.CHUNK, length, start, end, len(records), crc, 4, b"zstd", len(data)) + data
 
 
@@ -120,7 +121,7 @@ def unpack_chunk(record: bytes) -> bytes:
         content = _decompressors.of_thread.decompress(data)
     except zstandard.ZstdError:
         raise DamagedChunk("cannot be decompressed") from None
-    if zlib.crc32(content) != head.crc:
+    if crc32(content) != head.crc:
         raise DamagedChunk("the checksum differs")
     return content
 
@@ -158,7 +159,7 @@ def pack_end(
     offsets_start = start + len(summary)
     summary += pack_records(offsets)
     head = FOOTER_HEAD.pack(Opcode.FOOTER, 20, start, offsets_start)
-    footer = Footer(start, offsets_start, zlib.crc32(head, zlib.crc32(summary)))
+    footer = Footer(start, offsets_start, crc32(head, crc32(summary)))
     return pack_records([DataEnd(data_crc)]) + summary + pack_records([footer]) + MAGIC
 
 
@@ -174,7 +175,7 @@ def parse_summary(data: bytes) -> list[ChunkIndex]:
     Raises DamagedChunk if the checksum differs or an index record cannot be read.
     """
     (crc,) = struct.unpack_from("<I", data, len(data) - 4)
-    if zlib.crc32(data[:-4]) != crc:
+    if crc32(data[:-4]) != crc:
         raise DamagedChunk("the checksum of the summary differs")
     try:
         return [
