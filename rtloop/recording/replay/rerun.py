@@ -23,7 +23,7 @@ from rtloop.recording.file.topics.validation import header_extra_channels, heade
 from rtloop.recording.replay.kernels import fill_tape
 from rtloop.signals import Mode
 
-SLICE_TICKS = 2048
+SLICE_TICKS = 4096
 SMALLEST_RING_HZ = 1.0
 """Rate that makes the smallest ring: it holds a slice and fits the processor's cache."""
 UNLIMITED_SLACK = NEVER = 1 << 62

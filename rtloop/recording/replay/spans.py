@@ -75,7 +75,9 @@ def _replay_in_spans(
         return None
     totals = [extent.totals for extent in recording.extents if extent.totals]
     ticks_logged, ticks_executed = sum(total["ticks_logged"] for total in totals), totals[-1]["ticks_executed"]
-    spans = _find_spans(recording, jobs, ticks_executed)
+    with closing(recording.snapshots()) as recorded:
+        snapshot_ticks = [snapshot.tick for snapshot in recorded]
+    spans = _find_spans(recording, jobs, [tick for tick in snapshot_ticks if tick < ticks_executed])
     if len(spans) < 2:
         return None
     counts = _run_spans(recording, laws, spans, progress)
@@ -84,8 +86,6 @@ def _replay_in_spans(
     done = [count for count in counts if count is not None]
     ends = [span.last_tick for span in spans[:-1]] + [ticks_executed]
     ticks, snapshots = sum(count.ticks for count in done), sum(count.snapshots for count in done)
-    with closing(recording.snapshots()) as recorded:
-        snapshot_ticks = [snapshot.tick for snapshot in recorded]
     # the first span starts from the first snapshot; one that follows the last tick is not compared
     compared = sum(tick < ticks_executed for tick in snapshot_ticks) - 1
     if [count.end_tick for count in done] != ends or ticks != ticks_logged or snapshots != compared:
@@ -113,14 +113,12 @@ def _is_plain(recording: Recording) -> bool:
     )
 
 
-def _find_spans(recording: Recording, jobs: int, end_tick: int) -> list[Span]:
+def _find_spans(recording: Recording, jobs: int, snapshot_ticks: Sequence[int]) -> list[Span]:
     """Return up to `jobs` spans of about equally many chunks, at least LEAST_CHUNKS each.
 
-    [] for fewer chunks, a damaged chunk, or a first tick without a snapshot. `end_tick` follows the last tick; a
-    snapshot may be stored there.
+    [] for fewer chunks, a damaged chunk, or a first tick without a snapshot. `snapshot_ticks` are the ticks of the
+    snapshots, in order, without a snapshot that follows the last tick.
     """
-    with closing(recording.snapshots()) as snapshots:
-        snapshot_ticks = [snapshot.tick for snapshot in snapshots if snapshot.tick < end_tick]
     starts: list[tuple[int, int]] = []
     with open_run(recording.paths) as readers:
         chunks = [(reader, entry) for reader in readers for entry in reader.tick_chunks]
@@ -211,7 +209,9 @@ def _replay_span(
 def _within(snapshots: Iterator[Snapshot], span: Span) -> Iterator[Snapshot]:
     """Yield the snapshots of a span, both ends included."""
     for snapshot in snapshots:
-        if snapshot.tick >= span.first_tick and (span.last_tick is None or snapshot.tick <= span.last_tick):
+        if span.last_tick is not None and snapshot.tick > span.last_tick:
+            return
+        if snapshot.tick >= span.first_tick:
             yield snapshot
 
 
