@@ -203,28 +203,28 @@ class FaultOptions(Options):
 class PlantOptions(Options):
     """Options of one axis of the rig; the defaults are the paper's plant."""
 
-    hysteresis: HysteresisOptions = HysteresisOptions()
+    hysteresis: HysteresisOptions = HysteresisOptions.of_absent_table()
     """Hysteresis from drive to displacement, the first stage of the actuator."""
-    creep: CreepOptions = CreepOptions()
+    creep: CreepOptions = CreepOptions.of_absent_table()
     """Slow growth of the displacement after a change; by default none."""
-    disturbance: DisturbanceOptions = DisturbanceOptions()
+    disturbance: DisturbanceOptions = DisturbanceOptions.of_absent_table()
     """Displacement that is added before the dynamics; by default none."""
-    dynamics: DynamicsOptions = DynamicsOptions()
+    dynamics: DynamicsOptions = DynamicsOptions.of_absent_table()
     """Vibration of the displacement, with the resonance."""
-    sensor: SensorOptions = SensorOptions()
+    sensor: SensorOptions = SensorOptions.of_absent_table()
     """Sensor of the position, which the controller reads."""
-    adc: ConverterOptions = ConverterOptions()
+    adc: ConverterOptions = ConverterOptions.of_absent_table()
     """Converter from the sensor's voltage to the reading."""
-    dac: ConverterOptions = ConverterOptions()
+    dac: ConverterOptions = ConverterOptions.of_absent_table()
     """Converter from the drive to the voltage at the actuator."""
-    fault: FaultOptions = FaultOptions()
+    fault: FaultOptions = FaultOptions.of_absent_table()
     """Fault that begins during the run; by default none."""
 
 
 class RigOptions(Options):
     """Options of the rig: `plants.AXIS` for the axes that have it, `plant` for the others."""
 
-    plant: PlantOptions = PlantOptions()
+    plant: PlantOptions = PlantOptions.of_absent_table()
     """Plant of every axis that `plants` does not name."""
     plants: dict[str, PlantOptions] = Field(default_factory=dict)
     """Plants of single axes by their names; a key that is absent there has its own default, not the value in

@@ -14,7 +14,11 @@ from pathlib import Path
 
 import pytest
 
+from rtloop.configuration.axis import AxisOptions
+from rtloop.configuration.file import FileOptions
 from rtloop.foundation.native import cache
+from rtloop.foundation.options import Options
+from rtloop.hil.options import PlantOptions, RigOptions
 
 ROOT = Path(__file__).parents[1]
 HEAVY = ("scipy.signal", "scipy.stats", "scipy.optimize", "scipy.interpolate", "numba", "matplotlib", "pyarrow")
@@ -76,6 +80,32 @@ def test_pydantic_loads_no_plug_ins_under_the_command_line():
     program = "import rtloop.cli; from pydantic.plugin import _loader; print(*_loader.get_plugins(), _loader._plugins)"
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "None"
+
+
+def test_an_import_builds_no_validator_of_options():
+    """A default of a nested model built one for it, beside that of the whole file."""
+    program = """
+import rtloop.service.daemon
+from rtloop.foundation.options import Options
+models = [Options]
+while models:
+    model = models.pop()
+    models += model.__subclasses__()
+    if model.__pydantic_complete__:
+        print(model.__name__)
+"""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert done.stdout.split() == []
+
+
+def test_absent_tables_have_the_values_of_a_validated_empty_table():
+    for model in (AxisOptions, FileOptions, PlantOptions, RigOptions):
+        for field in model.model_fields.values():
+            if isinstance(field.default, Options):
+                empty = type(field.default)()
+                assert field.default == empty
+                assert field.default.model_fields_set == empty.model_fields_set
+                assert vars(field.default) == vars(empty)
 
 
 def test_the_command_line_computes_with_one_thread():

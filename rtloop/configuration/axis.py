@@ -160,15 +160,15 @@ class AxisOptions(Options):
     specification: str | None = None
     """File with the requirements on the loop, relative to the configuration's folder; `rtloop design verify` judges
     them."""
-    margins: MarginOptions = MarginOptions()
+    margins: MarginOptions = MarginOptions.of_absent_table()
     """Margins of the loop on its model that `rtloop check` expects."""
-    prefilter: PrefilterOptions = PrefilterOptions()
+    prefilter: PrefilterOptions = PrefilterOptions.of_absent_table()
     """Filter of the reference before the controller; by default the reference passes unchanged."""
-    limits: LimitsOptions = LimitsOptions()
+    limits: LimitsOptions = LimitsOptions.of_absent_table()
     """Limits of command and drive, and the slew rates of the drive."""
-    interlocks: InterlockOptions = InterlockOptions()
+    interlocks: InterlockOptions = InterlockOptions.of_absent_table()
     """Conditions under which the loop trips: all outputs ramp to their safe values, and the mode becomes off."""
-    reference: ReferenceOptions = HoldOptions()
+    reference: ReferenceOptions = HoldOptions.of_absent_table()
     """Reference from the first tick on, until the schedule or a client sets another one; 0 by default."""
     adapt: AdaptOptions | None = None
     """Schedule on which the taps are made anew, with consent."""

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cache, cached_property
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
@@ -110,9 +110,9 @@ class FileOptions(Options):
     """Channels that controllers set besides the drives, each by the name that laws and recordings use."""
     schedule: Annotated[tuple[ScheduleOptions, ...], Field(strict=False)] = ()
     """Changes of mode and reference at given ticks; changes at one tick take effect in the file's order."""
-    recording: RecordingOptions = RecordingOptions()
+    recording: RecordingOptions = RecordingOptions.of_absent_table()
     """Place, size and contents of the recordings; by default every tick is recorded."""
-    service: ServiceOptions = ServiceOptions()
+    service: ServiceOptions = ServiceOptions.of_absent_table()
     """Settings of `rtloop serve`: control socket, restarts, preparation of the actuator."""
 
 
@@ -188,7 +188,7 @@ def parse(text: str, name: str, folder: Path, source: str, library: Library | No
     driver = raw.pop("driver", None)
     faults: list[str] = []
     library = library or Library(folder)
-    sections = _validated(TypeAdapter(FileOptions), raw, "", faults, {"library": library})
+    sections = _validated(FileOptions, raw, "", faults, {"library": library})
     laws = () if sections is None else _laws(sections, library, faults)
     kind, options, channels = _driver(driver, faults)
     if sections is not None:
@@ -249,7 +249,7 @@ def _driver(raw: Any, faults: list[str]) -> tuple[str, Options | None, dict[str,
         return "", None, {}
     options = dict(raw)
     kind, channel_tables = options.pop("kind", None), options.pop("channels", {})
-    channels = _validated(TypeAdapter(dict[str, ChannelOptions]), channel_tables, "driver.channels", faults)
+    channels = _validated(dict[str, ChannelOptions], channel_tables, "driver.channels", faults)
     if channels is None and isinstance(channel_tables, dict):
         channels = channel_tables  # their names are known all the same
     if not isinstance(kind, str):
@@ -260,13 +260,18 @@ def _driver(raw: Any, faults: list[str]) -> tuple[str, Options | None, dict[str,
     except (ValueError, DriverError) as error:
         faults.append(f"driver.kind: {error}")
         return kind, None, channels or {}
-    return kind, _validated(TypeAdapter(model), options, "driver", faults), channels or {}
+    return kind, _validated(model, options, "driver", faults), channels or {}
 
 
-def _validated(
-    adapter: TypeAdapter[Any], raw: Any, prefix: str, faults: list[str], context: dict[str, Any] | None = None
-) -> Any:
-    """Return the value `raw` of key `prefix`, validated; None, with faults appended, where it is invalid."""
+@cache
+def type_adapter(kind: Any) -> TypeAdapter[Any]:
+    """Return pydantic's adapter of a type, which builds its validator once in a process."""
+    return TypeAdapter(kind)
+
+
+def _validated(kind: Any, raw: Any, prefix: str, faults: list[str], context: dict[str, Any] | None = None) -> Any:
+    """Return the value `raw` of key `prefix`, validated as type `kind`; None, with faults appended, if invalid."""
+    adapter = type_adapter(kind)
     try:
         return adapter.validate_python(raw, context=context)
     except ValidationError as error:

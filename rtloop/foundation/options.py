@@ -52,6 +52,14 @@ class Options(BaseModel):
                 raise ValueError(f"{number:g}; allowed: 0, and magnitudes from {SMALLEST:g} to {LARGEST:g}")
         return value
 
+    @classmethod
+    def of_absent_table(cls) -> Self:
+        """Return the options of a table that a file lacks: the defaults, without building the model's validator.
+
+        For defaults of a nested model. All options must have a default.
+        """
+        return cls.model_construct()
+
     def model_copy(self, *, update: Mapping[str, Any] | None = None, deep: bool = False) -> Self:
         """Return a copy as pydantic does, without the cached properties of the original."""
         copy = super().model_copy(update=update, deep=deep)

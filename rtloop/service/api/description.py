@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from pydantic import TypeAdapter
-
+from rtloop.configuration.file import type_adapter
 from rtloop.configuration.reference_options import ReferenceOptions
 from rtloop.recording.file.topics.events import MAX_NAME, OPERATOR, RESERVED_NAMES
 from rtloop.service.api.requests import REQUESTS, ApiRequest, Sender
@@ -39,7 +38,7 @@ NAME_PARAMETER = {
 
 def openapi(axes: Sequence[str]) -> dict[str, Any]:
     """Return the OpenAPI description, as JSON values, of the API of a service with these axes."""
-    reference = TypeAdapter(ReferenceOptions).json_schema(ref_template="#/components/schemas/{model}")
+    reference = type_adapter(ReferenceOptions).json_schema(ref_template="#/components/schemas/{model}")
     components = reference.pop("$defs")
     fields = {"axis": {"enum": list(axes)}, "section": {"enum": list(TUNABLE_SECTIONS)}, "reference": reference}
     paths: dict[str, Any] = {}

@@ -7,9 +7,9 @@ from contextlib import contextmanager
 from typing import Any, NamedTuple
 
 import numpy as np
-from pydantic import TypeAdapter, ValidationError
+from pydantic import ValidationError
 
-from rtloop.configuration.file import describe
+from rtloop.configuration.file import describe, type_adapter
 from rtloop.configuration.prepare import Prepared
 from rtloop.configuration.reference_options import ReferenceOptions
 from rtloop.configuration.references import (
@@ -72,7 +72,7 @@ class LiveReferences:
         Raises ConfigError for an unknown axis, invalid keys or values beyond the limits; Refusal, UnconfirmedCommand.
         """
         try:
-            options = TypeAdapter(ReferenceOptions).validate_python(dict(reference))
+            options = type_adapter(ReferenceOptions).validate_python(dict(reference))
         except ValidationError as error:
             raise ConfigError("reference", describe(error, "reference", reference)) from None
         values, samples = self.generator(options)

@@ -143,7 +143,7 @@ class _HeaderBase(_CheckedModel):
     realtime: _RealtimeModel
     versions: _VersionsModel
     host: _HostModel
-    extras: _ExtrasModel = _ExtrasModel()
+    extras: _ExtrasModel = _ExtrasModel.model_construct()
     sequence: Annotated[int, Field(ge=1, le=10**9)] = 1
     first_tick: Tick = 0
     repeats_before: Tick = 0
