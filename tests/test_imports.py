@@ -115,3 +115,11 @@ def test_the_command_line_computes_with_one_thread():
         given = environment if asked is None else environment | {"OPENBLAS_NUM_THREADS": asked}
         done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True, env=given)
         assert done.stdout.strip() == used
+
+
+def test_a_start_hardly_looks_for_garbage():
+    """Python by itself does so hundreds of times, and a fifth of a service's start was that."""
+    count = "print(*(generation['collections'] for generation in gc.get_stats()), file=sys.stderr)"
+    program = f"import atexit, gc, sys; atexit.register(lambda: {count}); from rtloop.cli import main; main(['schema'])"
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert sum(map(int, done.stderr.split())) < 100
