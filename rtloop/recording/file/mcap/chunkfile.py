@@ -19,8 +19,8 @@ import zstandard
 from mcap.records import Channel, ChunkIndex, Header, McapRecord, Schema, Statistics
 
 from rtloop.errors import OutputError
-from rtloop.foundation.native.crc32 import crc32
 from rtloop.foundation.trusted import UntrustedPath, close_descriptor, replace_file
+from rtloop.recording.file.mcap.checksum import crc32
 from rtloop.recording.file.mcap.container import (
     CHUNK_HEAD,
     MAGIC,

@@ -25,7 +25,7 @@ from mcap.records import (
     SummaryOffset,
 )
 
-from rtloop.foundation.native.crc32 import crc32
+from rtloop.recording.file.mcap.checksum import crc32
 
 MAGIC = b"\x89MCAP0\r\n"
 PREFIX = struct.Struct("<BQ")
