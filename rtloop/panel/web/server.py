@@ -62,8 +62,13 @@ def serve(control: Path, port: int, token_file: Path | None, print_address: Call
     if open_browser:
         webbrowser.open(address)
     server = uvicorn.Server(_server_config(application(Service(control), Sessions(token, port), viewers)))
-    for number in (signal.SIGINT, signal.SIGTERM):  # uvicorn handles them, and raises them again at its end.
-        signal.signal(number, lambda *_: None)
+
+    def end(*_: object) -> None:
+        """Let the server end, also if it has not begun."""
+        server.should_exit = True
+
+    for number in (signal.SIGINT, signal.SIGTERM):  # uvicorn handles them while it serves, and raises them again.
+        signal.signal(number, end)
     try:
         asyncio.run(server.serve(sockets=[listener]))
     finally:

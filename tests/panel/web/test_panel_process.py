@@ -89,3 +89,19 @@ def test_a_panel_beside_a_dead_service_says_so_to_who_starts_it(tmp_path: Path, 
         panel.terminate()
     assert ("the service has died" in said) == (not options)
     assert ("; the panel waits for it" in said) == (not options)
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_a_panel_that_is_stopped_before_it_serves_ends(tmp_path: Path, number: signal.Signals):
+    """The signal comes when the address is printed and the web server's own handlers are not there yet."""
+    program = f"""
+import asyncio, os, sys
+from pathlib import Path
+from rtloop.panel.web import server
+
+run = asyncio.run
+asyncio.run = lambda work: (os.kill(os.getpid(), {int(number)}), run(work))
+sys.exit(server.serve(Path("lab.sock"), 0, None, lambda _: None, False))
+"""
+    command = [sys.executable, "-c", program]
+    assert subprocess.run(command, cwd=tmp_path, timeout=60, env=os.environ | {"PYTHONPATH": str(ROOT)}).returncode == 0
