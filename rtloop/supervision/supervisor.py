@@ -24,6 +24,7 @@ from rtloop.engine.memory import ProcessState, SharedBlock, Word
 from rtloop.engine.messages import MESSAGE, Kind
 from rtloop.engine.ring import drain
 from rtloop.errors import LoopFault, RtloopError, UnavailableError
+from rtloop.foundation.native.cache import stored_file_count
 from rtloop.recording.capture.requester_names import RequesterNames
 from rtloop.recording.file.topics.events import law_label, trip_reason
 from rtloop.supervision.child import Child
@@ -43,6 +44,7 @@ WATCH_TIMEOUT_S = 2.0
 LONGEST_STEP_S = 0.01
 END_TIMEOUT_S = 30.0
 START_TIMEOUT_S = 300.0
+"""Longest time until loop and recorder are ready; it begins again with every newly compiled function."""
 ATTENDED_STALL_S = 2.0
 """Longest time without a tick in a run that a user watches: a host that stalls for half a second must not end it."""
 START_TIME_FIELD = 19
@@ -261,9 +263,9 @@ class Supervisor:
         """Wait until both processes are ready, and store the real-time settings in `realtime`.
 
         Raises RtloopError with the failure that the loop's process reports, LoopFault if a process ended without
-        report, UnavailableError after START_TIMEOUT_S.
+        report, UnavailableError after START_TIMEOUT_S in which nothing was compiled.
         """
-        deadline = time.monotonic() + START_TIMEOUT_S
+        deadline, compiled = time.monotonic() + START_TIMEOUT_S, stored_file_count()
         while True:
             self._watched_s = time.monotonic()
             self._collect_reports()
@@ -281,7 +283,9 @@ class Supervisor:
                     f"the recorder's process ended with exit code {self.recorder.exit_code} before the run began"
                 )
             if time.monotonic() > deadline:
-                raise UnavailableError(f"loop and recorder were not ready within {START_TIMEOUT_S:g} s")
+                if stored_file_count() == compiled:
+                    raise UnavailableError(f"loop and recorder were not ready within {START_TIMEOUT_S:g} s")
+                deadline, compiled = time.monotonic() + START_TIMEOUT_S, stored_file_count()
             time.sleep(START_POLL_S)
 
     def _raise_failure(self, exit_code: int) -> None:

@@ -20,7 +20,10 @@ from click.testing import CliRunner
 import rtloop
 from rtloop.cli import main
 from rtloop.engine.memory import ProcessState
+from rtloop.errors import UnavailableError
+from rtloop.foundation.native import cache
 from rtloop.recording.capture.session import Options, Session
+from rtloop.supervision import supervisor as supervisor_module
 from rtloop.supervision.supervisor import Supervisor
 from tests.recording.real_loop import PAPER, RealLoop, changed
 from tests.service.test_python_driver import DRIVER, install
@@ -137,3 +140,35 @@ def test_a_loop_that_was_stopped_before_anybody_saw_it_ready_was_ready() -> None
     supervisor.recorder = SimpleNamespace(state=ProcessState.READY, exit_code=None)
     supervisor._await_ready()
     assert supervisor.realtime == {"scheduler": "SCHED_OTHER"}
+
+
+class CompilingLoop:
+    """A loop's process that stores a compiled function at each look, `count` in all, and is then ready if `ends`."""
+
+    def __init__(self, folder: Path, count: int, ends: bool) -> None:
+        self.exit_code, self.folder, self.count, self.ends, self.stored = None, folder, count, ends, 0
+
+    def reports(self) -> list[dict[str, object]]:
+        if self.stored == self.count:
+            return [{"report": "ready", "realtime": {}}] if self.ends else []
+        (self.folder / f"{self.stored}.o").touch()
+        self.stored += 1
+        return []
+
+
+@pytest.mark.parametrize("is_quiet", [False, True])
+def test_the_limit_of_a_start_begins_again_with_each_compiled_function(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, is_quiet: bool
+) -> None:
+    """With no time at all from one look to the next, a start ends only where nothing new was compiled."""
+    monkeypatch.setattr(cache, "CACHE_FOLDER", tmp_path)
+    monkeypatch.setattr(supervisor_module, "START_TIMEOUT_S", 0.0)
+    supervisor: Any = object.__new__(Supervisor)
+    supervisor._loop, supervisor._reports = CompilingLoop(tmp_path, 20, ends=not is_quiet), {}
+    supervisor.recorder = SimpleNamespace(state=ProcessState.READY, exit_code=None)
+    if is_quiet:
+        with pytest.raises(UnavailableError, match="loop and recorder were not ready within 0 s"):
+            supervisor._await_ready()
+    else:
+        supervisor._await_ready()
+    assert supervisor._loop.stored == 20

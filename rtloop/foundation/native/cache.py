@@ -94,3 +94,11 @@ def _cache_folder() -> tuple[Path, bool]:
 CACHE_FOLDER, CACHE_IS_PERSISTENT = _cache_folder()
 with contextlib.suppress(OSError):
     os.utime(CACHE_FOLDER)  # Installing another version deletes the folders that were not used for longest.
+
+
+def stored_file_count() -> int:
+    """Return the number of files in the cache, to which each compiled function adds some; 0 if it is unreadable."""
+    try:
+        return len(os.listdir(CACHE_FOLDER))
+    except OSError:
+        return 0
