@@ -23,6 +23,8 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # what a shell starts in 
 
 PAGE = "tests/panel/page"
 """The tests in a browser."""
+LONG_FILES = ("tests/syscalls/", "tests/service/test_recovery", "tests/campaigns/test_page", "tests/panel/web/")
+"""Files that take long; they begin early, so that no process ends long after the others."""
 
 
 class OneBrowser(LoadFileScheduling):
@@ -43,8 +45,8 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: Producer) -> OneBrow
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Begin with the tests in a browser: they take longest, and one after the other."""
-    items.sort(key=lambda item: not item.nodeid.startswith(PAGE))
+    """Begin with the tests in a browser, which take longest, one after the other; then those of LONG_FILES."""
+    items.sort(key=lambda item: (not item.nodeid.startswith(PAGE), not item.nodeid.startswith(LONG_FILES)))
 
 
 @pytest.fixture
