@@ -25,6 +25,7 @@ PADE_COEFFICIENTS = tuple(
 """Coefficients of the numerator of the Padé approximant of eˣ, lowest power first."""
 LARGEST_SCALED_NORM = 4.25
 """Norm up to which the approximant is exact to rounding (θ₁₃ of Al-Mohy & Higham 2009)."""
+MAX_DOUBLINGS = 64
 
 
 def matrix_exponential(matrix: Real) -> Real:
@@ -48,6 +49,22 @@ def matrix_exponential(matrix: Real) -> Real:
     for _ in range(squarings):
         exponential = exponential @ exponential
     return np.asarray(exponential, dtype=np.float64)
+
+
+def stationary_covariance(a: Real, driving: Real) -> Real:
+    """Return X (n, n) = A X Aᵀ + `driving` for a stable A and a positive semidefinite `driving`, both (n, n).
+
+    X is the sum of A^k `driving` A^kᵀ, whose number of terms is doubled until it stands still (Smith 1968). For an
+    unstable A the result is meaningless, and may be infinite.
+    """
+    covariance, power = driving, a
+    for _ in range(MAX_DOUBLINGS):
+        addition = power @ covariance @ power.T
+        covariance = covariance + addition
+        if not np.abs(addition).max(initial=0.0) > 1e-17 * np.abs(covariance).max(initial=0.0):
+            break
+        power = power @ power
+    return covariance
 
 
 def block_diagonal(matrices: list[Real]) -> Real:

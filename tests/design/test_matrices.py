@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from scipy.linalg import block_diag, expm
+from scipy.linalg import block_diag, expm, solve_discrete_lyapunov
 
 from rtloop.foundation.arrays import rising_grid
-from rtloop.linear.matrices import block_diagonal, matrix_exponential
+from rtloop.linear.matrices import block_diagonal, matrix_exponential, stationary_covariance
 
 
 @pytest.mark.parametrize("size", [1, 2, 5, 13])
@@ -27,6 +27,20 @@ def test_an_exponential_of_a_nilpotent_matrix_with_a_large_entry_is_exact():
 def test_an_exponential_of_one_number_is_that_of_the_library():
     for number in (0.0, 1e-9, -1.0, 20.0, -700.0):
         assert matrix_exponential(np.array([[number]]))[0, 0] == pytest.approx(np.exp(number), rel=1e-12)
+
+
+@pytest.mark.parametrize("radius", [0.0, 0.5, 0.999, 1 - 1e-6])
+def test_a_stationary_covariance_is_that_of_scipy(radius: float):
+    numbers = np.random.default_rng(3)
+    a = numbers.normal(size=(6, 6))
+    a *= radius / np.abs(np.linalg.eigvals(a)).max()
+    inputs = numbers.normal(size=(6, 2))
+    expected = solve_discrete_lyapunov(a, inputs @ inputs.T, method="direct")
+    assert np.allclose(stationary_covariance(a, inputs @ inputs.T), expected, rtol=1e-8, atol=1e-9 * expected.max())
+
+
+def test_a_first_order_filter_has_the_variance_of_a_geometric_series():
+    assert stationary_covariance(np.array([[0.8]]), np.array([[1.0]]))[0, 0] == pytest.approx(1 / (1 - 0.64), rel=1e-14)
 
 
 def test_blocks_stand_along_the_diagonal():

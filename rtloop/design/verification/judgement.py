@@ -13,6 +13,7 @@ from rtloop.analysis.search import zero_between
 from rtloop.analysis.step_response import step_metrics
 from rtloop.design.synthesis.specification import SensorOptions, SpecificationOptions
 from rtloop.foundation.arrays import Real
+from rtloop.linear.matrices import stationary_covariance
 
 
 class Limit(NamedTuple):
@@ -144,8 +145,6 @@ def noise_gains(loop: Loop) -> Real:
     """Return the rms of x and of v per rms of white sensor noise, (2,), from the stationary covariance of a stable
     sampled loop.
     """
-    from scipy.linalg import solve_discrete_lyapunov  # `check` judges no noise, and starts without scipy.
-
     a, b, c, d = loop.matrices
-    covariance = c @ solve_discrete_lyapunov(a, np.outer(b, b), method="bilinear") @ c.T
+    covariance = c @ stationary_covariance(a, np.outer(b, b)) @ c.T
     return np.sqrt(np.diag(covariance) + d**2)
