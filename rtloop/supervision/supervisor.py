@@ -283,9 +283,10 @@ class Supervisor:
                     f"the recorder's process ended with exit code {self.recorder.exit_code} before the run began"
                 )
             if time.monotonic() > deadline:
-                if stored_file_count() == compiled:
+                before, compiled = compiled, stored_file_count()
+                if compiled == before:
                     raise UnavailableError(f"loop and recorder were not ready within {START_TIMEOUT_S:g} s")
-                deadline, compiled = time.monotonic() + START_TIMEOUT_S, stored_file_count()
+                deadline = time.monotonic() + START_TIMEOUT_S
             time.sleep(START_POLL_S)
 
     def _raise_failure(self, exit_code: int) -> None:

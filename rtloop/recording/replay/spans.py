@@ -77,7 +77,8 @@ def _replay_in_spans(
     ticks_logged, ticks_executed = sum(total["ticks_logged"] for total in totals), totals[-1]["ticks_executed"]
     with closing(recording.snapshots()) as recorded:
         snapshot_ticks = [snapshot.tick for snapshot in recorded]
-    spans = _find_spans(recording, jobs, [tick for tick in snapshot_ticks if tick < ticks_executed])
+    inner_ticks = [tick for tick in snapshot_ticks if tick < ticks_executed]
+    spans = _find_spans(recording, jobs, inner_ticks)
     if len(spans) < 2:
         return None
     counts = _run_spans(recording, laws, spans, progress)
@@ -87,7 +88,7 @@ def _replay_in_spans(
     ends = [span.last_tick for span in spans[:-1]] + [ticks_executed]
     ticks, snapshots = sum(count.ticks for count in done), sum(count.snapshots for count in done)
     # the first span starts from the first snapshot; one that follows the last tick is not compared
-    compared = sum(tick < ticks_executed for tick in snapshot_ticks) - 1
+    compared = len(inner_ticks) - 1
     if [count.end_tick for count in done] != ends or ticks != ticks_logged or snapshots != compared:
         return None
     if snapshot_ticks[-1] > ticks_executed:
