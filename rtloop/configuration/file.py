@@ -265,7 +265,7 @@ def _driver(raw: Any, faults: list[str]) -> tuple[str, Options | None, dict[str,
 
 @cache
 def type_adapter(kind: Any) -> TypeAdapter[Any]:
-    """Return pydantic's adapter of a type, which builds its validator once in a process."""
+    """Return pydantic's adapter of a type; the same one at every call, so that its validator is built once."""
     return TypeAdapter(kind)
 
 

@@ -12,9 +12,9 @@ Real = npt.NDArray[np.float64]
 
 
 def rising_grid(parts: Sequence[Real]) -> Real:
-    """Return the numbers of all `parts` (k,) in rising order, each once.
+    """Return the numbers of all one-dimensional `parts` in rising order; equal numbers once.
 
-    `numpy.unique` does the same, and imports masked arrays for it: ten milliseconds at the start of a command.
+    `numpy.unique` does the same, but imports masked arrays: ten milliseconds at the start of a command.
     """
     values = np.sort(np.concatenate(parts))
     return values[np.append(True, values[1:] != values[:-1])[: values.size]]

@@ -56,7 +56,7 @@ class Options(BaseModel):
     def of_absent_table(cls) -> Self:
         """Return the options of a table that a file lacks: the defaults, without building the model's validator.
 
-        For defaults of a nested model. All options must have a default.
+        Use it for the default of a field whose type is a model. Every option of the model must have a default.
         """
         return cls.model_construct()
 

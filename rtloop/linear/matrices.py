@@ -31,8 +31,8 @@ MAX_DOUBLINGS = 64
 def matrix_exponential(matrix: Real) -> Real:
     """Return the exponential of a real matrix (n, n), by scaling and squaring a Padé approximant of order 13.
 
-    Higham, SIAM J. Matrix Anal. Appl. 26 (2005). The scale follows from roots of norms of powers, not from the norm
-    (Al-Mohy & Higham, SIAM J. Matrix Anal. Appl. 31, 2009): a large input matrix beside slow states needs no squaring.
+    Higham, SIAM J. Matrix Anal. Appl. 26 (2005). The scale follows from the norms of powers, not from the norm of
+    the matrix (Al-Mohy & Higham, SIAM J. Matrix Anal. Appl. 31, 2009): in [A B; 0 0] a large B needs no squaring.
     """
     size = _one_norm(matrix)
     unit = matrix / size if size > 0 else matrix  # Powers of the matrix itself may overflow.
@@ -54,8 +54,8 @@ def matrix_exponential(matrix: Real) -> Real:
 def stationary_covariance(a: Real, driving: Real) -> Real:
     """Return X (n, n) = A X Aᵀ + `driving` for a stable A and a positive semidefinite `driving`, both (n, n).
 
-    X is the sum of A^k `driving` A^kᵀ, whose number of terms is doubled until it stands still (Smith 1968). For an
-    unstable A the result is meaningless, and may be infinite.
+    X is the sum of A^k `driving` A^kᵀ; the number of terms is doubled until the sum no longer changes (Smith 1968). For
+    an A with an eigenvalue outside the unit circle the result is meaningless, and may be infinite.
     """
     covariance, power = driving, a
     for _ in range(MAX_DOUBLINGS):

@@ -398,7 +398,7 @@ class Service:
         if not self._is_ready and supervisor.ticks >= READY_TICKS:
             self._is_ready = True
             self.notifier.send(READY=1)
-            self._start_thread(self._prepare_builder)
+            self._start_thread(self._start_builder_later)
             self._start_thread(lambda: self._judge_loop(supervisor.prepared))
         if self._reported_ticks == 0 and supervisor.ticks:
             self.notifier.limit_watchdog()
@@ -495,8 +495,8 @@ class Service:
             if self._requested_mode is not None:
                 log.info("not started: mode %s was requested meanwhile", self._requested_mode.name.lower())
 
-    def _prepare_builder(self) -> None:
-        """Start the limited process after BUILDER_PAUSE_S, unless the service ends before; an earlier job starts it."""
+    def _start_builder_later(self) -> None:
+        """Wait BUILDER_PAUSE_S, then start the process that builds changes; nothing if the service ends meanwhile."""
         if not self._end_requested.wait(BUILDER_PAUSE_S):
             prepare_builder()
 

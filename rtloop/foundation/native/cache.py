@@ -45,10 +45,10 @@ def source_digest() -> str:
 
 
 def installed_version(package: str) -> str:
-    """Return the version of an installed package, which is not imported, from the name of its folder of metadata.
+    """Return the version of an installed package from the name of its .dist-info folder; the package is not imported.
 
-    Without that folder, or with several, the metadata are read: importing their reader takes longer than the rest of
-    the digest. Raises PackageNotFoundError for a package without metadata.
+    If there is no such folder beside the package, or several, `importlib.metadata` looks for it, whose import takes
+    longer than `source_digest`. Raises PackageNotFoundError for a package without metadata.
     """
     spec, ending = find_spec(package), ".dist-info"
     if spec is not None and spec.origin is not None:
@@ -97,7 +97,7 @@ with contextlib.suppress(OSError):
 
 
 def stored_file_count() -> int:
-    """Return the number of files in the cache, to which each compiled function adds some; 0 if it is unreadable."""
+    """Return the number of files in CACHE_FOLDER; every compiled function adds files. 0 if the folder is unreadable."""
     try:
         return len(os.listdir(CACHE_FOLDER))
     except OSError:

@@ -288,7 +288,7 @@ class Reader:
     def _read_in_turn(
         self, entries: Iterable[ChunkEntry], names: Sequence[str]
     ) -> Iterator[tuple[ChunkEntry, ReadTicks]]:
-        """Yield each entry with a function that reads its ticks with columns `names`, and returns them."""
+        """Yield each entry with a function that reads and returns columns `names` of its ticks when it is called."""
         for entry in entries:
             yield entry, partial(self._read_ticks, entry, names)
 

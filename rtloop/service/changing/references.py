@@ -150,9 +150,10 @@ class LiveReferences:
 
     @contextmanager
     def _service_change(self, number: int, replaces: int | None = None) -> Iterator[None]:
-        """Hold the staging lock, and count the references set on axis `number` within as the service's own.
+        """Hold the staging lock in the block, and count the references set on axis `number` there as the service's own.
 
-        Raises ReferenceReplaced if `replaces` is given and clients have set another number of references.
+        `replaces` is an earlier entry of `client_counts`; if it is given and the count has changed since, a client has
+        set a reference, and ReferenceReplaced is raised before the block.
         """
         with self._staging.lock:
             if replaces is not None and self.client_counts[number] != replaces:

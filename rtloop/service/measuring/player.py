@@ -150,6 +150,6 @@ class Player:
             raise Refusal(f"{self._activity}: a limit changed the {' and the '.join(limited)}; {remedy}")
 
     def _require_closed_loop(self, rows: Real) -> None:
-        """Raise Refusal if a record (ticks, columns) is of another mode than closed_loop."""
+        """Raise Refusal if any of the records `rows` (ticks, columns) has another mode than closed_loop."""
         if np.any(rows[:, signals.MODE] != Mode.CLOSED_LOOP):
             raise Refusal(f"{self._activity}: the mode is not closed_loop; use `rtloop ctl mode closed_loop` first")

@@ -317,7 +317,7 @@ class Recovery:
         return self._host.configuration.service.recover
 
     def _count_remaining(self, options: RecoverOptions) -> int:
-        """Return the number of recoveries left within the hour; the guard must be held."""
+        """Return how many recoveries the policy still allows in the last 3600 s; `self._guard` must be held."""
         while self._begun_s and self._now_s() - self._begun_s[0] >= HOUR_S:
             self._begun_s.popleft()
         return max(options.max_per_hour - len(self._begun_s), 0)
