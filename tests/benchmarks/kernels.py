@@ -12,7 +12,7 @@ from rtloop.kernel.access import axis_state, loop_state
 from rtloop.kernel.layout import CONDITIONS
 from rtloop.kernel.memory import LawMemory, new_records
 from rtloop.kernel.step import evaluate, reset_trip, set_mode, update
-from rtloop.signals import ADC, REFERENCE, Flag, Mode, axis_column
+from rtloop.signals import ADC, FLAGS, REFERENCE, Flag, Mode, axis_column
 from tests.benchmarks import native
 from tests.benchmarks.measure import Effort, Spread, alternately, seconds
 from tests.benchmarks.scenario import NativeLoop, PythonLoop, paper_plan, plan_of_axes, tripping_plan
@@ -65,11 +65,11 @@ def check_law(adc_v: np.ndarray[Any, Any], references: np.ndarray[Any, Any]) -> 
     modes[::700] = random.choice([int(mode) for mode in Mode], modes[::700].size, p=[0.1, 0.2, 0.2, 0.5])
     adc_v[9_999::10_000] = random.choice([np.nan, np.inf, 9.995, -6.5], adc_v[9_999::10_000].size)
     outs = [np.empty((adc_v.size, 4)) for _ in range(2)]
-    ours, theirs, conditions = law_at_rest(paper_plan()), law_at_rest(paper_plan()), new_records(CONDITIONS, 1)
+    ours, theirs, conditions = law_at_rest(paper_plan()), native.law_at_rest(paper_plan()), new_records(CONDITIONS, 1)
     for memory in (ours, theirs):
         memory.state["mode"] = int(Mode.OFF)
     run_law(ours.law, adc_v, references, modes, conditions, outs[0])
-    native.run_law((*native.arrays_of(theirs), adc_v, references, modes), adc_v.size, outs[1])
+    native.run_law(theirs, (adc_v, references, modes, conditions), adc_v.size, outs[1])
     _require_equal("law", outs[0], outs[1])
     if not same_memory(ours, theirs):
         raise Differs("law: the states differ")
@@ -80,14 +80,17 @@ def check_law(adc_v: np.ndarray[Any, Any], references: np.ndarray[Any, Any]) -> 
 
 
 def law(effort: Effort) -> dict[str, Any]:
-    """ns a tick of the law alone in closed loop, in rtloop and in C; both must give the same bits."""
+    """ns a tick of the law alone in closed loop, in rtloop and in C; both must give the same bits.
+
+    Both call controller and feedforward through the pointers in their slots, on the same records.
+    """
     adc_v, references = law_inputs(CHECKED_TICKS)
     check_law(adc_v, references)
     modes, out = np.full(adc_v.size, -1), np.empty((adc_v.size, 4))
-    ours, theirs, conditions = law_at_rest(paper_plan()), law_at_rest(paper_plan()), new_records(CONDITIONS, 1)
+    ours, theirs, conditions = law_at_rest(paper_plan()), native.law_at_rest(paper_plan()), new_records(CONDITIONS, 1)
     pair = alternately(
         lambda: run_law(ours.law, adc_v, references, modes, conditions, out),
-        lambda: native.run_law((*native.arrays_of(theirs), adc_v, references, modes), adc_v.size, out),
+        lambda: native.run_law(theirs, (adc_v, references, modes, conditions), adc_v.size, out),
         effort.pairs,
     )
     if ours.state["mode"][0] != Mode.CLOSED_LOOP or not same_memory(ours, theirs):
@@ -96,7 +99,7 @@ def law(effort: Effort) -> dict[str, Any]:
 
 
 def check_loop() -> None:
-    """Equal rows through steps, saturation and a trip. Raises Differs."""
+    """Equal rows, events, number of snapshots and states through steps, saturation and a trip. Raises Differs."""
     plan = tripping_plan(CHECKED_TICKS - 10_000)
     python, baseline, flags = PythonLoop(plan), NativeLoop(plan), 0
     for begin in range(0, CHECKED_TICKS, CHUNK):
@@ -104,13 +107,22 @@ def check_loop() -> None:
         baseline.run(begin + CHUNK)
         slots = np.arange(begin, begin + CHUNK) % python.rows.shape[0]
         _require_equal(f"loop, from tick {begin}", python.rows[slots], baseline.rows[slots])
-        flags |= int(np.bitwise_or.reduce(python.rows[slots, 8].astype(np.int64)))
+        flags |= int(np.bitwise_or.reduce(python.rows[slots, FLAGS].astype(np.int64)))
+    for name in ("words", "events_slots", "events_marks", "snapshots_marks", "last_drive_v"):
+        if python.block[name].tobytes() != baseline.block[name].tobytes():
+            raise Differs(f"loop: {name} of the shared block differ")
+    if not same_memory(python.law, baseline.law):
+        raise Differs("loop: the states of the laws differ")
     if flags & WANTED != WANTED:
         raise Differs(f"the loop's check saw only {Flag(flags)!r}")
 
 
 def loop(effort: Effort) -> dict[str, Any]:
-    """ns a tick of the whole unpaced loop with the rig, without recording, in rtloop and in C, equal in bits."""
+    """ns a tick of the whole unpaced loop with the rig, without a recorder, in rtloop and in C, equal in bits.
+
+    Both do the same: commands and events, a snapshot a second, driver, clock and laws behind pointers, interlocks,
+    the record of the tick in the ring.
+    """
     check_loop()
     plan = paper_plan()
     loops = PythonLoop(plan), NativeLoop(plan)
@@ -128,26 +140,35 @@ def loop(effort: Effort) -> dict[str, Any]:
 
 
 def axes(effort: Effort) -> dict[str, Any]:
-    """ns a tick of the unpaced loop with 1, 2, 4 and 8 axes, and the cost of a further axis."""
-    counts = 1, 2, 4, 8
-    loops = {count: PythonLoop(plan_of_axes(count)) for count in counts}
-    taken: dict[int, list[float]] = {count: [] for count in counts}
+    """ns a tick of the unpaced loop with 1, 2, 4 and 8 axes, and the cost of a further axis, in rtloop and in C."""
+    counts, makers = (1, 2, 4, 8), {"": PythonLoop, "c_": NativeLoop}
+    loops = {(count, kind): make(plan_of_axes(count)) for count in counts for kind, make in makers.items()}
+    taken: dict[tuple[int, str], list[float]] = {key: [] for key in loops}
     for repeat in range(1, effort.pairs + 2):
-        for count, loop in loops.items():
+        for key, loop in loops.items():
             until = repeat * AXES_TICKS
-            taken[count].append(seconds(lambda loop=loop, until=until: loop.run(until)) * 1e9 / AXES_TICKS)
-    spreads = {count: Spread.of(values[1:]) for count, values in taken.items()}
-    named = {f"ns_per_tick_{count}": spread._asdict() for count, spread in spreads.items()}
-    return named | {"ns_per_further_axis": (spreads[8].minimum - spreads[1].minimum) / 7}
+            taken[key].append(seconds(lambda loop=loop, until=until: loop.run(until)) * 1e9 / AXES_TICKS)
+    for count in counts:
+        _require_equal(f"{count} axes, at the end", loops[count, ""].rows, loops[count, "c_"].rows)
+    spreads = {(count, kind): Spread.of(values[1:]) for (count, kind), values in taken.items()}
+    result: dict[str, Any] = {}
+    for kind in makers:
+        result |= {f"{kind}ns_per_tick_{count}": spreads[count, kind]._asdict() for count in counts}
+    for kind in makers:
+        result[f"{kind}ns_per_further_axis"] = (spreads[8, kind].minimum - spreads[1, kind].minimum) / 7
+    return result
 
 
 def same_memory(one: LawMemory, other: LawMemory) -> bool:
-    """Whether two laws remember the same, in bits, of what the drives depend on."""
-    names = {"controller": ("controller",), "feedforward": ("inverse_plays_um", "model_plays_v")}
-    return one.axes["drive_v"].tobytes() == other.axes["drive_v"].tobytes() and all(
-        one.slot_record(0, slot, "state")[name].tobytes() == other.slot_record(0, slot, "state")[name].tobytes()
-        for slot in ("controller", "feedforward")
-        for name in names[slot]
+    """Whether two laws remember the same in bits, but for partial sums, which only compiled Python stores."""
+    slots = "controller", "feedforward"
+    pairs = [(one.axes, other.axes), (one.state, other.state)]
+    pairs += [(one.slot_record(0, slot, "state"), other.slot_record(0, slot, "state")) for slot in slots]
+    return all(
+        mine[name].tobytes() == theirs[name].tobytes()
+        for mine, theirs in pairs
+        for name in mine.dtype.names
+        if name not in (*slots, "sums", "tap_sums")
     )
 
 

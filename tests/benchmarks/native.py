@@ -1,4 +1,5 @@
-"""The C baseline, compiled when it is needed, on the very records that the compiled Python works on."""
+"""The C baseline, compiled when it is needed. It works on the very records of the compiled Python, and its functions
+take the places of rtloop's laws, driver and clock behind the same pointers."""
 
 from __future__ import annotations
 
@@ -7,17 +8,26 @@ import platform
 import shutil
 import subprocess
 import tempfile
+from collections.abc import Iterator
+from enum import IntEnum, IntFlag
 from functools import cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from rtloop.hil.rig import COEFFICIENTS as RIG_COEFFICIENTS
-from rtloop.hil.rig import STATE as RIG_STATE
-from rtloop.kernel.layout import COEFFICIENTS, CONDITIONS, LOOP_STATE, STATE
+from rtloop import signals
+from rtloop.drivers import sim
+from rtloop.drivers.base import Pointers
+from rtloop.engine import clock, context
+from rtloop.engine.assembly import Assembly
+from rtloop.engine.memory import Word
+from rtloop.engine.messages import MESSAGE, Kind, Origin
+from rtloop.engine.plan import Plan
+from rtloop.hil import rig
+from rtloop.kernel import interlocks, layout
 from rtloop.kernel.memory import LawMemory
-from rtloop.kernel.reference import GENERATOR
+from rtloop.kernel.reference import GENERATOR, Generator
 from rtloop.laws.shipped import prandtl_ishlinskii, transfer
 
 SOURCE = Path(__file__).parent / "c"
@@ -25,39 +35,39 @@ SOURCE = Path(__file__).parent / "c"
 VECTORS = ("-mprefer-vector-width=256",) if platform.machine() == "x86_64" else ()
 OPTIONS = ("-O3", "-march=native", *VECTORS, "-ffp-contract=off", "-std=gnu11", "-Wall", "-Wextra", "-fPIC", "-shared")
 
-
-def in_one(**parts: np.dtype[Any]) -> np.dtype[Any]:
-    """The records of an axis and of its laws, one behind the other, as one; a name that comes twice gets a prefix."""
-    fields: list[Any] = []
-    for owner, part in parts.items():
-        for name, *rest in part.descr:
-            taken = any(name == before for before, *_ in fields)
-            fields.append((f"{owner}_{name}" if taken else name, *rest))
-    return np.dtype(fields)
-
-
 STRUCTS = {
-    "law_coefficients": in_one(
-        axis=COEFFICIENTS, plays=prandtl_ishlinskii.COEFFICIENTS, controller=transfer.COEFFICIENTS
-    ),
-    "law_state": in_one(axis=STATE, plays=prandtl_ishlinskii.STATE, controller=transfer.STATE),
-    "loop_state": LOOP_STATE,
-    "conditions": CONDITIONS,
-    "rig_coefficients": RIG_COEFFICIENTS,
-    "rig_state": RIG_STATE,
+    "axis_coefficients": layout.COEFFICIENTS,
+    "axis_state": layout.STATE,
+    "plays_coefficients": prandtl_ishlinskii.COEFFICIENTS,
+    "plays_state": prandtl_ishlinskii.STATE,
+    "linear_coefficients": transfer.COEFFICIENTS,
+    "linear_state": transfer.STATE,
+    "loop_state": layout.LOOP_STATE,
+    "conditions": layout.CONDITIONS,
+    "control": layout.CONTROL,
+    "functions": layout.FUNCTIONS,
+    "law": layout.LAW,
+    "trip": interlocks.TRIP,
+    "loop": context.LOOP,
+    "message": MESSAGE,
     "generator": GENERATOR,
+    "clock": clock.CONTEXT,
+    "sim": sim.CONTEXT,
+    "rig_coefficients": rig.COEFFICIENTS,
+    "rig_state": rig.STATE,
 }
-C_TYPES = {"f8": "double", "i8": "int64_t", "u8": "uint64_t", "u1": "uint8_t"}
-RUN = np.dtype(
-    [
-        *((name, np.int64) for name in ("law_coefficients", "law_state", "loop_state")),
-        *((name, np.int64) for name in ("rig_coefficients", "rig_state", "generators", "table")),
-        *((name, np.int64) for name in ("words", "head", "marks", "slots", "last_drive_v")),
-        *((name, np.int64) for name in ("axes", "columns", "capacity", "tick")),
-        *((name, np.float64) for name in ("period_ns", "period_us", "heartbeat_timeout_ns")),
-    ]
+ENUMS: dict[str, type[IntEnum | IntFlag]] = {
+    "MODE": signals.Mode, "FLAG": signals.Flag, "FAILURE": signals.Failure, "KIND": Kind, "ORIGIN": Origin,
+    "WORD": Word, "GENERATOR": Generator,
+}  # fmt: skip
+COLUMNS = (
+    *("TICK", "DEADLINE", "LATENESS", "READ", "LAW", "WRITE", "EXEC", "PERIODS_MISSED", "FLAGS", "MODE"),
+    *("DRIVER_STATUS", "SAMPLE_AGE", "ENABLE", "COMMON_COUNT", "PER_AXIS_COUNT"),
+    *("ADC", "POSITION", "REFERENCE", "ERROR", "COMMAND", "DEMAND", "DRIVE", "FEED"),
 )
-"""`struct run` of loop.c."""
+C_TYPES = {"f8": "double", "i8": "int64_t", "u8": "uint64_t", "u4": "uint32_t", "u1": "uint8_t"}
+LAWS = {"prandtl_ishlinskii": "plays", "transfer": "linear"}
+"""Prefix of the C functions of a law."""
 
 
 def struct_of(name: str, dtype: np.dtype[Any]) -> str:
@@ -71,10 +81,18 @@ def struct_of(name: str, dtype: np.dtype[Any]) -> str:
     return "\n".join([f"struct {name} {{", *members, "};", *checks])
 
 
+def _constants() -> Iterator[str]:
+    """Lines of C that name the values which Python and C share."""
+    for prefix, members in ENUMS.items():
+        yield from (f"enum {{ {prefix}_{name} = {int(value)} }};" for name, value in members.__members__.items())
+    yield from (f"enum {{ COLUMN_{name} = {getattr(signals, name)} }};" for name in COLUMNS)
+    yield f"enum {{ RAISED = {signals.RAISED} }};"
+
+
 def header() -> str:
-    """All structs that Python and C share."""
+    """All structs and constants that Python and C share."""
     structs = (struct_of(name, dtype) for name, dtype in STRUCTS.items())
-    return "\n".join(["#pragma once", "#include <stddef.h>", "#include <stdint.h>", *structs, ""])
+    return "\n".join(["#pragma once", "#include <stddef.h>", "#include <stdint.h>", *_constants(), *structs, ""])
 
 
 @cache
@@ -88,21 +106,46 @@ def library() -> ctypes.CDLL:
         target = Path(folder) / "baseline.so"
         command = [compiler, *OPTIONS, f"-I{folder}", f"-I{SOURCE}", str(SOURCE / "loop.c"), "-lm", "-o", str(target)]
         subprocess.run(command, check=True)
-        return ctypes.CDLL(str(target))
+        loaded = ctypes.CDLL(str(target))
+    loaded.run_loop.restype = ctypes.c_int64
+    return loaded
 
 
-def arrays_of(law: LawMemory) -> tuple[np.ndarray[Any, Any], ...]:
-    """Coefficients, axes and loop, as C has them."""
-    return law.coefficients, law.axes, law.state
+def _address(function: str) -> int:
+    """Address of a C function of the baseline."""
+    address = ctypes.cast(getattr(library(), function), ctypes.c_void_p).value
+    assert address is not None
+    return address
 
 
-def run_law(arrays: tuple[np.ndarray[Any, Any], ...], ticks: int, out: np.ndarray[Any, Any]) -> None:
-    """`run_law` of loop.c on coefficients, state, loop state, inputs [V], references and modes (−1: as before)."""
-    addresses = [ctypes.c_void_p(array.ctypes.data) for array in arrays]
-    axes, last = ctypes.c_int64(arrays[0].size), (ctypes.c_int64(ticks), ctypes.c_void_p(out.ctypes.data))
-    library().run_law(*addresses[:3], axes, *addresses[3:], *last)
+def law_at_rest(plan: Plan) -> LawMemory:
+    """The memory of the plan's laws before the first tick, with the C functions in their slots."""
+    functions = np.zeros(len(plan.laws), layout.FUNCTIONS)
+    for record, law in zip(functions, plan.laws, strict=True):
+        for name in ("output", "update", "enter"):
+            record[name] = _address(f"{LAWS[law.kind]}_{name}")
+    memory = LawMemory.create_at_rest(plan.layout, functions, plan.coefficients, plan.extras)
+    memory.state["mode"] = int(plan.mode)
+    return memory
 
 
-def run_loop(run: np.ndarray[Any, Any], until_tick: int) -> None:
-    """`run_loop` of loop.c."""
-    library().run_loop(ctypes.c_void_p(run.ctypes.data), ctypes.c_int64(until_tick))
+def rig_pointers(context_address: int) -> Pointers:
+    """The C functions of the simulated rig, on the context of rtloop's own driver."""
+    return Pointers(context_address, _address("rig_read"), _address("rig_write"))
+
+
+def unpaced_clock(clock_context: clock.Clock) -> clock.Clock:
+    """The C function of virtual time, on the context of rtloop's own clock."""
+    return clock.Clock(_address("unpaced_wait"), 0, clock_context.context)
+
+
+def run_law(law: LawMemory, inputs: tuple[np.ndarray[Any, Any], ...], ticks: int, out: np.ndarray[Any, Any]) -> None:
+    """`run_law` of loop.c on readings [V], references, modes (−1: as before) and one record of conditions."""
+    addresses = [ctypes.c_void_p(array.ctypes.data) for array in (law.records, *inputs)]
+    library().run_law(*addresses, ctypes.c_int64(ticks), ctypes.c_void_p(out.ctypes.data))
+
+
+def run_loop(assembly: Assembly, until_tick: int) -> int:
+    """`run_loop` of loop.c on the context of an assembly; the reason why it ended."""
+    address = assembly.loop.__array_interface__["data"][0]
+    return library().run_loop(ctypes.c_void_p(address), ctypes.c_int64(until_tick))

@@ -9,13 +9,12 @@ import numpy as np
 
 from rtloop.configuration.file import load
 from rtloop.configuration.prepare import prepare
-from rtloop.drivers.base import Wiring
+from rtloop.drivers.base import Pointers, Wiring
 from rtloop.engine.assembly import Assembly, law_at_rest
-from rtloop.engine.clock import clock_context, unpaced_clock
+from rtloop.engine.clock import Clock, clock_context, unpaced_clock
 from rtloop.engine.memory import SharedBlock, Word
 from rtloop.engine.plan import Plan
-from rtloop.hil.rig import build_rig
-from rtloop.kernel.layout import Records
+from rtloop.kernel.memory import LawMemory
 from tests.benchmarks import native
 from tests.benchmarks.configurations import PAPER
 
@@ -51,18 +50,21 @@ def plan_of_axes(count: int) -> Plan:
     )
 
 
-class PythonLoop:
+class Loop:
     """The loop as `rtloop run --unpaced` has it in its process, with nobody to wait for."""
 
-    def __init__(self, plan: Plan) -> None:
-        self.block = SharedBlock.create(plan.sizes)
-        self.law = law_at_rest(plan)
-        self._driver = plan.driver()
-        self._clock = clock_context(plan.pacing.rate_hz)
+    def __init__(self, plan: Plan, law: LawMemory) -> None:
+        self.block, self.law = SharedBlock.create(plan.sizes), law
+        self._driver, self._clock = plan.driver(), clock_context(plan.pacing.rate_hz)
+        pointers = self._driver.open()
         head, words = self.block.ring("ticks").head, self.block["words"]
         clock = unpaced_clock(self._clock, head, words, Word.RECORDER_CURSOR, NO_RECORDER)
-        self._assembly = Assembly(plan, self.block, self._driver.facts, self._driver.open(), clock, self.law)
-        self._assembly.run(0)
+        self.assembly = Assembly(plan, self.block, self._driver.facts, *self._functions(pointers, clock), law)
+        self.run(0)
+
+    def _functions(self, pointers: Pointers, clock: Clock) -> tuple[Pointers, Clock]:
+        """The functions of driver and clock that the loop calls."""
+        return pointers, clock
 
     @property
     def rows(self) -> np.ndarray[Any, Any]:
@@ -71,46 +73,25 @@ class PythonLoop:
 
     def run(self, until_tick: int) -> None:
         """Run on."""
-        self._assembly.run(until_tick)
+        self.assembly.run(until_tick)
 
 
-class NativeLoop:
-    """The same run by the C baseline, from the same bytes."""
+class PythonLoop(Loop):
+    """All of it compiled from Python."""
 
     def __init__(self, plan: Plan) -> None:
-        period_s = 1.0 / plan.pacing.rate_hz
-        options: Any = plan.driver().options
-        self.block = SharedBlock.create(plan.sizes)
-        self.block["table"][: plan.table.size] = plan.table
-        self.law = law_at_rest(plan)
-        rig_coefficients, rig_state = build_rig(options, plan.axes, period_s)
-        ring = self.block.ring("ticks")
-        self._kept: dict[str, np.ndarray[Any, Any] | Records] = {
-            "law_coefficients": self.law.coefficients,
-            "law_state": self.law.axes,
-            "loop_state": self.law.state,
-            "rig_coefficients": rig_coefficients,
-            "rig_state": rig_state,
-            "generators": plan.generators.copy(),
-            "table": self.block["table"],
-            "words": self.block["words"],
-            "head": ring.head,
-            "marks": ring.marks,
-            "slots": ring.slots,
-            "last_drive_v": self.block["last_drive_v"],
-        }
-        self._run = np.zeros(1, native.RUN)
-        for name, array in self._kept.items():
-            self._run[name] = array.ctypes.data
-        self._run["axes"], self._run["columns"], self._run["capacity"] = len(plan.axes), *ring.slots.shape[::-1]
-        self._run["period_ns"], self._run["period_us"] = 1_000_000_000 / plan.pacing.rate_hz, period_s * 1e6
-        self._run["heartbeat_timeout_ns"] = plan.pacing.heartbeat_timeout_s * 1e9
+        super().__init__(plan, law_at_rest(plan))
 
-    @property
-    def rows(self) -> np.ndarray[Any, Any]:
-        """Slots of the ring of records."""
-        return self.block["ticks_slots"]
+
+class NativeLoop(Loop):
+    """The same by the C baseline, from the same bytes: loop, laws, rig and clock."""
+
+    def __init__(self, plan: Plan) -> None:
+        super().__init__(plan, native.law_at_rest(plan))
+
+    def _functions(self, pointers: Pointers, clock: Clock) -> tuple[Pointers, Clock]:
+        return native.rig_pointers(pointers.context), native.unpaced_clock(clock)
 
     def run(self, until_tick: int) -> None:
         """Run on."""
-        native.run_loop(self._run, until_tick)
+        native.run_loop(self.assembly, until_tick)
