@@ -149,3 +149,11 @@ def run_loop(assembly: Assembly, until_tick: int) -> int:
     """`run_loop` of loop.c on the context of an assembly; the reason why it ended."""
     address = assembly.loop.__array_interface__["data"][0]
     return library().run_loop(ctypes.c_void_p(address), ctypes.c_int64(until_tick))
+
+
+def spin(period_ns: float, ticks: int) -> tuple[np.ndarray[Any, Any], ...]:
+    """`spin` of spin.h: deadlines [ns], whether each tick was late, periods skipped before it; each (ticks,)."""
+    arrays = tuple(np.zeros(ticks) for _ in range(3))
+    addresses = [ctypes.c_void_p(array.ctypes.data) for array in arrays]
+    library().spin(ctypes.c_double(period_ns), ctypes.c_int64(ticks), *addresses)
+    return arrays

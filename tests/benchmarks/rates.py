@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import os
 import tempfile
 from collections.abc import Callable, Iterator
+from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
+from functools import partial
+from multiprocessing import get_context
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -13,9 +17,10 @@ import numpy as np
 import rtloop
 from rtloop.errors import LoopFault
 from rtloop.signals import Flag
-from tests.benchmarks import plain_driver
+from tests.benchmarks import native, plain_driver
 from tests.benchmarks.board import board, on_a_board
 from tests.benchmarks.configurations import RIG, SINE, STEPS, at_rate, changed, last_cpu, pinned, write
+from tests.benchmarks.lateness import PRIORITY
 from tests.benchmarks.measure import Effort, NotMeasured, say
 from tests.benchmarks.processes import Failed
 from tests.benchmarks.processes import rtloop as command
@@ -60,18 +65,22 @@ def late_shares(deadline_ns: Signal, flags: Signal, missed: Signal) -> Late:
     return Late(*(float(np.median(share)) for share in shares))
 
 
-def highest_rates(configure: Configure, spin_us: float, windows: int) -> dict[str, float]:
-    """Hz, for each share: the last rate of the ladder before the first one that is not kept; 0 where none is."""
+def highest_rates(late_at: Callable[[float], Late]) -> dict[str, Any]:
+    """Hz, for each share: the last rate of the ladder before the first one that is not kept; 0 where none is.
+
+    `late_at` returns the shares at a rate in Hz. They are returned too, in %, for each rate that was tried.
+    """
     highest, kept = dict.fromkeys(Late._fields, 0.0), set(Late._fields)
+    percent: dict[str, float] = {}
     for rate_hz in RATES_HZ:
-        text = configure([at_rate(rate_hz), (STEPS, SINE), GENTLE, *pinned(last_cpu(), spin_us)])
-        late = _run(text, windows + 0.5)
-        say(f"{rate_hz} Hz, spin_us = {spin_us:g}: overrun {late.overrun:.3%}, overrun or skipped {late.lost:.3%}")
+        late = late_at(rate_hz)
+        say(f"{rate_hz} Hz: overrun {late.overrun:.3%}, overrun or skipped {late.lost:.3%}")
+        percent |= {f"{rate_hz // 1000}_khz {name}_percent": 100 * share for name, share in late._asdict().items()}
         kept &= {name for name, share in late._asdict().items() if share < ALLOWED}
         highest |= dict.fromkeys(kept, float(rate_hz))
         if not kept:
             break
-    return {f"{name}_hz": rate_hz for name, rate_hz in highest.items()}
+    return {f"{name}_hz": rate_hz for name, rate_hz in highest.items()} | percent
 
 
 def _run(text: str, duration_s: float) -> Late:
@@ -93,6 +102,24 @@ def _run(text: str, duration_s: float) -> Late:
             return NOT_KEPT
         signals = rtloop.load(summary["recording"]).read("deadline_ns", "flags", "periods_missed")
     return late_shares(*signals)
+
+
+def _bare_spin(rate_hz: float, duration_s: float) -> Late:
+    """The shares of a loop in C that does nothing, in a process with the loop's processor, scheduling and priority."""
+    with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
+        return pool.submit(_spin_here, rate_hz, duration_s).result()
+
+
+def _spin_here(rate_hz: float, duration_s: float) -> Late:
+    """Spin in this process, as the loop's process would. Raises PermissionError where the host refuses SCHED_FIFO."""
+    native.library()
+    os.sched_setaffinity(0, {last_cpu()})
+    os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(PRIORITY))
+    try:
+        deadline_ns, late, skipped = native.spin(1e9 / rate_hz, round(rate_hz * duration_s))
+    finally:
+        os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
+    return late_shares(deadline_ns, late * int(Flag.OVERRUN), skipped)
 
 
 @contextmanager
@@ -122,12 +149,20 @@ def rates(effort: Effort) -> dict[str, Any]:
     `rtloop run` runs the paper's law (a quarter of its gain) with recording: on the simulated rig, on a driver in
     plain Python, and on a board in shared memory with a separate clock at 10 kHz. The loop sleeps, or spins for
     the last 60 µs. Above 16 kHz it spins all the time; the kernel then gives 5 % of this processor to other
-    waiting tasks.
+    waiting tasks. `host` is a loop in C that spins for its deadlines and does nothing else: what the machine
+    leaves. Where it is late too, no program on this machine is in time.
     """
-    windows = max(round(effort.seconds(WINDOWS)), 2)
-    found: dict[str, Any] = {}
+    duration_s = max(round(effort.seconds(WINDOWS)), 2) + 0.5
+    found: dict[str, Any] = {"host": {"spinning": highest_rates(partial(_bare_spin, duration_s=duration_s))}}
     for name, kind in {"sim": _sim, "python": _plain, "shm": _shm}.items():
         with kind() as configure:
-            spins = {"sleeping": 0.0, "spinning": SPIN_US}
-            found[name] = {way: highest_rates(configure, spin_us, windows) for way, spin_us in spins.items()}
+            found[name] = {
+                way: highest_rates(partial(_loop, configure, spin_us, duration_s))
+                for way, spin_us in {"sleeping": 0.0, "spinning": SPIN_US}.items()
+            }
     return found
+
+
+def _loop(configure: Configure, spin_us: float, duration_s: float, rate_hz: float) -> Late:
+    """The shares of a run of the loop at a rate."""
+    return _run(configure([at_rate(rate_hz), (STEPS, SINE), GENTLE, *pinned(last_cpu(), spin_us)]), duration_s)

@@ -9,6 +9,7 @@
 #include "laws.h"
 #include "commands.h"
 #include "rig.h"
+#include "spin.h"
 
 enum { DONE, STOPPED, DRIVER_FAILED, HEARTBEAT_LOST, READ_FAILED = 1, WRITE_FAILED, BACKPRESSURE_NS = 50000 };
 typedef int32_t (*driver_function)(void *context, double *values);
