@@ -13,7 +13,7 @@ from typing import Any
 
 
 class CallableRoom(ModuleType):
-    """The room as a module that can be called."""
+    """The package `rtloop.design` as a module that can be called as the function of the same name."""
 
     def __call__(self, *arguments: Any, **options: Any) -> Any:
         """Call `rtloop.workbench.design.design`, with its arguments, result and errors."""
@@ -21,7 +21,7 @@ class CallableRoom(ModuleType):
 
     @property
     def __wrapped__(self) -> Any:
-        """The function, whose signature `help` and notebooks show."""
+        """Public function `rtloop.workbench.design.design`, whose signature `help` and notebooks show."""
         return import_module("rtloop.workbench.design").design
 
 

@@ -86,9 +86,10 @@ class Chain:
 def identify_stage(hysteresis: AxisRecording, step: AxisRecording, order: int | None = None) -> Stage:
     """Identify the stage from two recordings, with `order` poles (None: chosen by held-out errors).
 
-    Raises UnsuitableData for a step without a configuration, as an imported one is, if ticks of the step are missing or
-    late, if no model explains the step, and like `identify_hysteresis` and `identify_dynamics`; with a hint if only the
-    drive of `hysteresis` jumps.
+    `hysteresis` is the recording of a slow sine, `step` the one of a step. Raises UnsuitableData for a step without a
+    configuration, as an imported one is, if ticks of the step are missing or late, if no model explains the step, and
+    as `identify_hysteresis` and `identify_dynamics`; its message calls the recordings swapped if `hysteresis` has steps
+    of the drive and `step` has none. Raises ArithmeticError for a model with an unstable predictor.
     """
     try:
         return _identify_stage(hysteresis, step, order)
@@ -102,7 +103,7 @@ def identify_stage(hysteresis: AxisRecording, step: AxisRecording, order: int | 
 
 
 def _identify_stage(hysteresis: AxisRecording, step: AxisRecording, order: int | None) -> Stage:
-    """Identify the stage, and raise UnsuitableData, as `identify_stage` does, without the hint."""
+    """Identify the stage, and raise errors, as `identify_stage` does, but never call the recordings swapped."""
     if not step.configuration:
         raise UnsuitableData(
             f"{step.name}: an imported recording has no configuration, from which driver and limits of the new loop "
@@ -144,10 +145,10 @@ def _require_explained(step: AxisRecording, dynamics: DynamicsFit, noise_um: flo
 
 
 def configuration_text(chain: Chain, axis: str | None, spec_name: str, spec_text: str) -> str:
-    """Return the configuration of the step recording in closed loop, with the design in axis `axis` (None: first).
+    """Return a configuration as TOML: that of the step recording, in closed loop, with the design in `axis`.
 
-    `spec_name` is the specification's path relative to the configuration, `spec_text` its content. Raises
-    UnsuitableData for weights without an inverse.
+    `axis` is the name of one of its axes, None the first. `spec_name` is the specification's path relative to the
+    configuration, `spec_text` its content. Raises UnsuitableData for weights of the hysteresis without an inverse.
     """
     parts = {"controller": controller_values(chain.synthesis.controller, chain.design.controller)}
     comments = provenance(chain.synthesis, chain.design, spec_name, spec_text)
@@ -157,10 +158,12 @@ def configuration_text(chain: Chain, axis: str | None, spec_name: str, spec_text
 def stage_configuration(
     stage: Stage, parts: Mapping[str, Any], comments: list[str], axis: str | None, spec_name: str
 ) -> str:
-    """Return the configuration of the step recording in closed loop, a stepping reference in axis `axis` (None: first).
+    """Return a configuration as TOML: that of the step recording, in closed loop, with the stage in `axis`.
 
-    The axis receives the identified stage, the specification and the sections of `parts`; `comments` follow those on
-    the identification. Raises UnsuitableData for weights without an inverse.
+    `axis` is the name of one of its axes, None the first. It receives feedforward and model of the identified stage, a
+    reference of steps, an interlock against oscillation, the specification's path `spec_name`, and the sections of
+    `parts`, by name. [schedule] is left out. `comments` follow those on the identification at the head of the text.
+    Raises UnsuitableData for weights of the hysteresis without an inverse.
     """
     configuration = tomllib.loads(stage.fast.configuration)
     configuration["loop"] = {key: value for key, value in configuration["loop"].items() if key != "mode"}
@@ -185,21 +188,24 @@ def stage_configuration(
 
 
 def reference_values(stage: Stage, axis: str | None) -> dict[str, Any]:
-    """Return [axis.reference] that takes the place of the recorded excitation in axis `axis` (None: first)."""
+    """Return the table [axis.reference], a square wave as `steps_reference` makes, for the step recording's axis.
+
+    `axis` is the name of one of its axes, None the first.
+    """
     limits = LimitsOptions.model_validate(_axis_table(tomllib.loads(stage.fast.configuration), axis).get("limits", {}))
     slowest_hz = min((mode.frequency_hz for mode in stage.dynamics.modes), default=math.inf)
     return steps_reference(limits, stage.actuator, slowest_hz, stage.fast.period_s)
 
 
 def _axis_table(configuration: Mapping[str, Any], axis: str | None) -> dict[str, Any]:
-    """Return the table of axis `axis` (None: of the first)."""
+    """Return the table of the axis named `axis` (None: the first), not a copy. The axis must exist."""
     return next(table for table in configuration["axis"] if axis in (None, table["name"]))
 
 
 def _enable_oscillation(interlocks: Mapping[str, Any], dynamics: DynamicsFit, period_s: float) -> dict[str, Any]:
     """Return the interlocks with the one against a growing resonance enabled; the identification runs without it.
 
-    Without a lightly damped mode, or with the interlock set already, they are returned as they are.
+    Without a lightly damped mode, or with the interlock set already, the copy is unchanged.
     """
     lowest_hz = min((mode.frequency_hz for mode in dynamics.modes if mode.damping < LIGHT_DAMPING), default=None)
     if lowest_hz is None or interlocks.get("oscillation_swings", 0):

@@ -13,9 +13,9 @@ from rtloop.recording.views.picture import DOTS_PER_INCH, create_picture
 
 
 def create_figure(rows: int, columns: int, size: tuple[float, float] = (12, 5), **options: Any) -> tuple[Any, Any]:
-    """Return a new figure and its panels, an array if there are several.
+    """Return a new figure and its panels: one panel, an array (n,) for a single row or column, else (rows, columns).
 
-    `size` is in inches, `options` go to `Figure.subplots`. Raises MissingExtra without matplotlib.
+    `size` is width and height in inches, `options` go to `Figure.subplots`. Raises MissingExtra without matplotlib.
     """
     figure = create_picture(*size)
     return figure, figure.subplots(rows, columns, **options)
@@ -42,6 +42,6 @@ def finish_figure(figure: Any, panels: Any, title: str) -> bytes:
 
 
 def save_figure(figure: Any, output: Path) -> None:
-    """Write the figure as PNG, over an existing file. Raises OutputError if the file cannot be written."""
+    """Write the figure as PNG to `output`, over an existing file. Raises OutputError if this fails."""
     with output_errors(output), os.fdopen(overwrite_file(output), "wb") as file:
         figure.savefig(file, format="png", dpi=DOTS_PER_INCH)

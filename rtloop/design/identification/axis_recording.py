@@ -86,7 +86,9 @@ def read_axis_recording(path: Path, axis: str | None = None) -> AxisRecording:
     axis = select_axis(recording, axis, path)
     drive, position, deadlines = _signals(recording, path, f"{axis}_drive_v", f"{axis}_position_um", "deadline_ns")
     if drive.size < LEAST_TICKS:
-        raise UnsuitableData(f"{path}: {drive.size} ticks; needs at least {LEAST_TICKS}")
+        raise UnsuitableData(
+            f"{path}: the recording has {drive.size} ticks; identification needs at least {LEAST_TICKS}"
+        )
     if "flags" in recording:
         _require_untripped(path, recording["flags"])
     reading_name = f"{axis}_adc_v"
@@ -94,7 +96,9 @@ def read_axis_recording(path: Path, axis: str | None = None) -> AxisRecording:
     require_usable(str(path), drive, position, readings)
     intervals = np.diff(deadlines)
     if not np.all(intervals > 0):
-        raise UnsuitableData(f"{path}: the time does not grow at tick {int(np.argmax(intervals <= 0)) + 1}")
+        raise UnsuitableData(
+            f"{path}: the time of tick {int(np.argmax(intervals <= 0)) + 1} is not later than that of the tick before"
+        )
     period_ns = float(np.median(intervals))
     any_missed = "periods_missed" in recording and bool(np.any(recording["periods_missed"][1:]))
     is_even = not any_missed and bool(np.all(np.abs(intervals - period_ns) <= 1))
@@ -110,9 +114,10 @@ def read_axis_recording(path: Path, axis: str | None = None) -> AxisRecording:
 
 
 def shifted_rows(recording: Recording) -> int:
-    """Return the rows by which a recording's position is too early: 1 if drive and position were sampled together.
+    """Return by how many rows the position of a recording is early: 1 if drive and position were sampled together.
 
-    That is an imported recording, unless it says that the position of a row was sampled before the drive changed.
+    They were in an imported recording, unless its header says that the position of a row was sampled before the drive
+    changed. Return 0 for all others.
     """
     imported = recording.header.get("imported")
     return int(imported is not None and not imported.get("position_first", False))
@@ -150,7 +155,7 @@ def _signals(recording: Recording, path: Path, *names: str) -> list[Real]:
     """
     missing = [name for name in names if name not in recording]
     if missing:
-        raise UnsuitableData(f"{path}: identification needs the missing signals {', '.join(missing)}")
+        raise UnsuitableData(f"{path}: signals that identification needs are missing: {', '.join(missing)}")
     return recording.read(*names)
 
 
@@ -162,7 +167,7 @@ def require_usable(name: str, drive_v: Real, position_um: Real, adc_v: Real | No
     position is searched for clipping.
     """
     if not (np.all(np.isfinite(drive_v)) and np.all(np.isfinite(position_um))):
-        raise UnsuitableData(f"{name}: drive or position has numbers that are not finite")
+        raise UnsuitableData(f"{name}: drive or position contains NaN or infinite values; leave these ticks out")
     noise, span = noise_std(position_um), float(np.ptp(position_um))
     if np.ptp(drive_v) == 0:
         raise UnsuitableData(
@@ -221,7 +226,10 @@ def require_rising(run: AxisRecording) -> None:
 
 
 def wrong_sign(name: str, observation: str) -> UnsuitableData:
-    """Return the error for the recording `name` in which the position falls where it should rise."""
+    """Return the error for the recording `name`, in which the position falls where it should rise.
+
+    `observation` is a clause that tells how this was seen.
+    """
     return UnsuitableData(
         f"{name}: the sign is wrong: {observation}. A loop with this sign is unstable. Change the sign of the "
         "channel's um_per_v ([driver.channels], or the mapping of an import), or reverse the wires of sensor or drive, "
@@ -237,9 +245,10 @@ def noise_std(position: Real) -> float:
 
 
 def _first_clipped_tick(drive: Real, adc: Real) -> int | None:
-    """Return the first tick of a plateau of `adc` at its extreme caused by clipping; None without one.
+    """Return the first tick of a plateau of `adc`, readings or positions, that clipping caused; None without one.
 
-    A plateau at the start does not count.
+    A plateau is at the maximum, or else at the minimum, for PLATEAU_TICKS or more. It counts if the drive moves
+    meanwhile or `adc` jumps at one of its ends, and not at the start of the recording.
     """
     changes = np.abs(np.diff(adc))
     usual_change = max(float(np.median(changes)), float(changes[changes > 0].min(initial=np.inf)))

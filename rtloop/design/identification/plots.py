@@ -95,8 +95,8 @@ def _draw_in_time(fit: DynamicsFit, run: Excitation, full: Any, zoom: Any, diffe
 
 
 def _zoom_range(fit: DynamicsFit, run: Excitation) -> tuple[int, int]:
-    """Return first and last sample + 1 of ZOOM_PERIODS periods of the slowest mode, from the largest change of the
-    input on: at least LEAST_ZOOM samples.
+    """Return first sample and last sample + 1 of ZOOM_PERIODS periods of the slowest mode, or LEAST_ZOOM samples if
+    these are more, from just before the largest change of the input on.
     """
     slowest_hz = min((mode.frequency_hz for mode in fit.modes if mode.frequency_hz > 0), default=np.inf)
     length = min(max(round(ZOOM_PERIODS / (slowest_hz * run.period_s)), LEAST_ZOOM), run.input.size, POINTS)
@@ -130,7 +130,8 @@ def _draw_over_frequency(
 
 
 def plot_compensation(residual: Residual, actuator: PlayModel, inverse: PlayModel, output: Path) -> None:
-    """Write a PNG of y over v (Fig 7 of the paper) and of Ω with its bound.
+    """Write a PNG of the compensated position y over the command v (Fig 7 of the paper), and of the residual
+    Ω = y − ρ v with its bound ±ξ.
 
     Raises OutputError if `output` cannot be written, MissingExtra without matplotlib.
     """

@@ -19,7 +19,8 @@ from rtloop.recording.load import Recording, load
 
 
 def recorded_measurement(path: Path, axis: str | None = None, near_hz: float | None = None) -> LoopMeasurement:
-    """Measure the response from the longest multisine in the reference of an axis (None: the only one).
+    """Measure a closed loop's response in a recording, from the longest multisine in the reference of an axis (None:
+    the only one).
 
     The model comes from the recorded configuration; there is none for a user's law. The lightly damped mode is searched
     near `near_hz`; None means near the model's resonance, or without one where the plant answers most. Raises
@@ -56,7 +57,10 @@ def recorded_measurement(path: Path, axis: str | None = None, near_hz: float | N
 
 
 def recorded_driver_delay_ticks(recording: Recording) -> int:
-    """Return the ticks of delay that the driver of a recording adds; 0 for a driver that is not installed here."""
+    """Return the ticks of delay that the driver of a recording adds.
+
+    0 for a driver that is not installed here or refuses the recorded options.
+    """
     table = tomllib.loads(recording.configuration)["driver"]
     kind, channels = table.pop("kind"), table.pop("channels", {})
     if kind == TICK_DRIVEN:

@@ -23,7 +23,7 @@ FASTEST_DECAY = 14.0
 
 @dataclass(frozen=True)
 class Mode:
-    """A pole with its standard deviations from the covariance of the estimate."""
+    """A real pole s, or a pair: frequency |s|/2π, damping −Re s/|s|, and their standard deviations."""
 
     frequency_hz: float
     frequency_std_hz: float
@@ -85,9 +85,9 @@ def continuous_transfer(model: Innovations) -> Transfer:
 
 
 def estimate_modes(model: Innovations, covariance: Real, *, noise: bool) -> tuple[Mode, ...]:
-    """Return modes, by frequency, with standard deviations of |s| and −Re s/|s|, from the covariance of
-    `model.pack(noise=noise)`.
+    """Return the modes in rising order of frequency, with standard deviations of frequency and damping.
 
+    `covariance` is that of `model.pack(noise=noise)`: `noise` says whether it contains the noise gains.
     A mode that decays faster than FASTEST_DECAY per tick is given as |s| = FASTEST_DECAY per tick with damping 1, and
     infinite standard deviations.
     """
@@ -110,7 +110,7 @@ def estimate_modes(model: Innovations, covariance: Real, *, noise: bool) -> tupl
 
 
 def static_gain_std(model: Innovations, covariance: Real, *, noise: bool) -> float:
-    """Return the standard deviation of `model.static_gain`, from the covariance of `model.pack(noise=noise)`."""
+    """Return the standard deviation of `model.static_gain`, from the `covariance` of `model.pack(noise=noise)`."""
     slopes: list[float] = []
     for rate, residue, z_pole in zip(model.rates, model.residues, model.z_poles, strict=True):
         by_rate, by_residue = residue * model.period_s * z_pole / (1 - z_pole) ** 2, 1 / (1 - z_pole)

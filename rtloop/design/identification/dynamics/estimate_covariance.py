@@ -22,8 +22,9 @@ LAGS_PART = 20
 
 
 def estimate_covariance(model: Innovations, run: Excitation, errors: Real, *, white: bool) -> Real:
-    """Return the covariance (unknowns, unknowns) of `model.pack(noise=True)`, from the one-step-ahead `errors`
-    (samples,), taken as uncorrelated if `white`.
+    """Return the covariance (unknowns, unknowns) of `model.pack(noise=True)`, from its fit to `run`.
+
+    `errors` (samples,) are its one-step-ahead errors, taken as uncorrelated if `white`, else with their autocovariance.
     """
     rows = model.sensitivities(run.input, errors, noise=True)
     scale = np.linalg.norm(rows, axis=1)
@@ -35,7 +36,10 @@ def estimate_covariance(model: Innovations, run: Excitation, errors: Real, *, wh
 
 
 def _correlated(rows: Real, errors: Real) -> Real:
-    """Return each of `rows` (k, samples) times R (samples, samples) of the errors (samples,), (k, samples)."""
+    """Return `rows` (k, samples) times the autocovariance matrix of `errors` (samples,): (k, samples).
+
+    The autocovariance is tapered linearly to 0 behind the lag samples/LAGS_PART.
+    """
     largest_lag = errors.size // LAGS_PART
     spectrum = np.fft.rfft(errors - errors.mean(), 2 * errors.size)
     covariances = np.fft.irfft(np.abs(spectrum) ** 2)[: largest_lag + 1] / errors.size

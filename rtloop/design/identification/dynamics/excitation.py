@@ -68,8 +68,9 @@ def driven_input(run: LoopExcitation) -> Real:
 
 
 def _stabilise(polynomial: Real) -> Real:
-    """Return the polynomial; if a root is on or outside |z| = 1, all beyond LARGEST_Z_POLE are shrunk to it, angles
-    kept.
+    """Return the polynomial in z, highest power first, with all its roots inside the unit circle.
+
+    It is unchanged if they are. Else all roots of a magnitude above LARGEST_Z_POLE are shrunk to it, at the same angle.
     """
     roots = np.roots(polynomial)
     sizes = np.abs(roots)

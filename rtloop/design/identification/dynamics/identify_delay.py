@@ -88,9 +88,9 @@ def simplest_candidates(candidates: Sequence[Candidate]) -> list[Candidate]:
 
 
 def _judge_candidate(ticks: int, model: Innovations, run: Excitation, start: int | None) -> Candidate:
-    """Return the candidate for a model that was fitted to the samples before `start`; `run` is already delayed by
-    `ticks`.
+    """Return the candidate for a model that was fitted to the samples before `start` (None: to all, which judge it).
 
+    The input of `run` is delayed by `ticks` already.
     An unstable predictor has an infinite error and counts as not independent.
     """
     errors = model.errors(run.input, run.position_um)
@@ -130,7 +130,9 @@ def held_out_start(run: Excitation) -> int | None:
 
 
 def _candidate_delays(run: Excitation) -> Sequence[int]:
-    """Return the delays, 0 to MOST_TICKS samples, that leave out no significant coefficient of a long ARX model."""
+    """Return the delays in samples, rising from 0 to at most MOST_TICKS, that leave out no significant coefficient of a
+    long ARX model. 0 is always among them.
+    """
     regressors = np.vstack([*lagged_rows((run.position_um, run.input), ARX_ORDER), np.ones(run.input.size)])
     errors = [
         _squared_error(np.delete(regressors, range(ARX_ORDER, ARX_ORDER + ticks), axis=0), run.position_um)

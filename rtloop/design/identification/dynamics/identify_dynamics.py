@@ -149,8 +149,8 @@ def _has_settled(model: Innovations, run: Excitation) -> bool:
 
 
 def _score_model(model: Innovations, run: Excitation, start: int | None, validation: Sequence[Excitation]) -> Candidate:
-    """Return a model's order, rms prediction error from sample `start` on, its AIC and the rms output error on
-    `validation`.
+    """Return a model's order, rms prediction error from sample `start` on (None: of all), AIC, and rms output error on
+    `validation` (NaN without). Raises ArithmeticError for an unstable predictor.
     """
     rms = rms_error(model, run, start or 0)
     unknowns = model.pack(noise=True).size

@@ -62,10 +62,10 @@ def identify_recorded_dynamics(
     validation: Sequence[Excitation] = (),
     delay_ticks: int | None = None,
 ) -> DynamicsFit:
-    """Identify dynamics, in closed loop by `identify_in_loop`, otherwise by `identify_dynamics`, with the same
-    arguments.
+    """Identify dynamics of a LoopExcitation by `identify_in_loop`, of any other run by `identify_dynamics`.
 
-    Raises UnsuitableData like these, and ValueError for a criterion other than "held-out" in closed loop.
+    Arguments and errors are as there; None for `criterion` is "held-out". Raises ValueError for another criterion in
+    closed loop.
     """
     if not isinstance(run, LoopExcitation):
         return identify_dynamics(run, order, largest_order, criterion or "held-out", validation, delay_ticks)
@@ -125,7 +125,7 @@ def _search_models(
 ) -> tuple[list[JudgedModel], list[JudgedModel]]:
     """Return all models tried (of `order`, if given), and the models of fewest poles among those as good as the best.
 
-    Both are empty if none is stable.
+    The latter are pruned if `order` is None, and then need not be among the former. Both are empty if none is stable.
     """
     most_poles, patience = order or largest_order, None if order else PATIENCE
     models = search.grow(None, delay_ticks or 0, most_poles, patience)

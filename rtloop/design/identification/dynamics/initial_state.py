@@ -29,7 +29,11 @@ class FreeMotion(NamedTuple):
 
 
 def free_motion(model: Innovations, run: Excitation) -> FreeMotion | None:
-    """Return the free motion of a fitted `model`; None for a recording from rest, and for one without an end of it."""
+    """Return the free motion at the beginning of `run`, to which `model` was fitted.
+
+    None if it is not significant, as in a recording from rest, if the run is shorter than twice the time in which the
+    modes decay, and if the model's predictor is unstable.
+    """
     errors = model.errors(run.input, run.position_um)
     samples = _decay_samples(model)
     if errors is None or errors.size < 2 * samples:

@@ -102,7 +102,7 @@ class Innovations:
         """Return the derivative of the prediction errors ε by each unknown, (unknowns, samples), as `pack` orders them.
 
         `errors` (samples,) are ε for the input `u` (samples,). They count with `noise` only, which adds the noise gains
-        to the unknowns.
+        to the unknowns; without it, the effect of the rates on H is left out.
         """
         through_input = _mode_responses(self, u)
         through_noise = _mode_responses(self, errors) if noise else through_input

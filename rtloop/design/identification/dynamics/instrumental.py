@@ -67,7 +67,7 @@ def estimate_plant(
     `whitening` are the taps of the noise filter A_n (`fit_whitening`).
 
     If the iteration from `start` does not settle, it restarts from the two-stage method's model. None if that model
-    does not decay; the second iteration may be unsettled too.
+    has no stable continuous form; the second iteration may be unsettled too.
     """
     if (first_estimate := iterate_estimate(start, data, whitening, selection)).is_settled:
         return first_estimate

@@ -83,16 +83,16 @@ class ModeGuesses:
         return Innovations(self._period_s, (np.log(z_poles) / self._period_s).astype(complex), no_gains, no_gains)
 
     def _z_poles(self, order: int) -> Complex:
-        """Return the eigenvalues (order,) of the shift along the Hankel matrix's dominant column space."""
+        """Return `order` poles in z: the eigenvalues of the shift along the Hankel matrix's dominant column space."""
         root = np.sqrt(self.singular_values[:order])
         observability = self._left_vectors[:, :order] * root
         return np.linalg.eigvals(np.linalg.lstsq(observability[:-1], observability[1:], rcond=None)[0]).astype(complex)
 
 
 def fit_residues(model: Innovations, u: Real, y: Real) -> Innovations:
-    """Return the model with the residues and offset that fit `y` best in the least-squares sense, without noise model.
+    """Return the model with the residues and offset that fit `y` to `u`, each (samples,), by least squares.
 
-    Rates and noise gains stay.
+    Rates and noise gains stay; the fit is right only for noise gains of 0.
     """
     rows = -model.sensitivities(u, np.zeros_like(u), noise=False)
     values, solved = model.pack(noise=False), []

@@ -76,7 +76,8 @@ class FinalModel(NamedTuple):
 
 
 class ModelSearch:
-    """Search over models of one recording; `whitening` is the noise filter assumed before there is a model."""
+    """Search over models of one recording; `whitening` has the taps of the noise filter assumed before the first model.
+    """
 
     def __init__(self, data: InstrumentedRecording, whitening: Real) -> None:
         self._data, self._whitening, self._judging_whitening = data, whitening, whitening
@@ -90,8 +91,8 @@ class ModelSearch:
         """Add modes one by one to `start` (None: no modes), up to `most_poles` poles or until `patience` modes in a row
         bring no gain (None: no such limit).
 
-        Returns all models, including `start`, judged with the whitening of the best one, which is also used for all
-        later fits and judgements of this search.
+        Return all models in growing order, `start` first, up to the first fit that fails; [] if there is none. They are
+        judged with the whitening of the best one, which is stored for all later fits and judgements of this search.
         """
         data = delay_recording(self._data, delay_ticks)
         models = [start] if start else []

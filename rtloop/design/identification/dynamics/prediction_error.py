@@ -90,7 +90,7 @@ def fit_models_at_gap(run: Excitation, orders: Sequence[int]) -> list[Innovation
 def _fit_order(guesses: ModeGuesses, order: int, run: Excitation, smaller: Sequence[Innovations]) -> Innovations | None:
     """Return the fitted model of `order` poles, from the guess or else from the last of `smaller` and a fast pole.
 
-    None if there is no such start, or a fitted mode does not decay.
+    None if there is no such start, or a fitted mode does not decay or has no continuous form.
     """
     start = guesses.initial_model(order)
     if start is None and smaller and smaller[-1].order == order - 1:
@@ -115,7 +115,8 @@ def _add_fast_pole(model: Innovations) -> Innovations:
 
 
 def refine(model: Innovations, run: Excitation) -> Innovations | None:
-    """Return the model of least squared prediction errors nearby, fitted first without a noise model, then with one.
+    """Return the model of least squared prediction errors nearby, fitted first with its noise gains as they are, then
+    with these too.
 
     None if a mode does not decay or has no continuous form.
     """
@@ -127,8 +128,9 @@ def refine(model: Innovations, run: Excitation) -> Innovations | None:
 def minimise_errors(
     model: Innovations, run: Excitation, *, noise: bool, selection: SampleSelection = ALL_SAMPLES
 ) -> Innovations:
-    """Return the model of least squared errors over `selection`, downhill from `model`, with or without noise model.
+    """Return the model of least squared prediction errors over the samples `selection`, downhill from `model`.
 
+    `noise` fits its noise gains too; they stay otherwise.
     The search ends after MOST_EVALUATIONS evaluations, converged or not.
     """
 

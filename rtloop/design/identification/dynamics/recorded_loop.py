@@ -23,9 +23,9 @@ LIMITING_FLAGS = Flag.COMMAND_LIMITED | Flag.DRIVE_LIMITED | Flag.SLEW_LIMITED |
 
 @dataclass(frozen=True)
 class RecordedLoop:
-    """Longest stretch in closed loop: ticks `start` … `end` − 1, and the external signals (k, all ticks of the
-    recording) with their names.
+    """Longest part of a recording without interruption in closed loop: ticks `start` … `end` − 1.
 
+    `external` (k, all ticks of the recording) are the external signals, `names` their names.
     In an imported recording ticks count the drive, one later than the position.
     """
 
@@ -34,10 +34,10 @@ class RecordedLoop:
     names: tuple[str, ...]
     external: Real
     first_limited_tick: int | None
-    """First tick of the stretch at which a limit kept the command from the plant."""
+    """First tick of this part at which a limit or a ramp kept the command from the plant; None if there is none."""
 
     def excitation(self, recording: Excitation) -> LoopExcitation:
-        """Return the stretch of a recording with its external signals; `recording` has all ticks."""
+        """Return ticks `start` … `end` − 1 of `recording`, which has all ticks, with the external signals."""
         ticks = slice(self.start, self.end)
         return LoopExcitation(
             recording.name,
@@ -48,8 +48,8 @@ class RecordedLoop:
         )
 
     def require_commands_obeyed(self, name: str) -> None:
-        """Raise UnsuitableData if a limit changed the command within the stretch, so that the plant received a
-        different one.
+        """Raise UnsuitableData if a limit or a ramp changed the command in ticks `start` … `end` − 1, so that the plant
+        received a different one. `name` names the recording.
         """
         if self.first_limited_tick is not None:
             raise UnsuitableData(
@@ -61,11 +61,11 @@ class RecordedLoop:
 def find_closed_loop(
     path: Path, axis: str | None = None, state: State = "auto", names: Sequence[str] = ()
 ) -> RecordedLoop | None:
-    """Return the longest closed-loop stretch; None for an open loop, by `state` or, for "auto", the recorded mode.
+    """Return the longest part of a recording in closed loop; None for an open loop.
 
-    With `state` "closed" and no recorded mode, all ticks count. `names` are the external signals, by default the axis's
-    reference and feed. Raises RecordingError for a bad file and an unknown axis; UnsuitableData if the recording lacks
-    one of `names`, or all of the default ones.
+    `state` says which it is; for "auto", the recorded mode does. With "closed" and no tick recorded in closed loop, all
+    ticks count. `names` are the external signals, by default the axis's reference and feed. Raises RecordingError for a
+    bad file and an unknown axis; UnsuitableData if the recording lacks one of `names`, or all of the default ones.
     """
     recording = load(path)
     closed = recording["mode"] == Mode.CLOSED_LOOP if "mode" in recording else np.zeros(0, dtype=bool)
@@ -86,7 +86,9 @@ def find_closed_loop(
 
 
 def _first_limited_tick(recording: Recording, start: int, end: int) -> int | None:
-    """Return the first tick from `start` on, before `end`, with an active limit; None without one or without flags."""
+    """Return the first tick from `start` on, before `end`, with an active limit or a ramp; None if there is none, or no
+    flags were recorded.
+    """
     if "flags" not in recording:
         return None
     limited = np.flatnonzero(recording["flags"][start:end].astype(np.int64) & int(LIMITING_FLAGS))

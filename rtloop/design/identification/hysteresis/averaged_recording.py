@@ -28,12 +28,13 @@ CHUNK_TICKS = 100_000
 
 
 class AveragedRecording(NamedTuple):
-    """Recording averaged over blocks: time in s since its first tick, drive in V, position in µm, path of the drive in
-    V, each (blocks,).
+    """Recording averaged over blocks: time in s since its first tick, drive in V, position in µm, path of the drive
+    (the sum of its changes) in V, each (blocks,).
 
-    `stretch` (blocks,) numbers the stretches of known memory, −1 for a block outside them; plays of up to half of
-    `stroke_v` move within them. `full_v` is the drive of every tick, `size` the ticks of a block. `before_v` (k,) is
-    the drive in V from rest to the first tick, None where unknown.
+    A stretch is a part of the recording in which the state of all plays that move is known. `stretch` (blocks,) numbers
+    them from 0, −1 for a block outside them; `stroke_v` is the longest stroke in one, in which plays of up to half of
+    it move. `full_v` is the drive of every tick, `size` the ticks of a block. `before_v` (k,) is the drive in V from
+    rest to the first tick, None where unknown.
     """
 
     name: str
@@ -51,7 +52,7 @@ class AveragedRecording(NamedTuple):
 def average_recording(
     run: AxisRecording, runs: int, before_v: npt.ArrayLike | None = None, blocks: int = BLOCKS
 ) -> AveragedRecording:
-    """Return the average of one of `runs` recordings, which have about `blocks` blocks together.
+    """Return the recording `run` averaged over blocks; `runs` is the number of recordings that share about `blocks`.
 
     Each drive is paired with the position of the following tick. `before_v` (k,) is the drive in V from rest to the
     first tick, [0] for a start at rest, None if unknown.
@@ -105,9 +106,10 @@ def build_equations(
 
 
 def _number_stretches(drive: Real, size: int) -> tuple[npt.NDArray[np.intp], float]:
-    """Return the stretch of every block (blocks,) and the longest stroke in V.
+    """Return for every block of `size` ticks its stretch, (blocks,), and the longest stroke within one, in V.
 
-    The number is −1 for blocks across stretches, and in stretches of fewer than PIECES blocks.
+    Stretches, in which the state of all plays that move is known, are numbered from 0; −1 marks blocks that are not in
+    a single one, and those of stretches of fewer than PIECES blocks. An incomplete block at the end is omitted.
     """
     numbers = covered_intervals(drive)
     tick_numbers = numbers[: drive.size // size * size].reshape(-1, size)

@@ -16,9 +16,9 @@ EXPLAINED_SHARE = 0.5
 
 def is_creep_likely(run: AxisRecording) -> bool:
     """Whether plays with lags of the drive leave less than EXPLAINED_SHARE of the rms residual of plays alone, noise
-    aside.
+    aside. `run` must begin at rest.
 
-    A recording from rest at one speed is no proof: a memory that fades with the drive's path looks the same.
+    With a drive of one speed this is no proof of creep: a memory that fades with the drive's path looks the same.
     """
     recordings = prepare_recordings([run], "free", [np.zeros(1)])
     thresholds = place_thresholds(FINEST_PLAYS, float(np.abs(run.drive_v).max()), "chebyshev-from-0")
@@ -33,6 +33,6 @@ def is_creep_likely(run: AxisRecording) -> bool:
 
 
 def _residual_mean_square(columns: Real, position_um: Real) -> float:
-    """Return the mean square of the residual of `position_um` after least squares on `columns`."""
+    """Return the mean square of the residual of `position_um` (n,) after least squares on `columns` (n, k)."""
     solution = np.linalg.lstsq(columns, position_um)[0]
     return float(np.mean((position_um - columns @ solution) ** 2))

@@ -32,9 +32,10 @@ COVERED_SHARE, LEAST_OTHERS = 0.95, 2
 
 
 def cross_validate(recordings: Sequence[Equations], limits: Limits) -> list[Real]:
-    """Return errors in µm of every recording, (blocks, 2), by fits without it; NaN where memory is not known.
+    """Return errors in µm of every recording, (blocks, 2), by fits without it or without the piece that is judged.
 
-    Column 0: the whole model; column 1: the plays alone, as they are written, without their mean per stretch.
+    Column 0: the whole model; column 1: the plays alone, as they are written, less their mean over each stretch of
+    known memory. NaN where memory, the state of the plays, is not known.
     """
     errors_um = _errors_by_piece(recordings, limits)
     for group in range(GROUPS):
@@ -48,7 +49,9 @@ def cross_validate(recordings: Sequence[Equations], limits: Limits) -> list[Real
 
 
 def unseen_errors(recording: Equations, common: SharedGains) -> Real:
-    """Return errors in µm (blocks, 2) of a recording not used for `common`; NaN where memory is not known."""
+    """Return errors in µm (blocks, 2) of a recording not used for `common`, as `cross_validate`; NaN where memory is not
+    known. Its own offsets and drift are fitted to every other piece, and judged on the pieces between.
+    """
     errors_um, is_odd = np.full((recording.is_known.size, 2), np.nan), piece_numbers(recording) % 2 == 1
     for fitted_blocks in (recording.is_known & is_odd, recording.is_known & ~is_odd):
         judged_blocks = recording.is_known & ~fitted_blocks
@@ -61,8 +64,8 @@ def unseen_errors(recording: Equations, common: SharedGains) -> Real:
 
 
 def piece_numbers(recording: Equations) -> npt.NDArray[np.intp]:
-    """Return the piece number, 0 … PIECES − 1 within its stretch, of each block (blocks,); −1 where memory is not
-    known.
+    """Return the number of each block's piece (blocks,), 0 … PIECES − 1 within its stretch of known memory; −1 where
+    memory is not known.
     """
     numbers = np.full(recording.is_known.size, -1)
     for column in (recording.offsets.T > 0) & recording.is_known:
@@ -99,7 +102,7 @@ def _residual_columns(recording: Equations, common: SharedGains, own_gains: Real
 
 
 def _remove_play_offsets(recording: Equations, errors_um: Real) -> Real:
-    """Subtract from the errors of the plays alone their mean over each stretch, because plays leave the offset open.
+    """Subtract from the errors of the plays alone their mean over each stretch of known memory: plays have no offset.
 
     `errors_um` (blocks, 2) has the errors of the whole model and of its plays alone. Column 1 is changed in place where
     memory is known; the array is returned.
@@ -122,9 +125,7 @@ def _is_covered(recording: Equations, other_recordings: Sequence[Equations]) -> 
 
 
 def _play_travel(recording: Equations) -> Real:
-    """Return the largest range of every slope's column within a stretch (plays,); memory is unknown between
-    stretches.
-    """
+    """Return the largest range of every slope's column within one stretch of known memory, in V, (plays,)."""
     stretches = (recording.offsets.T > 0) & recording.is_known
     return np.max(
         [np.zeros(recording.slopes.shape[1]), *(np.ptp(recording.slopes[stretch], axis=0) for stretch in stretches)],

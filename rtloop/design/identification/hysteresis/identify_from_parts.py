@@ -116,7 +116,7 @@ def _trial_of_user_thresholds(thresholds: Real, stroke_v: float, hint: str) -> T
 
 
 def _require_stroke(runs: Sequence[AxisRecording], work: RecordingSet) -> tuple[float, str]:
-    """Return the longest stroke of known memory in V, and a hint for the missing one, "" if none.
+    """Return the longest stroke of known memory in V, and a text on the drive that would show more, "" if none would.
 
     Raises UnsuitableData if that stroke is shorter than LEAST_KNOWN_SHARE of the drive's range.
     """

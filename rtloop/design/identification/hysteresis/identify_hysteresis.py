@@ -54,7 +54,7 @@ def identify_hysteresis(
     """Fit one model to all `runs`, each from rest at 0 V, with `count` plays placed by `placement`, or at
     `thresholds_v`.
 
-    "auto": with a dead band ("chebyshev") or without ("chebyshev-from-0"), whichever leaves less of the recordings.
+    "auto": with a dead band ("chebyshev") or without ("chebyshev-from-0"), whichever has the smaller rms error.
     "invertible" `weights` have an inverse: no partial sum is below LEAST_SLOPE of the mean slope. "free" ones may have
     none. Raises UnsuitableData for a run without rest or loop, a wrong sign, thresholds beyond the drive, weights that
     cannot be told apart, and an actuator that no sum of plays explains; ValueError for a wrong `count`, `placement` or
@@ -103,7 +103,7 @@ def _fit_trial(recordings: RecordingSet, trial: Trial) -> HysteresisFit:
 
 
 def _require_thresholds_reached(trial: Trial, largest_v: float) -> None:
-    """Raise UnsuitableData for thresholds at or beyond `largest_v`."""
+    """Raise UnsuitableData for thresholds of the trial at or beyond `largest_v`, the largest |drive|."""
     unreached = trial.thresholds_v[trial.thresholds_v >= largest_v]
     if unreached.size:
         raise UnsuitableData(

@@ -41,7 +41,7 @@ class Judgement:
     `error_um` is held out, NaN where the memory is not known; `written_error_um` is the error of the written plays
     alone, without drift and creep; `early_error_um` is the error of the other blocks, with a memory estimated for them
     (`early_errors`), NaN elsewhere. `residual_um` is the residual of the fit to the blocks of known memory. `offset_um`
-    is the offset of the last stretch. `starts_from_rest`: the initial memory was given. `known_from_s` is the time from
+    is the offset in its last stretch. `starts_from_rest`: the initial memory was given. `known_from_s` is the time from
     which the memory of all plays is known, None if never. `unsettled_um` is the departure of the beginning from a
     periodic loop; `drift_um` the drift over the duration.
     """
@@ -122,10 +122,10 @@ def combine_errors(rms_um: Sequence[float]) -> CombinedError:
 def evaluate_from_rest(
     runs: Sequence[AxisRecording], shape: HysteresisFit, other_runs: Sequence[AxisRecording] = ()
 ) -> tuple[tuple[Judgement, ...], tuple[Judgement, ...]]:
-    """Judge `runs`, each from rest and held out in turn, and `other_runs`, of unknown memory, under plays placed as in
-    `shape`.
+    """Judge `runs`, each from rest and held out of the fit in turn, and `other_runs`, whose memory is unknown.
 
-    Returns the judgements of `runs`, then the judgements of `other_runs`.
+    Only thresholds and kind of weights come from `shape`; the weights are fitted anew. Return the judgements of `runs`,
+    then those of `other_runs`.
     """
     recordings = prepare_recordings(runs, shape.weights, [np.zeros(1)] * len(runs))
     trial = Trial(shape.model.thresholds, shape.placement, ())

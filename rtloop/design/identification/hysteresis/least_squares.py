@@ -34,7 +34,8 @@ class Equations(NamedTuple):
     """Equations of one recording, averaged over blocks: columns of slopes (blocks, plays), creep (blocks, terms),
     offsets (blocks, stretches) and drift (blocks, 1), or (blocks, 0) without; position in µm (blocks,).
 
-    `is_known` (blocks,) marks known memory; elsewhere the last stretch's offset applies.
+    A stretch is a part of the recording in which the state of all plays that move is known, and has an offset of its
+    own. `is_known` (blocks,) marks the blocks in one; in others the last stretch's offset applies.
     """
 
     slopes: Real
@@ -105,8 +106,9 @@ def fit_gains(recordings: Sequence[Equations], limits: Limits) -> tuple[SharedGa
 
 
 def fit_own_gains(recording: Equations, common: SharedGains) -> Real:
-    """Return a recording's own gains (offsets, then drift), fitted to its blocks of known memory under given common
-    gains.
+    """Return a recording's own gains (stretches + drifts,), its offsets in µm and then its drift.
+
+    They are fitted to its blocks of known memory; the gains `common` stay.
     """
     known_blocks = recording.select_blocks(recording.is_known)
     penalty_rows = known_blocks.is_known.size**0.5 * np.diag(recording.gain_penalties)
