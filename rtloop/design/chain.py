@@ -124,9 +124,10 @@ def _identify_stage(hysteresis: AxisRecording, step: AxisRecording, order: int |
 
 
 def design_controller(stage: Stage, design: DesignOptions) -> Chain:
-    """Synthesise a controller for `design`, whose plant is replaced by the identified one.
+    """Synthesise a controller for `design`, with the identified plant and the step recording's rate; return all results.
 
-    Raises NoController for a specification that none meets, ValueError for an incomplete one.
+    Raises as `synthesise_design`: NoController for a specification that no controller meets, ValueError for an
+    incomplete one.
     """
     completed = stage.complete_design(design)
     return Chain(stage, completed, synthesise_design(completed))

@@ -46,10 +46,11 @@ def from_control(system: Any) -> Transfer | FrequencyResponse:
     """
     if not isinstance(system, library.StateSpace | library.TransferFunction | library.FrequencyResponseData):
         raise ValueError(
-            f"{type(system).__name__}; allowed: StateSpace, TransferFunction, FrequencyResponseData of python-control"
+            f"system: a {type(system).__name__}; allowed: StateSpace, TransferFunction, FrequencyResponseData of "
+            "python-control"
         )
     if (system.ninputs, system.noutputs) != (1, 1):
-        raise ValueError(f"{system.ninputs} inputs and {system.noutputs} outputs; allowed: one of each")
+        raise ValueError(f"system: {system.ninputs} inputs and {system.noutputs} outputs; allowed: one of each")
     if isinstance(system, library.FrequencyResponseData):
         hz = np.asarray(system.omega) / (2 * np.pi)
         return FrequencyResponse(hz, np.asarray(system.frdata)[0, 0], np.ones(hz.size))

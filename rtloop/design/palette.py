@@ -27,7 +27,9 @@ class Palette:
     limit: str
 
     def label(self, panel: Any, x: str, y: str, title: str = "", legend: str | None = None) -> None:
-        """Label the axes of a panel, give it a title, and a transparent legend at the location `legend`; None: none."""
+        """Label the axes of a panel, give it a title, and a transparent legend at the location `legend`, matplotlib's
+        name for it; None: no legend.
+        """
         panel.set_xlabel(x)
         panel.set_ylabel(y)
         panel.set_title(title, loc="left", fontsize=10, fontweight="bold")
@@ -66,7 +68,7 @@ def draw_pictures(
 
 
 def _matplotlib_settings(ink: Palette) -> Any:
-    """Return matplotlib's settings for a palette."""
+    """Return matplotlib's settings (rcParams) for a palette as a dictionary."""
     return {
         "figure.facecolor": ink.background,
         "axes.facecolor": ink.background,

@@ -30,7 +30,8 @@ def remove_stale_comments(text: str, values: Mapping[str, Any], rewritten: Colle
     """Return `text` without the comments of sections that `values` lacks, or that differ and are named in `rewritten`.
 
     Comments of a section are those directly above its heading, without an empty line between, and those above its keys.
-    Comments behind a value stay. Raises TOMLDecodeError for a text that is not TOML.
+    Comments behind a value stay. If the text would then hold other values, it is returned unchanged. Raises
+    TOMLDecodeError for a text that is not TOML.
     """
     old_values = tomllib.loads(text)
     cleaned_lines: list[str] = []

@@ -41,8 +41,8 @@ def edit_text(
     """Return `text` changed to hold `values` and no other keys, with its old comments, below new `comments`.
 
     A first line `#:schema` stays the first. A comment is removed with its section or value, with a value that changes,
-    and with a table named in `rewritten` that differs. If the form of `text` cannot be
-    changed in place, the values are written without the old comments.
+    and with a table named in `rewritten` that differs. If `text` is no TOML or of a form that cannot be changed in
+    place, the values are written without the old comments.
     """
     heading = "".join(f"# {comment}".rstrip() + "\n" for comment in comments)
     schema_line, text = split_schema_line(text)
@@ -93,7 +93,9 @@ def _take_last_lines(table: Any) -> list[Any]:
 
 
 def _find_last_entries(table: Any) -> list[Any]:
-    """Return the entries, (key or None, item), of the last table within a table or document, or of itself."""
+    """Return the list of entries, (key or None, item), of the last table within a table or document, or its own if it
+    contains none. It is tomlkit's own list: changes of it change the document.
+    """
     while True:
         if isinstance(table, AoT):
             table = table.body[-1]
@@ -139,7 +141,7 @@ def _table(values: Mapping[str, Any], holds_tables_alone: bool = False) -> Table
 
 
 def _array(values: Sequence[Any] | npt.NDArray[Any]) -> Array:
-    """Return a list as TOML array, of more than LIST_WIDTH characters with a line for each entry."""
+    """Return a list as TOML array, with a line for each entry if it is longer than LIST_WIDTH characters."""
     items = [_inline_item(value) for value in values]
     array = tomlkit.array()
     if len(items) > LIST_WIDTH:  # appended one by one they take a time that grows with its square

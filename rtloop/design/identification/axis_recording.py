@@ -31,7 +31,7 @@ _TRIP_REMEDIES = {
     "damped stage overshoots. Wider interlocks.sensor_min_v and sensor_max_v help only inside the converter's range.",
     "position": "Use a smaller drive or step, or a larger interlocks.position_um if the stage may move so far.",
     "oscillation": "Use a smaller drive or step, or a larger interlocks.oscillation_um if the stage may ring so far.",
-    "frozen": "The reading stood still while the drive moved: look after the sensor and its wires.",
+    "frozen": "The reading stood still while the drive moved: check the sensor and its wires.",
 }
 _OTHER_REMEDY = "A smaller drive does not prevent this trip: see the cause in `rtloop info`, and record again."
 """Sentences that tell how to avoid a trip, by its cause, and the one for all other causes."""

@@ -91,9 +91,7 @@ def dynamics_provenance(fit: DynamicsFit, run: AxisRecording, input_kind: str) -
 def static_gain_text(gain: float, input_kind: str, spread: str = "") -> str:
     """Return a clause with the static gain of the dynamics, and where in a configuration it belongs.
 
-    This depends on the input of the identification, `input_kind`: "hysteresis", "command" or "drive".
-
-    `spread` follows the number, such as " ± 0.1 (1σ)".
+    This depends on the input of the identification, `input_kind`: "hysteresis", "command" or "drive". `spread` follows the number, such as " ± 0.1 (1σ)".
     """
     number = f"its static gain of {gain:.6g}{spread}"
     if input_kind == "hysteresis":

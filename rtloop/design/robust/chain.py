@@ -77,8 +77,8 @@ def design_robust_loop(
     stage: Stage, design: DesignOptions, axis: str | None, folder: Path, spec_name: str, spec_text: str,
     progress: Progress = lambda _: None,
 ) -> tuple[RobustChain, str]:  # fmt: skip
-    """Design a controller and its taps; return both with the configuration text that has them in axis `axis` (None:
-    first).
+    """Design a controller and its taps; return the results of all steps, and a configuration as TOML that has the
+    design in axis `axis` (None: the first).
 
     `spec_name` is the specification's path relative to `folder`, the configuration's folder. `design` has passed
     `require_specified`. `progress` receives a sentence after each attempt. Raises NoDesign with the missed requirement,
@@ -124,14 +124,16 @@ def require_specified(design: DesignOptions, source: str) -> None:
 
 
 def _selected_axis(configuration: Configuration, axis: str | None) -> AxisOptions:
-    """Return the options of axis `axis`, None: the first."""
+    """Return the options of the axis named `axis` (None: the first), which must exist."""
     return next(entry for entry in configuration.axes if axis in (None, entry.name))
 
 
 def _require_reachable_steps(
     stage: Stage, design: DesignOptions, axis: str | None, folder: Path, spec_name: str
 ) -> None:
-    """Raise NoDesign for a reference that the stage's drive cannot hold: it precedes the long computation."""
+    """Raise NoDesign if the stage's drive cannot hold the specification's reference step: a check before the long
+    computation. Nothing is checked for a design without a plant.
+    """
     configuration = parse(stage_configuration(stage, {}, [], axis, spec_name), "identified", folder, spec_name)
     axis_options = _selected_axis(configuration, axis)
     if design.plant is None:
@@ -205,7 +207,7 @@ def _find_damped_controller(design: DesignOptions, progress: Progress) -> Robust
 
 def _least_damped_mode(robust: RobustDesign) -> tuple[float, float]:
     """Return frequency (Hz) and damping of the least damped closed-loop mode of the model near its leading modes;
-    without a mode there, the damping is 1.
+    without a mode there, the damping is 1, and the frequency has no meaning.
     """
     family = robust.family
     controller = discretise_controller(robust.controller, family.period_s, "matched")
@@ -261,8 +263,8 @@ def _slowest_hz(family: Family) -> float:
 
 
 def _limit_command(subject: Subject, design: DesignOptions) -> Subject:
-    """Return `subject` with |v| limited to `specification.command.command_um`, if that is larger than its reference
-    step.
+    """Return `subject` with |v| limited to `specification.command.command_um` too, unchanged unless that is larger than
+    its reference step.
     """
     command, bounds = design.specification.command, subject.bounds
     if command is None or command.command_um <= command.reference_um:

@@ -68,8 +68,8 @@ class Objective:
         self.responses = np.array([plant.response(self.z) for plant in plants])
 
     def __call__(self, points: Real) -> Real:
-        """Return costs (k,) of points (k, n): the log of the slowest decay in periods, plus WALL_SLOPE times the log of
-        each excess over a limit.
+        """Return costs (k,) of points (k, n): the log of the slowest decay in periods, half of the worst band and half
+        of the bands' mean, plus WALL_SLOPE times the log of each excess over a limit.
 
         Outside the bounds, the cost is the cost of the nearest point inside plus the squared distance. An unstable
         point costs at least UNSTABLE_COST.

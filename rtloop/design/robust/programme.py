@@ -192,7 +192,8 @@ def _solve_dual(
     """Return the variables x of least `cost`·x with A x ≤ b, static response 1 and x within `limits`; None if
     infeasible.
 
-    Raises NoDesign if no solver finishes.
+    A is `matrix_a`, b `limit`, and the row `static` (1, variables) times x the static response. Raises NoDesign if no
+    solver finishes.
 
     The dual is solved: least b·y + z with Aᵀy + zs = −c and 0 ≤ y ≤ LARGEST_PRICE. It has tens of rows for the
     thousands of A, many nearly equal, among which a simplex may take minutes instead of fractions of a second. A row
@@ -220,7 +221,10 @@ def _solve_dual(
 
 
 def _worst_rows(violation: Real, candidates: npt.NDArray[np.intp]) -> npt.NDArray[np.intp]:
-    """Return the indices of the most violated row of each run of neighbours, at most MOST_NEW, worst first."""
+    """Return the indices of rows that are violated most among their neighbours, at most MOST_NEW, worst first.
+
+    `violation` (rows,) has all rows, `candidates` the indices of those that are violated.
+    """
     previous, following = np.r_[0.0, violation[:-1]], np.r_[violation[1:], 0.0]
     peaks = candidates[
         (violation[candidates] >= previous[candidates]) & (violation[candidates] >= following[candidates])

@@ -17,7 +17,7 @@ from rtloop.version import __version__
 
 
 def robust_section(robust: RobustDesign, design: DesignOptions, source: str, text: str) -> str:
-    """Return the text of [axis.controller], which depends on the specification alone.
+    """Return [axis.controller] as TOML below comments on its origin; it depends on the specification alone.
 
     `source` is the specification's name, `text` its content.
     """
@@ -65,7 +65,9 @@ def insert_taps(
 
 
 def taps_section(tap_design: TapDesign, subject: Subject, source: str) -> str:
-    """Return the text of [axis.prefilter]; `source` is the name of the configuration with the controller."""
+    """Return [axis.prefilter] as TOML below comments on its origin; `source` is the name of the configuration with the
+    controller.
+    """
     return write_section("axis.prefilter", taps_values(tap_design.taps), taps_provenance(tap_design, subject, source))
 
 
@@ -139,5 +141,5 @@ def _remove_provenance(text: str, heading: str) -> str:
 
 
 def _output(design: DesignOptions) -> OutputOptions:
-    """Return output options with the method "matched", which recovers the written roots exactly."""
+    """Return the output options of `design` with the method "matched", which recovers the written roots exactly."""
     return design.controller.model_copy(update={"method": "matched", "prewarp_hz": None})

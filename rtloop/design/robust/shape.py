@@ -57,8 +57,8 @@ class Subject:
 
 
 class StepMeasures(NamedTuple):
-    """Figures of a unit step: settling to ±5 % (ms), overshoot (fraction), excess of v over its limits (negative
-    inside), undershoot, least and largest v.
+    """Figures of a unit step: settling to ±5 % (ms), overshoot (fraction), excess of v over its limits per unit step
+    (negative inside), undershoot (fraction), least and largest v per unit step.
     """
 
     settling_ms: float
@@ -73,7 +73,8 @@ class TapDesign(NamedTuple):
     """Taps that settle in `settling_ms`; `fastest_ms` is the least possible.
 
     `proof` holds the worst figures of `proved_count` plants at PROOF_POINTS points a tick; `step` is the model's step
-    (t in s, x, v), `variation` the total variation of its v; `curve` the trade-off (ms, ε).
+    (t in s, x, v), `variation` the total variation of its v; `curve` has points (settling time in ms, least overshoot)
+    of the trade-off, none unless they were asked for.
     """
 
     taps: Taps
@@ -95,12 +96,12 @@ def design_taps(
 ) -> TapDesign:
     """Design the taps of reference and feedforward for the loop of `subject`.
 
-    The taps settle fastest, or in `subject.options.settling_ms` if set; of these the ones with the least
-    variation of the command v. They are designed for some plants of the family, and proved by a simulated step on many;
-    a round adds the plants that fail. `curve` adds the trade-off of settling time and overshoot, `progress` receives a
-    sentence per round. `may_be_late`: if `settling_ms` cannot be reached, return the fastest taps instead. Raises
-    NoDesign with the binding limit and possible relaxations if no taps exist, if the proof fails MOST_ROUNDS times, if
-    the loop of a plant is unstable, and if no solver finishes.
+    The taps settle fastest, or in `subject.options.settling_ms` if set; of these the ones with the least variation of
+    the command v. They are designed for some plants of the family, and proved by a simulated step on many; a round adds
+    the plants that fail. `curve` adds the trade-off of settling time and overshoot, `progress` receives a sentence per
+    round. `may_be_late`: if `settling_ms` cannot be reached, return the fastest taps instead. Raises NoDesign with the
+    binding limit and possible relaxations if no taps exist, if the proof fails MOST_ROUNDS times, if the loop of a
+    plant is unstable, and if no solver finishes.
     """
     options, tick_ms, family = subject.options, 1e3 * subject.controller.period_s, subject.family()
     scenarios = list(dict.fromkeys([family.nominal, *family.sweep_scenarios(SWEEP_PLACES)]))
@@ -256,7 +257,10 @@ def _simulate_step(subject: Subject, taps: Taps, scenario: Scenario) -> tuple[Re
 
 
 def _scenario_responses(subject: Subject, family: Family, scenario: Scenario, points: int, ticks: int) -> Responses:
-    """Return the responses of one scenario over `ticks`. Raises NoDesign if its loop is unstable."""
+    """Return the responses of the loop of one scenario over `ticks` ticks, with `points` positions a tick.
+
+    Raises NoDesign if the loop is unstable.
+    """
     try:
         return step_responses(subject.controller, family.plant(scenario), scenario.delay_ticks, points, ticks)
     except ValueError as error:

@@ -111,8 +111,8 @@ def synthesise_design(design: DesignOptions) -> Synthesis:
     """Synthesise the controller of SPEC.toml, for a loop stable at [controller] rate_hz behind the plant's delay.
 
     A delay, and half a period for the hold, belong to the design plant. Without a delay the hold is added only if
-    no controller runs otherwise. Raises ValueError for an incomplete specification, NoController, with a remedy, for
-    a contradictory one.
+    no controller runs otherwise. Raises as `synthesise`: NoController, with a remedy, for a contradictory
+    specification; ValueError for an order or a plant that is not allowed, and for an incomplete specification.
     """
     plant, weights, options = design.required_plant.transfer(), build_weights(design), design.synthesis
     _require_possible(plant, design)
@@ -163,7 +163,10 @@ def _require_possible(plant: Transfer, design: DesignOptions) -> None:
 
 
 def _explain_contradiction(plant: Transfer, weights: Weights, gamma: float, largest: float) -> str:
-    """Return a message that names the weight that makes γ large, by γ with each of them relaxed."""
+    """Return a message that names the weight that makes γ_opt, `gamma`, large, by γ_opt with each of them relaxed.
+
+    `largest` is the largest γ_opt allowed.
+    """
     w1, w2, w3 = weights
     slower = Transfer(w1.zeros / 10, w1.poles / 10, w1.gain)
     relaxed_weights = {

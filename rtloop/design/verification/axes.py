@@ -67,8 +67,9 @@ def verify_axis(
 
 
 def _plant_differences(axis: AxisOptions, design: DesignOptions) -> list[str]:
-    """Return one sentence if the model of an axis, which is judged, differs from the plant of its specification; [] if
-    not, or without one of both.
+    """Return one sentence if the model of an axis, which is judged, differs from the plant of its specification.
+
+    [] if it does not, and if one of them is missing.
 
     It names gain at 0 Hz, resonance and delay where they differ by more than SAME_PLANT, else the frequency below ten
     resonances or 10 kHz with the largest difference of the responses, if that is above SAME_RESPONSE.
@@ -106,8 +107,8 @@ def _add_contradictions(
     """Return the verification with the contradictions between axis and hardware, also as warnings, and with the loop
     judged on the simulated rig.
 
-    `on_rig` is None for other drivers, without a linear loop, and without a contradiction if the loop is stable on the
-    rig. Raises ValueError for a rig's plant with direct feedthrough.
+    Its `on_rig` is None for drivers other than a simulated rig, without a linear loop, and without a contradiction if
+    the loop is stable on the rig. Raises ValueError for a rig's plant with direct feedthrough.
     """
     axis = next(axis for axis in configuration.axes if axis.name == check.name)
     (lines, on_rig), rig_verification = compare_with_rig(configuration, axis, check), None
@@ -147,7 +148,7 @@ def add_simulation(configuration: Configuration, verifications: Verifications) -
 
 
 def _hardware_model(axis: AxisOptions, design: DesignOptions) -> HardwareModel:
-    """Return the model of an axis (else of its specification) with the sensor of its specification."""
+    """Return the model of an axis, else the one of its specification, else None, with the specification's sensor."""
     sensor, residual_percent = design.sensor, design.simulation.residual_percent
     model = axis.model or design.plant
     return HardwareModel(model, sensor.noise_um, sensor.resolution_um, sensor.bandwidth_hz, residual_percent)

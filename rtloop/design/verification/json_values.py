@@ -58,8 +58,8 @@ def _scenarios(scenarios: ScenarioResults) -> dict[str, Any]:
 
 
 def _row(row: Row) -> dict[str, Any]:
-    """Return one quantity for JSON: name, unit, required limit, value and verdict of both loops, claim; null for
-    none.
+    """Return one quantity for JSON: name, unit, required (value, at_most), continuous and running (the values of both
+    loops) with continuous_met and running_met, claim; null for none.
     """
     limit = row.limit
     return {

@@ -182,7 +182,9 @@ def prediction_errors(model: Innovations, run: Excitation) -> Real:
     """Return the one-step-ahead errors in µm (samples,). Raises ArithmeticError for an unstable predictor."""
     errors = model.errors(run.input, run.position_um)
     if errors is None:
-        raise ArithmeticError(f"{run.name}: the predictor of the model of order {model.order} is unstable")
+        raise ArithmeticError(
+            f"{run.name}: the predictor of the model of order {model.order} is unstable; use another order"
+        )
     return errors
 
 

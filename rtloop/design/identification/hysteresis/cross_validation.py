@@ -49,8 +49,8 @@ def cross_validate(recordings: Sequence[Equations], limits: Limits) -> list[Real
 
 
 def unseen_errors(recording: Equations, common: SharedGains) -> Real:
-    """Return errors in µm (blocks, 2) of a recording not used for `common`, as `cross_validate`; NaN where memory is not
-    known. Its own offsets and drift are fitted to every other piece, and judged on the pieces between.
+    """Return errors in µm (blocks, 2) of a recording not used for `common`, as `cross_validate`; NaN where memory is
+    not known. Its own offsets and drift are fitted to every other piece, and judged on the pieces between.
     """
     errors_um, is_odd = np.full((recording.is_known.size, 2), np.nan), piece_numbers(recording) % 2 == 1
     for fitted_blocks in (recording.is_known & is_odd, recording.is_known & ~is_odd):
