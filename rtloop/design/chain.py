@@ -124,7 +124,7 @@ def _identify_stage(hysteresis: AxisRecording, step: AxisRecording, order: int |
 
 
 def design_controller(stage: Stage, design: DesignOptions) -> Chain:
-    """Synthesise a controller for `design`, with the identified plant and the step recording's rate; return all results.
+    """Synthesise a controller for `design`, with the identified plant at the step recording's rate; return all results.
 
     Raises as `synthesise_design`: NoController for a specification that no controller meets, ValueError for an
     incomplete one.

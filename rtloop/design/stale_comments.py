@@ -19,7 +19,10 @@ def split_schema_line(text: str) -> tuple[str, str]:
 
 
 def remove_first_comments(text: str) -> str:
-    """Return a configuration without the comments of its first paragraph, which describe its former purpose."""
+    """Return a configuration without its first paragraph if that is comments alone, which describe its former purpose.
+
+    A first line `#:schema` stays; so does a paragraph that no other follows.
+    """
     schema_line, text = split_schema_line(text)
     paragraph, gap, remainder = text.partition("\n\n")
     is_comment = all(line.startswith("#") for line in paragraph.splitlines())

@@ -20,7 +20,8 @@ def steps_reference(limits: LimitsOptions, actuator: PlayModel, slowest_hz: floa
     """Return [axis.reference]: a square wave between STEP_PART of the largest command, rounded to one digit, and 0.
 
     An actuator that does not come back to 0 within the drive's limits gets a square wave within the positions that it
-    does come back to. Each level lasts whole ticks: at least LEAST_DWELL_S, and DWELL_SWINGS periods of `slowest_hz`.
+    does come back to. Each level lasts whole ticks: at least LEAST_DWELL_S, and DWELL_SWINGS periods of `slowest_hz`
+    (inf without a mode). Its keys are `kind`, `levels` (two, in µm) and `dwell_s`.
     """
     dwell_s = max(LEAST_DWELL_S, DWELL_SWINGS / slowest_hz)
     dwell_s = math.ceil(dwell_s / period_s) * period_s
@@ -29,7 +30,7 @@ def steps_reference(limits: LimitsOptions, actuator: PlayModel, slowest_hz: floa
 
 
 def describe_reference(values: Mapping[str, Any]) -> str:
-    """Return the values of `steps_reference` as words."""
+    """Return `values`, as of `steps_reference`, as words: both levels in µm, and the duration of each."""
     levels = " and ".join(f"{level:g}" for level in values["levels"])
     return f"steps between {levels} µm, {values['dwell_s']:g} s each"
 

@@ -267,7 +267,7 @@ def _first_clipped_tick(drive: Real, adc: Real) -> int | None:
 
 
 def _require_untripped(path: Path, flags: Real) -> None:
-    """Raise UnsuitableData, with the first such tick, if a tick's flags hold a trip; `flags` (ticks,)."""
+    """Raise UnsuitableData if `flags` (ticks,) contain a trip, with its first tick, its causes and a remedy."""
     is_tripped = np.array([bool(trip_causes(value)) for value in np.unique(flags)])
     if not np.any(is_tripped):
         return
@@ -280,7 +280,7 @@ def _require_untripped(path: Path, flags: Real) -> None:
 
 
 def trip_remedy(causes: Sequence[str]) -> str:
-    """Return what prevents a trip of these causes in a recording for identification, as sentences."""
+    """Return sentences that tell how to prevent a trip of these causes, named as by `trip_causes`, in a recording."""
     remedies = dict.fromkeys(_TRIP_REMEDIES.get(cause, _OTHER_REMEDY) for cause in causes)
     return " ".join(remedies)
 

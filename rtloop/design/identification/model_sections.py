@@ -33,7 +33,7 @@ Section = TypeVar("Section", bound=Options)
 
 
 def feedforward_section(model: PlayModel, comments: Sequence[str]) -> str:
-    """Return [axis.feedforward] as text. Raises UnsuitableData for weights that have no inverse."""
+    """Return [axis.feedforward] as TOML below comment lines. Raises UnsuitableData for weights without an inverse."""
     return write_section("axis.feedforward", feedforward_values(model), comments)
 
 
@@ -50,7 +50,7 @@ def feedforward_values(model: PlayModel) -> dict[str, Any]:
 
 
 def model_section(fit: DynamicsFit, comment_lines: Sequence[str]) -> str:
-    """Return [axis.model] as text, with zeros, poles, gain and delay."""
+    """Return [axis.model] as TOML below comment lines: zeros, poles, gain and delay."""
     return write_section("axis.model", model_values(fit), comment_lines)
 
 
@@ -60,7 +60,7 @@ def model_values(fit: DynamicsFit) -> dict[str, Any]:
 
 
 def hysteresis_provenance(fit: HysteresisFit, runs: Sequence[AxisRecording]) -> list[str]:
-    """Return comment lines on the origin of the hysteresis model."""
+    """Return three comment lines, without #, on the origin of the hysteresis model: recordings, plays, errors."""
     return [
         f"Hysteresis, identified by rtloop {__version__} from {describe_sources(runs)}",
         f"{fit.model.thresholds.size} play operators, thresholds {fit.placement}, weights {fit.weights}; "
@@ -71,7 +71,10 @@ def hysteresis_provenance(fit: HysteresisFit, runs: Sequence[AxisRecording]) -> 
 
 
 def dynamics_provenance(fit: DynamicsFit, run: AxisRecording, input_kind: str) -> list[str]:
-    """Return comment lines on the origin of the dynamics; `input_kind` is "hysteresis", "command" or "drive"."""
+    """Return four comment lines, without #, on the origin of the dynamics: recording, fit, modes, static gain.
+
+    `input_kind` is the input of the identification: "hysteresis", "command" or "drive".
+    """
     modes = (
         f"{mode.frequency_hz:.2f} ± {mode.frequency_std_hz:.2g} Hz (ζ {mode.damping:.5f})"
         if math.isfinite(mode.frequency_std_hz)
@@ -91,7 +94,8 @@ def dynamics_provenance(fit: DynamicsFit, run: AxisRecording, input_kind: str) -
 def static_gain_text(gain: float, input_kind: str, spread: str = "") -> str:
     """Return a clause with the static gain of the dynamics, and where in a configuration it belongs.
 
-    This depends on the input of the identification, `input_kind`: "hysteresis", "command" or "drive". `spread` follows the number, such as " ± 0.1 (1σ)".
+    This depends on the input of the identification, `input_kind`: "hysteresis", "command" or "drive". `spread` follows
+    the number, such as " ± 0.1 (1σ)".
     """
     number = f"its static gain of {gain:.6g}{spread}"
     if input_kind == "hysteresis":

@@ -68,5 +68,5 @@ def _complex(pairs: Any) -> Complex:
 
 
 def _format_margin(margin: Mapping[str, float | None]) -> str:
-    """Return a margin with its standard deviation as text; "–" without a value."""
+    """Return a margin, its "value" ± its "std", as text; "–" if the value is None."""
     return "–" if margin["value"] is None else f"{margin['value']:.4g} ± {margin['std']:.2g}"

@@ -75,7 +75,10 @@ def draw_dynamics(fit: DynamicsFit, run: Excitation, measured: FrequencyResponse
 
 
 def _draw_in_time(fit: DynamicsFit, run: Excitation, full: Any, zoom: Any, difference: Any) -> None:
-    """Draw measured and modelled position over time in full, a part of them, and their difference, in a panel each."""
+    """Draw measured and modelled position over time, an enlarged part of them, and their difference, in a panel each.
+
+    Only the first POINTS samples are drawn.
+    """
     residual_um = residual_noise(fit.model, run) if isinstance(run, LoopExcitation) else None
     if residual_um is None:
         residual_um = run.position_um - run.position_um[0] - fit.model.simulate_output(run.input)

@@ -59,6 +59,7 @@ class NoTaps(NoDesign):
     """No taps suit the controller that was found; `text` is the configuration with the controller alone."""
 
     def __init__(self, message: str, text: str) -> None:
+        """Store `text`, the configuration with the controller alone; `message` says why there are no taps."""
         super().__init__(message)
         self.text = text
 
@@ -112,8 +113,8 @@ def design_robust_loop(
 
 
 def require_specified(design: DesignOptions, source: str) -> None:
-    """Raise ConfigError, with all missing entries, for an incomplete specification: it precedes the long
-    computation.
+    """Raise ConfigError, with all missing entries, for an incomplete specification: a check before the long
+    computation. `source` names the specification's file.
     """
     specification = design.specification
     faults = missing_requirements(specification)

@@ -56,6 +56,7 @@ class Objective:
     """
 
     def __init__(self, family: Family, scenarios: Sequence[Scenario], walls: Walls, sections: int):
+        """Prepare plants and frequencies for controllers with `sections` second-order sections, limited by `walls`."""
         self.walls, self.period_s = walls, family.period_s
         self.low, self.high = point_bounds(sections)
         self.bands = family.bands if family.modes.size else np.array([[0.0, np.inf]])

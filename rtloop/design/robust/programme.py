@@ -84,6 +84,11 @@ class Programme:
     """
 
     def __init__(self, scenario_responses: list[Responses], taps: int, points: int, bounds: Bounds, band: float = BAND):
+        """Set up the rows of the programme from `scenario_responses`, the model's first; `points` are positions a tick.
+
+        `taps` is their number in each of the two rows, `band` the settling band as a fraction. The first solution uses
+        only some of the rows, marked in `active`.
+        """
         self.taps, self.points, self.band = taps, points, band
         self.ticks = scenario_responses[0].command.shape[1]
         self.time = np.tile(np.arange(1, self.ticks * points + 1) / points, len(scenario_responses))
@@ -102,20 +107,20 @@ class Programme:
 
     def is_feasible(self, settling: float, overshoot: float) -> bool:
         """Whether some taps settle in `settling` ticks with an overshoot up to USED_SHARE of `overshoot`, a fraction of
-        the step.
+        the step. Raises NoDesign if no solver finishes.
         """
         return self._solve(settling, np.eye(2 * self.taps + 1)[-1], overshoot) is not None
 
     def least_overshoot_taps(self, settling: float) -> Taps | None:
         """Return the taps of least overshoot ε that settle in `settling` ticks; None if there are none with ε up to
-        USED_SHARE of the band.
+        USED_SHARE of the band. Raises NoDesign if no solver finishes.
         """
         solved = self._solve(settling, np.eye(2 * self.taps + 1)[-1], None)
         return None if solved is None else self._split_taps(solved)
 
     def quietest_taps(self, settling: float, overshoot: float) -> Taps | None:
         """Return the taps of least variation of v on the model that settle in `settling` ticks, with an overshoot up to
-        USED_SHARE of `overshoot`; None if there are none.
+        USED_SHARE of `overshoot`; None if there are none. Raises NoDesign if no solver finishes.
         """
         rows = self._penalty_rows()
         weights = np.where(np.arange(rows.shape[0]) < rows.shape[0] - 2 * self.taps, 1.0, TAP_WEIGHT)
@@ -140,7 +145,7 @@ class Programme:
         infeasible.
 
         `settling` in ticks, ε up to USED_SHARE of `overshoot` (None: of the band). Rows that were violated stay in
-        `active`.
+        `active`. Raises NoDesign if no solver finishes.
         """
         count, extra = 2 * self.taps + 1, cost.size - 2 * self.taps - 1
         is_settled = self.time >= settling - 1e-9

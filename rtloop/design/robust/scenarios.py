@@ -28,6 +28,7 @@ class Scenario(NamedTuple):
     delay_ticks: int
 
     def __str__(self) -> str:
+        """Return the changes as one line, such as "resonance +10 %, damping × 0.5, gain -5 %, delay_ticks 2"."""
         parts = [f"resonance {'/'.join(f'{percent:+.3g}' for percent in self.resonance)} %"] if self.resonance else []
         return ", ".join(
             [*parts, f"damping × {self.damping:.3g}", f"gain {self.gain:+.3g} %", f"delay_ticks {self.delay_ticks}"]
@@ -42,6 +43,10 @@ class Family:
     """
 
     def __init__(self, model: Transfer, delay_ticks: int, options: ScenarioOptions, period_s: float):
+        """Find the lightly damped modes of `model` below half the rate, and which of them lead.
+
+        `delay_ticks` is the delay in samples unless `options` list delays.
+        """
         self.model, self.options, self.period_s = model, options, period_s
         self.modes = light_modes(model, period_s)
         peaks = np.abs(model.response(1j * np.abs(self.modes)))

@@ -149,7 +149,8 @@ def design_walls(design: DesignOptions) -> Walls:
 
 
 def _tighten(search_walls: Walls, walls: Walls, proof: Certificate) -> Walls:
-    """Return limits for another round, lowered by the excess in the proof, each by LEAST_FACTOR at most.
+    """Return limits for another round of the search: `search_walls`, each lowered by its excess over the requested
+    `walls` in the proof, by LEAST_FACTOR at most.
 
     A peak may lie between a search's points.
     """

@@ -37,7 +37,7 @@ def controller_section(synthesis: Synthesis, design: DesignOptions, source: str,
 
 
 def commented_section(controller: Transfer, output: OutputOptions, lines: Sequence[str]) -> str:
-    """Return [axis.controller] as text, below comment `lines`."""
+    """Return [axis.controller] as TOML, below comment `lines`."""
     return write_section("axis.controller", controller_values(controller, output), lines)
 
 
@@ -45,10 +45,10 @@ def controller_configuration(
     synthesis: Synthesis, design: DesignOptions, source: str, text: str, axis: str, specification: str,
     actuator: PlayModel | None = None,
 ) -> str:  # fmt: skip
-    """Return a configuration with the controller on axis `axis`, which `check`, `run` and `ctl controller` can load.
+    """Return a configuration as TOML with the controller on axis `axis`, for `check`, `run` and `ctl controller`.
 
     Its rig is the plant of `design`. `source` is the specification's name, `text` its content, `specification` its path
-    relative to the configuration, `actuator` the identified one.
+    relative to the configuration, `actuator` the identified one, None a placeholder.
     """
     lines = provenance(synthesis, design, source, text)
     return configuration_around(synthesis.controller, design, lines, axis, specification, actuator)

@@ -96,7 +96,7 @@ def _reduce_and_finish(
     finish: Callable[[Transfer], Transfer | None],
 ) -> tuple[Transfer, float]:
     """Return the reduced, finished controller and the weighted loop's norm with it; `full` and inf if `finish` accepts
-    none.
+    none, and if numpy fails to compute them.
 
     The norm is infinite if the loop is unstable. Raises ValueError for an order that `reduce_order` refuses.
     """

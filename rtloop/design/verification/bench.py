@@ -55,6 +55,10 @@ class Bench:
     """
 
     def __init__(self, configuration: Configuration, hardware_models: Mapping[str, HardwareModel]) -> None:
+        """Prepare the configured rig, or one of `hardware_models` by axis; nothing runs yet.
+
+        Raises ValueError if no rig can represent the hardware, ConfigError for a configuration that cannot run.
+        """
         self.is_configured = configuration.driver_kind == "sim" or isinstance(
             configuration.driver_options, BoardOptions
         )
@@ -95,8 +99,8 @@ def _place_on_rig(
 ) -> tuple[Configuration, RigOptions]:
     """Return the configuration in closed loop, at rest, without schedule, on a rig, and the rig's options.
 
-    A configured rig is used; otherwise one is made. Raises ValueError for channels that belong to no axis, and for
-    an axis without a model.
+    A configured rig is used; otherwise one is made. Raises ValueError for [inputs] and [outputs] without a configured
+    rig 'sim', for an axis without a model, and for a residual hysteresis that cannot be made.
     """
     loop = configuration.loop.model_copy(update={"mode": "closed_loop", "enable_input": None, "hold_input": None})
     axes = tuple(axis.model_copy(update={"reference": HoldOptions()}) for axis in configuration.axes)
@@ -127,7 +131,7 @@ def _place_on_rig(
 
 
 def _plant(axis: AxisOptions, hardware_model: HardwareModel, um_per_v: float) -> PlantOptions:
-    """Return the simulated plant for an axis's hardware.
+    """Return the simulated plant for an axis's hardware; its sensor has the scale `um_per_v`.
 
     Raises ValueError without a model, and for a residual hysteresis that `add_residual_hysteresis` cannot make.
     """

@@ -96,8 +96,8 @@ def slowest_near_s(loop: Loop, resonance: float) -> float:
 
 
 def loop_quantities(loop: Loop, sensor: SensorOptions) -> dict[str, float]:
-    """Return the other quantities of a loop by name: largest pole (real part in s, magnitude in z), crossover, margins,
-    max |S|, |S| at 1 Hz and, as in `_noise`, sensor noise.
+    """Return the quantities of a loop beside `specified_quantities`, by name: `max_re_pole` (continuous loop) or
+    `max_abs_pole` (sampled), crossover, margins, max |S|, |S| at 1 Hz and, as in `_noise`, sensor noise.
     """
     margins = loop_margins(loop)
     name, magnitudes = (

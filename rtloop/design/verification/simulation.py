@@ -43,7 +43,7 @@ LIMIT_FLAGS = {Flag.COMMAND_LIMITED: "command", Flag.DRIVE_LIMITED: "drive", Fla
 
 
 def simulate(bench: Bench, axis: AxisOptions, slowest_s: float, design: DesignOptions) -> SimulationResult:
-    """Simulate steps and rest of an axis whose linear loop has the slowest 1/|Re s| `slowest_s`.
+    """Simulate steps and rest of an axis; `slowest_s` is 1/|Re s| in s of the slowest mode of its linear loop.
 
     Each height is simulated where `_levels` places it; heights that fit nowhere are omitted. A height whose figures
     noise decides is run more often. Raises ValueError for a run whose recorded reference has no step, and for a
@@ -85,7 +85,10 @@ def _noise_at_rest_nm(bench: Bench, axis: str, reach_um: float) -> list[float]:
 
 
 def _command_range(axis: AxisOptions) -> PositionRange:
-    """Return the static commands in µm that limits and drive allow, in any order. Raises ValueError without inverse."""
+    """Return the range of static commands in µm that limits and drive allow, in any order.
+
+    Raises ValueError for a hysteresis model without inverse.
+    """
     limits = axis.limits
     return reachable_range(axis.feedforward.actuator(), limits.lowest_v, limits.drive_v, limits.command_um)
 

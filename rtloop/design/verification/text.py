@@ -233,8 +233,8 @@ def shifts(verification: Verification) -> list[tuple[str, str]]:
 def format_range(tolerated: PercentRange | None) -> str:
     """Return "down … up" in percent.
 
-    "no requirement is met" for None, "none" for no tolerated change, "no lower limit" and "no upper limit" where no
-    change within the searched range is too large.
+    "no requirement is met" for None, "none" for no tolerated change, "no lower limit" or "no upper limit" where no
+    change within the searched range is too large, "no limit in the range searched" for both.
     """
     if tolerated is None:
         return "no requirement is met"

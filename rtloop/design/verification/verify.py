@@ -156,8 +156,9 @@ class Verification:
     @property
     def meets_specification(self) -> bool:
         """Whether the running loop is stable and meets all requirements, also in the scenarios and simulated steps
-        that are judged, and within the delay margin of this host if it was measured. With contradictions, the loop
-        on the simulated rig must meet them too.
+        that are judged, and within the delay margin of this host if it was measured.
+
+        A loop judged on the simulated rig (`on_rig`) must meet them there too; contradictions without it give False.
         """
         scenarios_hold = self.scenarios is None or not self.scenarios.missed_rows
         simulation_holds = self.simulated is None or not self.simulated.violations
@@ -229,7 +230,7 @@ def verify(
 
 
 def _weights(design: DesignOptions) -> Weights | None:
-    """Return the weights of the design; None if it lacks a value for them."""
+    """Return the weights of the design; None if it lacks a value for them or a rule cannot make them."""
     try:
         return build_weights(design)
     except ValueError:

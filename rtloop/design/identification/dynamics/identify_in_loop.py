@@ -109,9 +109,10 @@ def identify_in_loop(
 
 
 def _choose_final(search: ModelSearch, models: list[JudgedModel], equivalent: list[JudgedModel]) -> FinalModel | None:
-    """Return the model of least total error among the `equivalent` ones that settle on the whole recording.
+    """Return a model refitted on the whole recording: of the `equivalent` ones whose refit settles, the one of least
+    total error.
 
-    Otherwise return the model of least held-out error among the `models` that settle; None if no model settles.
+    Without one, take of the `models` whose refit settles the one of least held-out error; None if no refit settles.
     """
     finals = [final for model in equivalent if (final := search.refit_on_whole(model))]
     if finals:

@@ -50,7 +50,10 @@ class Innovations:
         return float((_pair_weights(self) * self.residues / (1 - self.z_poles)).sum().real)
 
     def discrete(self) -> ModalSystem:
-        """Return G as a sum over all modes in z, conjugates included, one output and no direct gain."""
+        """Return G, the model without noise and offset, as a sum over all modes in z, conjugates included.
+
+        It has one output and no direct gain.
+        """
         pairs = self.rates.imag != 0
         poles = np.concatenate([self.z_poles, self.z_poles[pairs].conj()])
         residues = np.concatenate([self.residues, self.residues[pairs].conj()])
@@ -64,7 +67,10 @@ class Innovations:
         )
 
     def predictor_poles(self) -> Complex:
-        """Return the roots of C (n,): the poles of H⁻¹, inside the unit circle for a usable model."""
+        """Return the poles in z (n,), conjugates included, of H⁻¹, the inverse of the noise model.
+
+        They are inside the unit circle for a usable model.
+        """
         blocks, columns, rows = np.zeros((self.order, self.order)), np.zeros(self.order), np.zeros(self.order)
         i = 0
         for rate, z_pole, gain in zip(self.rates, self.z_poles, self.noise_gains, strict=True):

@@ -55,6 +55,7 @@ class ModeGuesses:
     """
 
     def __init__(self, g: Real, period_s: float) -> None:
+        """Decompose the Hankel matrix of the impulse response `g` (k,), whose samples are `period_s` apart."""
         self._period_s = period_s
         rows = min(HANKEL_ROWS, (g.size - 1) // 2)
         self._matrix = hankel(g[: rows + 1], g[rows : 2 * rows])

@@ -32,6 +32,7 @@ class Spectra:
     """Spectra of a residual (samples,) and of the input (samples,), both whitened alike."""
 
     def __init__(self, residual: Real, driven: Real, period_s: float) -> None:
+        """Compute the spectra of `residual` and of the input `driven`, each (samples,), which are whitened alike."""
         size = 1 << (2 * residual.size - 1).bit_length()
         spectrum = np.fft.rfft(driven, size)
         block_size = max(1, int(RESOLUTION_HZ * size * period_s))
@@ -46,7 +47,7 @@ class Spectra:
     def find_mode(self, *, pair_allowed: bool) -> complex:
         """Return the rate s (rad/s) of the mode that explains most of the residual, less Akaike's penalty.
 
-        For a pair, if `pair_allowed`, it has a positive imaginary part.
+        It is a real pole or, only if `pair_allowed`, the pole of a pair with positive imaginary part.
         """
         top = HIGHEST_SHARE * np.pi / self._period_s
         real_gain, real = self._choose_rate((-np.geomspace(self._slowest, top, REAL_POINTS)).astype(complex))
@@ -59,7 +60,7 @@ class Spectra:
     def _find_pair(self, damping: float, top: float) -> tuple[float, complex]:
         """Return the explained energy and the rate (rad/s) of the best pair near `damping`, up to `top` rad/s.
 
-        No search from a broad pair reaches a light one.
+        Each of DAMPINGS has a search of its own: a search that starts at a broad pair does not reach a light one.
         """
         count = int(np.log(top / self._slowest) / np.log1p(GRID_SPACING * damping)) + 2
         gain, pair = self._choose_rate(_pair_rates(np.geomspace(self._slowest, top, count), np.array([damping])))

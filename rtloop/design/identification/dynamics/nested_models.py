@@ -76,10 +76,13 @@ class FinalModel(NamedTuple):
 
 
 class ModelSearch:
-    """Search over models of one recording; `whitening` has the taps of the noise filter assumed before the first model.
-    """
+    """Search over models of one recording; `whitening` has the taps of the noise filter assumed before the first model."""
 
     def __init__(self, data: InstrumentedRecording, whitening: Real) -> None:
+        """Prepare a search on `data`; every second block of BLOCK_SAMPLES is held out of the fits.
+
+        `whitening` has the taps of the noise filter assumed before the first model.
+        """
         self._data, self._whitening, self._judging_whitening = data, whitening, whitening
         has_past, blocks = past_mask(data.run.input.size), np.arange(data.run.input.size) // BLOCK_SAMPLES
         self._has_past, self._is_fitted = has_past, has_past & (blocks % 2 == 0)
@@ -181,7 +184,9 @@ class ModelSearch:
         return self._judge_estimate(estimate, delay_ticks) if estimate else None
 
     def _judge_estimate(self, estimate: Estimate, delay_ticks: int) -> JudgedModel:
-        """Return an estimate with its whitened prediction errors over held-out blocks and over the whole recording."""
+        """Return an estimate with its squared prediction errors, whitened by the present judging filter: those over the
+        held-out blocks, and their sum over the whole recording.
+        """
         errors = whiten(
             residual_noise(estimate.model, delay_recording(self._data, delay_ticks).run), self._judging_whitening
         )

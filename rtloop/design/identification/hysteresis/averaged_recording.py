@@ -77,11 +77,11 @@ def average_recording(
 def build_equations(
     run: AveragedRecording, thresholds: Real, terms: Sequence[Term], clock: Clock, duration_s: float, path_v: float
 ) -> Equations:
-    """Build the equations for plays at `thresholds` (V) and `terms`; `duration_s` and `path_v` are the longest of all
-    runs.
+    """Build the equations for plays at `thresholds` (V) and `terms`, with a row for each of the run's blocks.
 
-    Rows are the run's blocks. `terms` are "drift" and "creep", which lags over time or, by `clock`, over the drive's
-    path. Unknown memory is assumed to come from earlier repetitions of the same drive.
+    `terms` are "drift" and "creep", which lags over time or, by `clock`, over the drive's path, the sum of its changes.
+    `duration_s` and `path_v` are the longest duration and path of all runs. Unknown memory is assumed to come from
+    earlier repetitions of the same drive.
     """
     if run.before_v is None:
         memory = periodic_memory(run.full_v, thresholds)

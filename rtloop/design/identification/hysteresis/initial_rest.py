@@ -12,16 +12,16 @@ REST_SHARE = 0.02
 
 
 def begins_at_rest(run: AxisRecording) -> bool:
-    """Whether the first drive is near 0 V (REST_SHARE) and the major loop complete, as `identify_hysteresis`
-    requires.
+    """Whether the first drive is near 0 V (REST_SHARE) and the drive turns back at least twice, by half of its range,
+    which completes the major loop: `identify_hysteresis` requires both.
     """
     turns = turning_points(run.drive_v, 0.5 * float(np.ptp(run.drive_v)))
     return abs(run.drive_v[0]) <= REST_SHARE * float(np.abs(run.drive_v).max()) and turns.size >= 2
 
 
 def require_loop(run: AxisRecording) -> None:
-    """Raise UnsuitableData for a first drive above REST_SHARE of the largest, and for a drive with fewer than two
-    turns.
+    """Raise UnsuitableData for a first |drive| above REST_SHARE of the largest, and for a drive that turns back fewer
+    than two times by half of its range.
     """
     drive, largest_v = run.drive_v, float(np.abs(run.drive_v).max())
     if abs(drive[0]) > REST_SHARE * largest_v:

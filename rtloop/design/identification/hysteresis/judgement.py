@@ -111,7 +111,10 @@ class CombinedError(NamedTuple):
 
 
 def combine_errors(rms_um: Sequence[float]) -> CombinedError:
-    """Return the combined rms error of several recordings; NaN entries are ignored, and all NaN gives NaN."""
+    """Return the combined rms error of several recordings; NaN entries are ignored, and all NaN gives NaN.
+
+    Its `std_um` is None for fewer than two finite entries.
+    """
     squares = np.square([value for value in rms_um if np.isfinite(value)])
     rms = float(np.sqrt(squares.mean())) if squares.size else np.nan
     if squares.size < 2:

@@ -47,7 +47,10 @@ class NormalForm(NamedTuple):
 
 
 def normalise(plant: GeneralisedPlant) -> NormalForm:
-    """Return the normal form; D12 must have full column rank and D21 full row rank."""
+    """Return the normal form of a plant, with D12 = [0; I] and D21 = [0 I].
+
+    Its own D12 must have full column rank, and its D21 full row rank.
+    """
     scale = _state_scale(plant)
     a = plant.a * scale / scale[:, None]
     b1, b2, c1, c2 = plant.b1 / scale[:, None], plant.b2 / scale[:, None], plant.c1 * scale, plant.c2 * scale

@@ -114,7 +114,7 @@ def _direct_bound(normal: NormalForm) -> float:
 
 
 def _solve_riccati_pair(normal: NormalForm, gamma: float) -> _Solutions:
-    """Solve both Riccati equations and check their coupling.
+    """Solve both Riccati equations and check their coupling; return X∞, Y∞ and the gains F and L that follow.
 
     Raises NoController if γ does not exceed `_direct_bound`, an equation has no solution ≥ 0, or ρ(XY) ≥ γ².
     """
