@@ -76,7 +76,7 @@ class FinalModel(NamedTuple):
 
 
 class ModelSearch:
-    """Search over models of one recording; `whitening` has the taps of the noise filter assumed before the first model."""
+    """Search over models of one recording; `whitening` has the taps of the noise filter before the first model."""
 
     def __init__(self, data: InstrumentedRecording, whitening: Real) -> None:
         """Prepare a search on `data`; every second block of BLOCK_SAMPLES is held out of the fits.

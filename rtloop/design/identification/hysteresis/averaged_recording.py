@@ -32,9 +32,9 @@ class AveragedRecording(NamedTuple):
     (the sum of its changes) in V, each (blocks,).
 
     A stretch is a part of the recording in which the state of all plays that move is known. `stretch` (blocks,) numbers
-    them from 0, −1 for a block outside them; `stroke_v` is the longest stroke in one, in which plays of up to half of
-    it move. `full_v` is the drive of every tick, `size` the ticks of a block. `before_v` (k,) is the drive in V from
-    rest to the first tick, None where unknown.
+    them from 0, −1 for a block outside them; plays of up to half of `stroke_v` move within them. `full_v` is the drive
+    of every tick, `size` the ticks of a block. `before_v` (k,) is the drive in V from rest to the first tick, None
+    where unknown.
     """
 
     name: str
@@ -106,7 +106,7 @@ def build_equations(
 
 
 def _number_stretches(drive: Real, size: int) -> tuple[npt.NDArray[np.intp], float]:
-    """Return for every block of `size` ticks its stretch, (blocks,), and the longest stroke within one, in V.
+    """Return for every block of `size` ticks its stretch, (blocks,), and the longest stroke within one in V, 0 if none.
 
     Stretches, in which the state of all plays that move is known, are numbered from 0; −1 marks blocks that are not in
     a single one, and those of stretches of fewer than PIECES blocks. An incomplete block at the end is omitted.
