@@ -86,8 +86,8 @@ class Chain:
 def identify_stage(hysteresis: AxisRecording, step: AxisRecording, order: int | None = None) -> Stage:
     """Identify the stage from two recordings, with `order` poles (None: chosen by held-out errors).
 
-    `hysteresis` is the recording of a slow sine, `step` the one of a step. Raises UnsuitableData for a step without a
-    configuration, as an imported one is, if ticks of the step are missing or late, if no model explains the step, and
+    `hysteresis` records a slow sine, `step` a step of the drive. Raises UnsuitableData for a step without a
+    configuration, as in an imported file, if ticks of the step are missing or late, if no model explains the step, and
     as `identify_hysteresis` and `identify_dynamics`; its message calls the recordings swapped if `hysteresis` has steps
     of the drive and `step` has none. Raises ArithmeticError for a model with an unstable predictor.
     """
@@ -146,7 +146,7 @@ def _require_explained(step: AxisRecording, dynamics: DynamicsFit, noise_um: flo
 
 
 def configuration_text(chain: Chain, axis: str | None, spec_name: str, spec_text: str) -> str:
-    """Return a configuration as TOML: that of the step recording, in closed loop, with the design in `axis`.
+    """Return as TOML the step recording's configuration in closed loop, with the design in `axis`.
 
     `axis` is the name of one of its axes, None the first. `spec_name` is the specification's path relative to the
     configuration, `spec_text` its content. Raises UnsuitableData for weights of the hysteresis without an inverse.
@@ -159,7 +159,7 @@ def configuration_text(chain: Chain, axis: str | None, spec_name: str, spec_text
 def stage_configuration(
     stage: Stage, parts: Mapping[str, Any], comments: list[str], axis: str | None, spec_name: str
 ) -> str:
-    """Return a configuration as TOML: that of the step recording, in closed loop, with the stage in `axis`.
+    """Return as TOML the step recording's configuration in closed loop, with the stage in `axis`.
 
     `axis` is the name of one of its axes, None the first. It receives feedforward and model of the identified stage, a
     reference of steps, an interlock against oscillation, the specification's path `spec_name`, and the sections of

@@ -133,7 +133,7 @@ def _require_reachable_steps(
     stage: Stage, design: DesignOptions, axis: str | None, folder: Path, spec_name: str
 ) -> None:
     """Raise NoDesign if the stage's drive cannot hold the specification's reference step: a check before the long
-    computation. Nothing is checked for a design without a plant.
+    computation, left out for a design without a plant.
     """
     configuration = parse(stage_configuration(stage, {}, [], axis, spec_name), "identified", folder, spec_name)
     axis_options = _selected_axis(configuration, axis)

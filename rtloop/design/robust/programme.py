@@ -228,7 +228,7 @@ def _solve_dual(
 def _worst_rows(violation: Real, candidates: npt.NDArray[np.intp]) -> npt.NDArray[np.intp]:
     """Return the indices of rows that are violated most among their neighbours, at most MOST_NEW, worst first.
 
-    `violation` (rows,) has all rows, `candidates` the indices of those that are violated.
+    `violation` (rows,) has all rows, `candidates` the indices of the violated ones.
     """
     previous, following = np.r_[0.0, violation[:-1]], np.r_[violation[1:], 0.0]
     peaks = candidates[

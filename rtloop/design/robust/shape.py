@@ -74,7 +74,7 @@ class TapDesign(NamedTuple):
 
     `proof` holds the worst figures of `proved_count` plants at PROOF_POINTS points a tick; `step` is the model's step
     (t in s, x, v), `variation` the total variation of its v; `curve` has points (settling time in ms, least overshoot)
-    of the trade-off, none unless they were asked for.
+    of the trade-off, () without `curve=True`.
     """
 
     taps: Taps

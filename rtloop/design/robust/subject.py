@@ -97,8 +97,8 @@ def step_bounds(axis: AxisOptions, model: ModelOptions, design: DesignOptions) -
 
     A range of v with equal sides gives levels to both sides of 0; so does one with unequal sides if the shorter one has
     room for `command_um`. Otherwise the levels lie between 0 and the reference on the longer side, or in the middle of
-    a range without 0, which is that of a drive of one sign. Raises ValueError, naming the key, for a reference that v
-    cannot hold, and without [specification.command].
+    a range without 0, as a drive of one sign has it. Raises ValueError, naming the key, for a reference that v cannot
+    hold, and without [specification.command].
     """
     command, undershoot = design.specification.command, design.shape.undershoot_percent / 100
     if command is None:

@@ -148,7 +148,7 @@ def add_simulation(configuration: Configuration, verifications: Verifications) -
 
 
 def _hardware_model(axis: AxisOptions, design: DesignOptions) -> HardwareModel:
-    """Return the model of an axis, else the one of its specification, else None, with the specification's sensor."""
+    """Return the model of an axis, else its specification's model, else None, with the specification's sensor."""
     sensor, residual_percent = design.sensor, design.simulation.residual_percent
     model = axis.model or design.plant
     return HardwareModel(model, sensor.noise_um, sensor.resolution_um, sensor.bandwidth_hz, residual_percent)

@@ -55,7 +55,7 @@ class Bench:
     """
 
     def __init__(self, configuration: Configuration, hardware_models: Mapping[str, HardwareModel]) -> None:
-        """Prepare the configured rig, or one of `hardware_models` by axis; nothing runs yet.
+        """Prepare the configured rig, or one of `hardware_models` by axis, without running it.
 
         Raises ValueError if no rig can represent the hardware, ConfigError for a configuration that cannot run.
         """

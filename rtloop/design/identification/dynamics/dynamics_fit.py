@@ -87,7 +87,7 @@ def continuous_transfer(model: Innovations) -> Transfer:
 def estimate_modes(model: Innovations, covariance: Real, *, noise: bool) -> tuple[Mode, ...]:
     """Return the modes in rising order of frequency, with standard deviations of frequency and damping.
 
-    `covariance` is that of `model.pack(noise=noise)`: `noise` says whether it contains the noise gains.
+    `covariance` belongs to `model.pack(noise=noise)`: `noise` says whether it contains the noise gains.
     A mode that decays faster than FASTEST_DECAY per tick is given as |s| = FASTEST_DECAY per tick with damping 1, and
     infinite standard deviations.
     """

@@ -109,10 +109,10 @@ def identify_in_loop(
 
 
 def _choose_final(search: ModelSearch, models: list[JudgedModel], equivalent: list[JudgedModel]) -> FinalModel | None:
-    """Return a model refitted on the whole recording: of the `equivalent` ones whose refit settles, the one of least
-    total error.
+    """Return the `equivalent` model of least total error, refitted on the whole recording.
 
-    Without one, take of the `models` whose refit settles the one of least held-out error; None if no refit settles.
+    Models whose refit does not settle are left out. Without another, take the first of `models`, by rising held-out
+    error, whose refit settles; None if no refit does.
     """
     finals = [final for model in equivalent if (final := search.refit_on_whole(model))]
     if finals:

@@ -60,7 +60,7 @@ class Spectra:
     def _find_pair(self, damping: float, top: float) -> tuple[float, complex]:
         """Return the explained energy and the rate (rad/s) of the best pair near `damping`, up to `top` rad/s.
 
-        Each of DAMPINGS has a search of its own: a search that starts at a broad pair does not reach a light one.
+        Each of DAMPINGS is searched separately: a search that starts at a broad pair does not reach a light one.
         """
         count = int(np.log(top / self._slowest) / np.log1p(GRID_SPACING * damping)) + 2
         gain, pair = self._choose_rate(_pair_rates(np.geomspace(self._slowest, top, count), np.array([damping])))

@@ -217,7 +217,7 @@ def delay_recording(data: InstrumentedRecording, ticks: int) -> InstrumentedReco
 
 
 def _is_without_gain(models: list[JudgedModel], count: int) -> bool:
-    """Whether none of the last `count` models is clearly better than the best one before them."""
+    """Whether the last `count` models are all not clearly better (`is_worse_than`) than the best one before them."""
     best_model = min(models[:-count], key=lambda model: model.rms_um)
     return not any(best_model.is_worse_than(model) for model in models[-count:])
 

@@ -109,7 +109,7 @@ def _number_stretches(drive: Real, size: int) -> tuple[npt.NDArray[np.intp], flo
     """Return for every block of `size` ticks its stretch, (blocks,), and the longest stroke within one in V, 0 if none.
 
     Stretches, in which the state of all plays that move is known, are numbered from 0; −1 marks blocks that are not in
-    a single one, and those of stretches of fewer than PIECES blocks. An incomplete block at the end is omitted.
+    a single one, and all blocks of a stretch with fewer than PIECES. An incomplete block at the end is omitted.
     """
     numbers = covered_intervals(drive)
     tick_numbers = numbers[: drive.size // size * size].reshape(-1, size)

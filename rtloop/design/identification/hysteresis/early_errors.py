@@ -25,9 +25,9 @@ INSIDE_SHARE = 0.999
 def early_errors(
     run: AveragedRecording, recording_equations: Equations, common: SharedGains, own_gains: Real, thresholds: Real
 ) -> Real:
-    """Return errors in µm (blocks,) where memory, the state of the plays, is unknown, with the one that fits best.
+    """Return errors in µm (blocks,) where memory, the state of the plays, is unknown, with the best-fitting memory.
 
-    NaN elsewhere, and everywhere if memory is known in all blocks or in none. `own_gains` are those of this recording.
+    NaN elsewhere, and everywhere if memory is known in all blocks or in none. `own_gains` belong to this recording.
     """
     early_um = np.full(recording_equations.is_known.size, np.nan)
     if recording_equations.is_known.all() or not recording_equations.is_known.any():

@@ -168,9 +168,9 @@ def _is_lag_over_time(
 ) -> bool:
     """Whether creep lowers the error of all recordings, and more than a memory that fades with the drive's path.
 
-    `squares_by_name` has the mean square errors of `trial`, the one with creep, under `name`; those of the memory by
-    path are added to it. An actuator that is no sum of plays may have such a memory (Bouc and Wen's is a lag by path);
-    weights fitted beside it would not model it. A drive of one speed cannot tell the two apart.
+    `squares_by_name` has the mean square errors of `trial`, which includes creep, under `name`; this function adds the
+    errors with a memory by path. An actuator that is no sum of plays may have such a memory (Bouc and Wen's is a lag by
+    path); weights fitted beside it would not model it. A drive of one speed cannot tell the two apart.
     """
     path_name = f"{name} by path"
     squares_by_name[path_name] = _mean_squares(work, trial._replace(clock="path"))

@@ -127,8 +127,8 @@ def evaluate_from_rest(
 ) -> tuple[tuple[Judgement, ...], tuple[Judgement, ...]]:
     """Judge `runs`, each from rest and held out of the fit in turn, and `other_runs`, whose memory is unknown.
 
-    Only thresholds and kind of weights come from `shape`; the weights are fitted anew. Return the judgements of `runs`,
-    then those of `other_runs`.
+    Only thresholds and kind of weights come from `shape`; the weights are fitted anew. Return the judgements of `runs`
+    and the judgements of `other_runs`.
     """
     recordings = prepare_recordings(runs, shape.weights, [np.zeros(1)] * len(runs))
     trial = Trial(shape.model.thresholds, shape.placement, ())
