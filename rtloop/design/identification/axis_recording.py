@@ -167,7 +167,9 @@ def require_usable(name: str, drive_v: Real, position_um: Real, adc_v: Real | No
     position is searched for clipping.
     """
     if not (np.all(np.isfinite(drive_v)) and np.all(np.isfinite(position_um))):
-        raise UnsuitableData(f"{name}: drive or position contains NaN or infinite values; leave these ticks out")
+        raise UnsuitableData(
+            f"{name}: drive or position contains NaN or infinite values; identification needs finite ones"
+        )
     noise, span = noise_std(position_um), float(np.ptp(position_um))
     if np.ptp(drive_v) == 0:
         raise UnsuitableData(
