@@ -13,7 +13,10 @@ def signal_unit(name: str) -> str:
 
 
 def describe_signal(name: str) -> Signal:
-    """Unit and meaning of a signal by its name; the meaning is empty for a signal that only the driver defines."""
+    """Return name, unit and meaning of a signal by its name; an axis's meaning begins with the axis's name.
+
+    For a name that rtloop does not define: meaning "", and the unit by the end of the name, such as µm for `_um`, or "".
+    """
     for signal in COMMON_SIGNALS:
         if name == signal.name:
             return signal

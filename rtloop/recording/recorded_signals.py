@@ -168,8 +168,8 @@ class RecordedSignals:
     def between(self, names: Sequence[str], start_s: float, end_s: float) -> Generator[Rows]:
         """Yield arrays (n, names) of the ticks due from `start_s` to `end_s`, both included, in s since the start.
 
-        Chunks outside are not read, damaged ones are added to `problems`. Raises RecordingError for an unknown name and
-        for a file that cannot be read.
+        In a part of a recording, the times are limited to the part's. Chunks outside are not read, damaged ones are
+        skipped and added to `problems`. Raises RecordingError for an unknown name and for a file that cannot be read.
         """
         start_s, end_s = max(start_s, self._start_s), min(end_s, self._end_s)
         with self._open_readers() as readers:

@@ -106,7 +106,8 @@ class _Conversion:
         """Add a message; messages of topics that rtloop does not write are ignored.
 
         Raises RecordingError for a malformed or a second header, and for ticks before the header or of another schema;
-        DamagedChunk for a malformed tick or ticks out of order; OutputError if the copy cannot be written.
+        DamagedChunk for a malformed tick, ticks out of order or log times that contradict the deadlines; OutputError if
+        the copy cannot be written.
         """
         number = CHANNEL_IDS.get(channel.topic)
         if self._writer is None:

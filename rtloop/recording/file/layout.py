@@ -47,7 +47,10 @@ class OwnLayout:
         return any(len(channels) > 1 and format.TICKS in channels for channels in offsets)
 
     def _find_chunks(self) -> list[ChunkEntry]:
-        """Chunks by the index of the file, or by a scan, listed in `problems`, if it is missing or damaged."""
+        """Return the chunks by the index of the file or, if that is missing or damaged, by a scan of the file.
+
+        The missing index and the faults that the scan finds are added to `problems`, the latter to `left_out` too.
+        """
         try:
             return read_chunk_index(self._source)
         except DamagedChunk as reason:

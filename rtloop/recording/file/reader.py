@@ -192,8 +192,9 @@ class Reader:
     def chunks(self) -> Iterator[tuple[Rows | None, list[Message]]]:
         """Yield each chunk in the order of the file: (rows, []) for ticks, else (None, messages of the other topics).
 
-        Repeated data is included. Damaged chunks, ticks out of order and a wrong number of ticks are listed in
-        `problems`; unless the reader is tolerant, they raise RecordingError.
+        Data that an earlier file repeats is included. Damaged chunks, malformed messages and ticks out of order are
+        left out; these and a wrong number of ticks are listed in `problems`, or raise RecordingError unless the reader
+        is tolerant.
         """
         account = TickAccount(self.first_tick, self.totals)
         for entry in self.entries:
@@ -263,9 +264,10 @@ class Reader:
         return names
 
     def _parse(self, entry: ChunkEntry) -> Ticks | list[Message]:
-        """Ticks of a chunk, or its valid messages of the slow topics; invalid ones are reported.
+        """Return the ticks of a chunk, or its valid messages of other topics; invalid ones are reported.
 
-        Raises DamagedChunk if the chunk cannot be read.
+        Raises DamagedChunk if the chunk is damaged, RecordingError for an invalid message unless the reader is
+        tolerant.
         """
         content = self._layout.content(entry)
         if starts_with_tick(content):
@@ -293,21 +295,24 @@ class Reader:
             yield entry, partial(self._read_ticks, entry, names)
 
     def _read_ticks(self, entry: ChunkEntry, names: Sequence[str]) -> Ticks | None:
-        """Columns `names` of the ticks of a chunk; None if it holds messages of the slow topics.
+        """Return columns `names` of the ticks of a chunk; None if it holds messages of other topics.
 
-        Raises DamagedChunk if the chunk cannot be read.
+        Raises DamagedChunk if the chunk is damaged.
         """
         content = self._layout.content(entry)
         return self._tick_layout.parse_ticks(content, names) if starts_with_tick(content) else None
 
     def _messages(self, channel: int) -> Iterator[Message]:
-        """Yield the messages of one slow topic; invalid messages of any topic in the same chunks are reported."""
+        """Yield the valid messages of a topic other than /ticks, by its channel id, in the order of the file.
+
+        Damaged chunks, and invalid messages of any topic in the same chunks, are reported.
+        """
         for entry in self.entries:
             if may_hold_slow(entry, channel):
                 yield from (message for message in self._slow_messages(entry) if message.channel == channel)
 
     def _slow_messages(self, entry: ChunkEntry) -> list[Message]:
-        """Valid messages of the slow topics in a chunk; none if it holds ticks or is damaged."""
+        """Return the valid messages of a chunk; [] if it holds ticks or is damaged, which is reported."""
         try:
             content = self._layout.content(entry)
             return [] if starts_with_tick(content) else self._valid_messages(split_messages(content))
@@ -316,7 +321,10 @@ class Reader:
             return []
 
     def _valid_messages(self, messages: list[Message]) -> list[Message]:
-        """Valid messages among `messages`; the faults of the others are reported."""
+        """Return the valid ones of `messages`; the faults of the others are listed in `problems`.
+
+        Raises RecordingError for an invalid message unless the reader is tolerant.
+        """
         valid = []
         for message in messages:
             try:
@@ -333,16 +341,22 @@ class Reader:
         return valid
 
     def _report_chunk(self, entry: ChunkEntry, reason: DamagedChunk) -> None:
-        """Report a damaged chunk by its offset."""
+        """List a damaged chunk, by its offset, in `problems`. Raises RecordingError unless the reader is tolerant."""
         self._report(f"the chunk at byte {entry.offset} is damaged ({reason})")
 
     def _check_count(self, account: TickAccount) -> None:
-        """Report a number of ticks that differs from the recorder's, unless a reported problem explains it."""
+        """List a number of ticks that differs from the recorder's in `problems`, unless data is left out anyway.
+
+        Raises RecordingError for it unless the reader is tolerant.
+        """
         if account.shortage_problem and not self.left_out:
             self._report(account.shortage_problem)
 
     def _report(self, problem: str) -> None:
-        """List a problem that removed data. Raises RecordingError unless the reader is tolerant."""
+        """Add a problem that removed data to `problems` and `left_out`, once.
+
+        Raises RecordingError instead unless the reader is tolerant.
+        """
         if not self.tolerant:
             raise RecordingError(f"{self.path}: {problem}; `rtloop recover` keeps the undamaged part")
         for problems in (self.problems, self.left_out):

@@ -133,9 +133,9 @@ class Writer:
     def finish(self, final_message: Callable[[int], Message], *, require_all: bool = False) -> None:
         """Write `final_message(ticks written)`, the index and the end; then give the file its final name.
 
-        If the disk is full, the last chunks are dropped to make room and leave the counts; with `require_all`,
-        OutputError is raised instead. Raises OutputError for any other failure, NotOnDisk if the file may not be on the
-        disk.
+        If the disk is full, the last chunks are dropped to make room, their ticks are subtracted from `ticks` and
+        `ticks_skipped`, and `final_message` is called again; with `require_all`, OutputError is raised instead. Raises
+        OutputError for any other failure, NotOnDisk if the file may not be on the disk.
         """
         max_chunks = len(self.file)
         while not self._try_write_end(final_message, require_all):
@@ -185,7 +185,10 @@ class Writer:
         return True
 
     def _write_header(self, header: dict[str, Any], log_time: int, repeated: Sequence[McapRecord]) -> None:
-        """Write the first chunk: schemas and channels `repeated`, then the header."""
+        """Write the first chunk: schemas and channels `repeated`, then `header` with `configuration_sha256` added.
+
+        Raises OutputError.
+        """
         digest = hashlib.sha256(header.get("configuration", "").encode()).hexdigest()
         payload = json.dumps({**header, "configuration_sha256": digest}).encode()
         message = Message(format.CONFIGURATION, log_time, payload)

@@ -152,7 +152,7 @@ class ChunkFile:
         self._append(pack_end(self._crc, self.size, self._repeated, self._statistics(), index))
 
     def publish(self) -> None:
-        """Make the file durable, give it its final name and close it; never replaces a file.
+        """Make the file durable, give it its final name and close it, also after an error; never replaces a file.
 
         Raises NotOnDisk if it is not durable, OutputError if it was removed, the final name is taken or it cannot be
         renamed; it then keeps the name of an unfinished file.

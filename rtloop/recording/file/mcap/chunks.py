@@ -98,7 +98,7 @@ class McapSource:
 
 
 def _file_name_hint(path: Path) -> str:
-    """Hint at the finished file of an unfinished recording, or the reverse; empty if there is none."""
+    """Return ", but there is …" for the finished file of a missing unfinished one, or the reverse; "" if none exists."""
     if path.suffix == ".part" and path.with_suffix("").exists():
         return f", but there is {path.with_suffix('').name}, finished or recovered meanwhile"
     part = path.with_name(path.name + ".part")
@@ -135,9 +135,10 @@ def _require_contiguous(source: McapSource, indexes: list[ChunkIndex], end: int)
 
 
 def scan_chunks(source: McapSource, position: int = len(MAGIC)) -> tuple[list[ChunkEntry], list[str]]:
-    """Scan the file from the record at `position` on. Returns the whole chunks and the faults, as sentences.
+    """Scan the file from the record at `position` to the end of its data. Returns the whole chunks and the faults.
 
-    A damaged part is skipped up to the next chunk.
+    A damaged part is skipped up to the next chunk, and is a fault, as is a chunk that is cut off: one sentence each.
+    The contents of the chunks are not checked. Raises RecordingError if the file cannot be read.
     """
     entries: list[ChunkEntry] = []
     problems: list[str] = []

@@ -55,14 +55,20 @@ def library_name(source: McapSource) -> str:
 
 
 def encoding(channel: Channel, schema: Schema | None) -> str:
-    """Return the encoding of a channel's messages as text, followed by that of its schema in brackets if it differs."""
+    """Return the encoding of a channel's messages as text, or "unnamed encoding".
+
+    That of the schema follows in brackets, unless it is the same or the usual one for it (`jsonschema` for `json`).
+    """
     name = schema.encoding if schema else ""
     is_implied = name in ("", channel.message_encoding, f"{channel.message_encoding}schema")
     return (channel.message_encoding or "unnamed encoding") + ("" if is_implied else f" ({name})")
 
 
 def describe_topics(counts: Counter[tuple[str, str]]) -> str:
-    """List the MAX_TOPICS most frequent topics as text, from the number of messages by topic and encoding."""
+    """List the MAX_TOPICS most frequent topics as text; "no message" for empty `counts`.
+
+    `counts` has the number of messages by (topic, encoding).
+    """
     topics = [
         f"{topic[:MAX_CHARACTERS]!r} ({words}, {count} messages)"
         for (topic, words), count in counts.most_common(MAX_TOPICS)

@@ -60,9 +60,9 @@ def may_hold(entry: ChunkEntry, channel: int) -> bool:
 
 
 def overlaps(entry: ChunkEntry, start_ns: float, end_ns: float) -> bool:
-    """Whether a chunk may hold messages between two log times in ns, both included; True without an index.
+    """Whether a chunk may hold messages between two log times (UNIX ns), both included; True without an index.
 
-    The times are compared to 1 µs: a double is not more exact.
+    A chunk up to 1 µs outside counts too, because a double of such a time is not more exact.
     """
     index, margin_ns = entry.index, 1e3
     return index is None or not (

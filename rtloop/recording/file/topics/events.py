@@ -45,7 +45,8 @@ def event_from_message(
     """Return one record of MESSAGE as an event {tick, time_ns, kind, who, axis, what}, due `time_ns` after the start.
 
     `axis` is a name, None for all axes. `laws` has the `law_label` of each law of the loop. `name` is the operator's
-    name and becomes `who`; without it, `who` is the origin.
+    name and becomes `who`; without it, `who` is the origin. `what` holds the message's `values` (NaN and infinities as
+    text) and `identity`, and for some kinds their meaning, such as {mode} or {causes, reason}.
     """
     values = [float(value) for value in message["values"]]
     kind, axis = int(message["kind"]), int(message["axis"])

@@ -91,7 +91,7 @@ def tick_schema(columns: Sequence[str]) -> bytes:
 
 
 def schemas(columns: Sequence[str]) -> list[Schema]:
-    """Schema records of a recording with `columns`."""
+    """Schema records of `/ticks` with `columns`, `/events` and `/configuration`; not the one of `/overview`."""
     return [
         Schema(id=TICK_SCHEMA, name="rtloop.Tick", encoding="protobuf", data=tick_schema(columns)),
         Schema(id=EVENT_SCHEMA, name="rtloop.Event", encoding="jsonschema", data=json.dumps(_EVENT).encode()),
@@ -105,7 +105,7 @@ def schemas(columns: Sequence[str]) -> list[Schema]:
 
 
 def channels() -> list[Channel]:
-    """Channel records of every recording."""
+    """Channel records of every recording: `/ticks`, `/events`, `/law`, `/configuration`."""
     rows = (
         (TICKS, "/ticks", "protobuf", TICK_SCHEMA),
         (EVENTS, "/events", "json", EVENT_SCHEMA),

@@ -84,9 +84,10 @@ REASON_TEXTS = {
 
 
 def step_meaning(values: Sequence[float]) -> dict[str, Any]:
-    """Return {step, left, reason: text or None, causes: causes of the trip} of the values of a RECOVERY message.
+    """Return {step, left, reason, causes} of the values of a RECOVERY message.
 
-    A step or reason that this version does not know is its number as text.
+    `left`: number of recoveries left within the hour; `reason`: text, or None for a step without a reason; `causes`:
+    names of the trip's causes. A step or reason that this version does not know is its number as text.
     """
     step, left, reason, causes = (int(value) for value in values[:4])
     is_known = reason in list(StepReason)

@@ -64,8 +64,9 @@ class TickLayout:
     def parse_ticks(self, content: bytes, names: Sequence[str]) -> Ticks:
         """Return the ticks of an unpacked chunk, with the columns `names` in this order.
 
-        Raises DamagedChunk if it holds anything but ticks of these columns, a value is out of range in INTEGER_COLUMNS,
-        ticks or deadlines do not grow, or log times contradict the deadlines.
+        Raises DamagedChunk if it holds anything but ticks of the recording's columns, a value of INTEGER_COLUMNS is not
+        whole or out of range, ticks or deadlines do not grow, or log times contradict the deadlines. Raises ValueError
+        without a tick.
         """
         if len(content) % self._template.itemsize:
             raise DamagedChunk("the length of the chunk is not a multiple of the length of a tick")
