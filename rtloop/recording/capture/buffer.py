@@ -78,7 +78,10 @@ class TickBuffer:
         return len(self._rows) - self._row_count
 
     def take_from(self, reader: RingReader) -> int:
-        """Append ticks from the ring, as many as there is room for. Returns the number appended or lost in the ring."""
+        """Append ticks from the ring, as many as there is room for.
+
+        Returns the number of ticks appended plus that of ticks lost in the ring before them.
+        """
         copied, lost = reader.take_into(self._rows[self._row_count :])
         self._row_count += copied
         return copied + lost

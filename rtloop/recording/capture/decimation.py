@@ -69,7 +69,10 @@ class Decimation:
                 self._end_interval()
 
     def _end_interval(self) -> None:
-        """Queue minimum, maximum and mean of the present interval (NaN: no number), if it has any ticks."""
+        """End the present interval and queue its minimum, maximum and mean; nothing happens if it has no tick.
+
+        The three are NaN for a column whose values are all NaN.
+        """
         if self._interval_ticks == 0:
             return
         with np.errstate(invalid="ignore"):

@@ -56,7 +56,10 @@ class PendingMessages:
         self._entries.append(PendingEntry(tick, message, from_loop=False))
 
     def recorder_message(self, kind: str, place: TickTime, details: dict[str, Any]) -> Message:
-        """Return an event of the recorder at `place` as a message, without appending it."""
+        """Return an event `kind` of the recorder, at tick and time of `place`, as a message, without appending it.
+
+        `details` becomes its `what`.
+        """
         return event_message(recorder_event(kind, *place, details), self._start_unix_ns())
 
     def log_time(self, tick: int) -> int:

@@ -29,7 +29,10 @@ class RingReader:
         return copied, int(lost)
 
     def take(self) -> np.ndarray[Any, Any]:
-        """Return a copy of all new slots, at most as many as the ring holds, and move `position` behind them."""
+        """Return a copy of all new slots, possibly none, and move `position` behind them.
+
+        If the loop has written more than the ring holds, the oldest new slots are lost and added to `lost`.
+        """
         slots = self._ring.slots
         if int(self._ring.head[0]) == self.position:  # The usual case, without a call into compiled code.
             return slots[:0]

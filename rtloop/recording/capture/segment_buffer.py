@@ -215,7 +215,7 @@ class SegmentBuffer:
         return [entry for _, entry in events[MAX_PENDING_EVENTS:]]
 
     def _entry_lists(self) -> list[list[PendingEntry]]:
-        """Lists of waiting messages, in the order of their ticks."""
+        """Return the lists in which messages wait (no copies), in the order of their ticks: omitted ticks first."""
         return [self._skipped_entries, *(part.entries for part in self._batches())]
 
     def _batches(self) -> list[DrainedBatch]:

@@ -45,7 +45,8 @@ class SelectiveSession(Session):
     def _handle_snapshot(self, tick: int) -> None:
         """At the law's snapshot of `tick`: move the ticks before it to the buffer, and begin a segment.
 
-        Then, after a failure of a paced run, try to resume in a new file; write the decided segments.
+        Then, after a failure of a paced run, try to resume in a new file. Finally write the segments that are decided:
+        retained ones, and overviews in place of the others.
         """
         self._write(self._buffer.count_before(tick), self._pending.take_entries(before=tick))
         self._segments.begin_segment(tick)
@@ -54,12 +55,15 @@ class SelectiveSession(Session):
         self._write_decided()
 
     def _write_all(self) -> None:
-        """Move ticks and their messages to the buffer; later messages wait for their ticks."""
+        """Move all drained ticks, and the messages up to the last of them, to the segments, and write what is decided.
+
+        Later messages wait for their ticks.
+        """
         if count := len(self._buffer):
             self._write(count, self._pending.take_entries(before=self._buffer.end))
 
     def _write(self, count: int, entries: list[PendingEntry]) -> None:
-        """Move the first `count` rows and `entries` to the buffer, then write the decided batches.
+        """Move the first `count` rows and `entries` to the segments, then write the decided batches.
 
         A condition that begins a retained span adds an event RETENTION_BEGUN.
         """
@@ -74,7 +78,7 @@ class SelectiveSession(Session):
         self._write_decided()
 
     def _write_remaining(self, result: str) -> None:
-        """Write or reduce all waiting ticks; retain them all unless the loop finished."""
+        """Write all waiting ticks and messages, or overviews of the ticks; all ticks unless `result` is "finished"."""
         super()._write_remaining(result)
         self._write(0, self._pending.take_entries())
         if result != FINISHED:
@@ -99,7 +103,10 @@ class SelectiveSession(Session):
             self._pending.count_dropped(self._segments.drop_excess())
 
     def _write_batch(self, batch: WriteBatch) -> None:
-        """Write a batch, or begin a file where it is a cut. Raises OutputError if the write fails."""
+        """Write a batch, or begin the next file if `batch.cut` gives its first tick.
+
+        Raises OutputError if the write fails; a file that cannot be begun stops recording instead.
+        """
         if batch.cut is not None:
             self._rotate(batch.cut)
         else:
@@ -111,7 +118,10 @@ class SelectiveSession(Session):
         return self._segments.first_waiting_tick
 
     def _finish_file(self, kind: str, result: str, end_tick: int, event_tick: int) -> None:
-        """Finish the file; waiting ticks go into the next one, so its last event is at `end_tick` at the latest."""
+        """Finish the file as `Session` does, with its last event at `end_tick` at the latest.
+
+        Ticks that still wait, from `end_tick` on, go into the next file.
+        """
         super()._finish_file(kind, result, end_tick, min(end_tick, event_tick))
 
     def _count_pending(self, channel: int) -> int:
@@ -123,5 +133,5 @@ class SelectiveSession(Session):
         return self._files.end_place if tick == self._files.end_place.tick else super()._tick_time(tick)
 
     def _failure_time(self) -> TickTime:
-        """Tick and time of a failure: after all waiting events."""
+        """Tick and deadline of the event of a failed write: the next tick to drain, after all waiting events."""
         return self._buffer.tick_time(self.cursor)

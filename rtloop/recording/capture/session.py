@@ -87,9 +87,10 @@ class Session:
             self._fail(error)
 
     def _read_from(self, position: RingPosition, *, repeats: bool) -> None:
-        """Read the rings from `position` on, into files counted from there.
+        """Make readers that begin at `position` of the rings, and prepare the files of the run from its tick on.
 
-        `repeats`: ticks that a dead recorder's file holds are written again.
+        No slot is read and no file opened yet. `repeats`: the ticks from `position` to the end of the dead recorder's
+        file are written again.
         """
         self._ticks = RingReader(self._block, "ticks", position.ticks)
         self._snapshots = RingReader(self._block, "snapshots", position.snapshots)
@@ -165,7 +166,7 @@ class Session:
         }
 
     def _write_remaining(self, result: str) -> None:
-        """Write all waiting snapshots, messages and ticks; `result` tells how the loop ended."""
+        """Write all waiting snapshots, messages and ticks; `result` tells how the loop ended, for subclasses."""
         while self._waiting_snapshots:
             self._pending.add_snapshot(self._waiting_snapshots.popleft())
         self._write_all()
@@ -261,7 +262,7 @@ class Session:
         self._stop_recording(error)
 
     def _failure_time(self) -> TickTime:
-        """Tick and time of a failure: the end of the written ticks."""
+        """Tick and deadline of the event of a failed write: the tick after the last one in a file."""
         return self._files.end_place
 
     def _stop_recording(self, failure: OutputError) -> None:

@@ -98,7 +98,7 @@ class McapSource:
 
 
 def _file_name_hint(path: Path) -> str:
-    """Return ", but there is …" for the finished file of a missing unfinished one, or the reverse; "" if none exists."""
+    """Return ", but there is …" with the finished file of a missing unfinished one, or the reverse; "" without it."""
     if path.suffix == ".part" and path.with_suffix("").exists():
         return f", but there is {path.with_suffix('').name}, finished or recovered meanwhile"
     part = path.with_name(path.name + ".part")

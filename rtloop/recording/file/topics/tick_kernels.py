@@ -21,7 +21,10 @@ class RecordLayout:
     def __init__(self, template: npt.NDArray[np.uint8], is_fixed: npt.NDArray[np.bool_]) -> None:
         self.size = len(template)
         if self.size < WORD_BYTES or len(is_fixed) != self.size:
-            raise ValueError(f"{self.size} bytes, {len(is_fixed)} marks; allowed: {WORD_BYTES} bytes, as many marks")
+            raise ValueError(
+                f"template: {self.size} bytes, is_fixed: {len(is_fixed)} values; allowed: {WORD_BYTES} or more, "
+                "equally many"
+            )
         starts = np.minimum(np.arange(0, self.size, WORD_BYTES), self.size - WORD_BYTES)
         self._starts = starts.astype(np.int64)
         mask = np.where(is_fixed, 0xFF, 0).astype(np.uint8)
