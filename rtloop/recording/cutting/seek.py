@@ -43,7 +43,7 @@ class ChunkSeeker:
 
     @property
     def end(self) -> int:
-        """Place after the last chunk."""
+        """Number of chunks in the file, which is the place after the last chunk."""
         return len(self.reader.entries)
 
     def first_span(self) -> ChunkSpan | None:
@@ -65,7 +65,7 @@ class ChunkSeeker:
         return next((event["what"] for event in reversed(events) if event["kind"] in FINAL), None)
 
     def find_place(self, tick: int) -> int:
-        """Place of the first chunk with `tick` or a later one; `end` if there is none."""
+        """Index of the first chunk with `tick` or a later one; `end` if there is none."""
         return self._first_place(lambda span: span.last >= tick)
 
     def has_tick(self, tick: int) -> bool:
@@ -80,7 +80,7 @@ class ChunkSeeker:
         return int(due_rows[0, TICK]) if len(due_rows) else None
 
     def rows(self, place: int, first: int, end: int) -> Rows:
-        """Rows (n, columns) of the ticks [first, end) in the chunk at `place`; shape (0, 0) without any."""
+        """Rows (n, columns) of the ticks [first, end) in chunk number `place`; shape (0, 0) without any."""
         span = self.span(place) if place < self.end else None
         if span is None or span.last < first or span.first >= end:
             return np.empty((0, 0))
@@ -89,12 +89,12 @@ class ChunkSeeker:
         return rows[begin:stop]
 
     def _all_rows(self, place: int) -> Rows:
-        """Rows (n, columns) of the chunk at `place`; shape (0, 0) without ticks."""
+        """Rows (n, columns) of chunk number `place`; shape (0, 0) for no ticks, a damaged chunk and `end`."""
         content = self.chunk(place) if place < self.end else None
         return content.rows if isinstance(content, Ticks) else np.empty((0, 0))
 
     def _read_chunk(self, place: int) -> Ticks | list[Message] | None:
-        """Ticks or messages of the chunk at `place`; None if it is damaged. Its faults are stored in `damage`."""
+        """Ticks or messages of chunk number `place`; None if it is damaged. Its faults are stored in `damage`."""
         problem_count = len(self.reader.left_out)
         content = self.reader.chunk(self.reader.entries[place])
         if place not in self.damage:
@@ -102,7 +102,7 @@ class ChunkSeeker:
         return content
 
     def _read_span(self, place: int) -> ChunkSpan | None:
-        """Span of the chunk at `place`; None if it holds no ticks."""
+        """First and last tick of chunk number `place`, with deadlines; None if it holds no ticks or is damaged."""
         rows = self._all_rows(place)
         return (
             ChunkSpan(*(int(rows[row, TICK]) for row in (0, -1)), *rows[[0, -1], DEADLINE].tolist())
@@ -111,7 +111,10 @@ class ChunkSeeker:
         )
 
     def _first_place(self, condition: Callable[[ChunkSpan], bool]) -> int:
-        """First place whose span meets `condition`, which all later spans meet as well; `end` if there is none."""
+        """Index of the first chunk whose span meets `condition`; `end` if there is none.
+
+        All later spans must meet it as well. Chunks without ticks are passed over.
+        """
         low, high, first_place = 0, self.end, self.end
         while low < high:
             middle = (low + high) // 2

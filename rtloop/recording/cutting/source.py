@@ -146,9 +146,10 @@ class RunSource:
         ]
 
     def contents(self, tick_range: TickRange) -> Iterator[tuple[list[Message], Rows]]:
-        """Yield messages of topics other than /ticks, and rows (n, columns), of a range, chunk by chunk.
+        """Yield (messages, rows) of each chunk with data of a range: one of the two is empty.
 
-        Data in two files of the run comes once. Damaged chunks are left out; their faults are appended to `problems`.
+        Messages are of topics other than /ticks, rows (n, columns) are ticks. Data in two files of the run comes once.
+        Damaged chunks are left out; their faults are appended to `problems`.
         """
         next_tick = tick_range.first
         for seeker in self._seekers:
@@ -173,7 +174,7 @@ class RunSource:
                     yield messages, rows
 
     def _slow_messages(self, seeker: ChunkSeeker, place: int) -> list[Message]:
-        """Messages of the slow topics in the chunk at `place`; [] if it holds ticks or is damaged."""
+        """Messages in chunk number `place` of a file; [] if it holds ticks or is damaged."""
         content = seeker.chunk(place) if _may_hold_slow(seeker, place) else None
         return content if isinstance(content, list) else []
 
@@ -192,7 +193,7 @@ class RunSource:
 
 
 def _is_owned(message: Message, seeker: ChunkSeeker) -> bool:
-    """Whether a message is read from this file, if another file of the run holds it as well."""
+    """Whether a message is to be read from the file of `seeker`; False if another file of the run gives it."""
     if message.channel == format.LAW:
         return seeker.reader.owns(snapshot_tick(message))
     if message.channel != format.EVENTS:
@@ -202,6 +203,6 @@ def _is_owned(message: Message, seeker: ChunkSeeker) -> bool:
 
 
 def _may_hold_slow(seeker: ChunkSeeker, place: int) -> bool:
-    """Whether the chunk at `place` may hold messages of the slow topics."""
+    """Whether chunk number `place` may hold events, snapshots of the law or overviews; True without an index."""
     entry = seeker.reader.entries[place]
     return any(may_hold(entry, channel) for channel in (format.EVENTS, format.LAW, format.OVERVIEW))

@@ -49,8 +49,9 @@ def first_unequal(recorded: Real, replayed: Real) -> tuple[int, int] | None:
 
 
 def fill_tape(rows: Real, pairs: npt.NDArray[np.int64], tape: Real, refused: npt.NDArray[np.bool_]) -> None:
-    """Fill the first rows of a playback tape from recorded `rows` (n, columns), and `refused` (n,): a write had failed.
+    """Fill the first n rows of a playback tape from recorded `rows` (n, columns).
 
+    Also set the first n of `refused`: True in a tick whose write to the drives had failed.
     Columns 0 to 3 of the tape are: deadline and wake, in ns; missed periods; infinity in a tick with a lost heartbeat,
     else NaN. `pairs` (k, 2) are other columns of the tape and the recorded columns that they copy. Raises ValueError
     for shapes and columns that do not fit, and for values that are not float64.

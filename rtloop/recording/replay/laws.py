@@ -69,7 +69,8 @@ def require_law(recording: Recording) -> None:
 def _recorded_law(entry: Mapping[str, Any], recording: Recording, trust: TrustedLaws) -> LawReference:
     """Return the law of one header entry, for its recorded number of axes.
 
-    Raises RecordingError if it is missing, differs from the recorded one, or has an invalid number of axes.
+    Raises RecordingError if it is missing, differs from the recorded one, or has an invalid number of axes; ConfigError
+    if the law's code ends or blocks its process.
     """
     law, axes = _find_law(entry, recording, trust), entry.get("axes")
     if law_class(law).axes != ANY_NUMBER:

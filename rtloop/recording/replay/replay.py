@@ -197,7 +197,7 @@ class Replay:
                 self.report.add_unverified(begin, count, "not in the recording")
 
     def _report_unreadable(self) -> None:
-        """Add the problems that removed data from the recording to the report."""
+        """Add the problems that removed data from the recording to the report, as unverified ticks of unknown place."""
         for problem in self._recording.left_out:
             self.report.add_unverified(None, None, problem)
 
@@ -275,7 +275,10 @@ class Replay:
             )
 
     def _start_rerun(self, tick: int, law: LawMemory) -> None:
-        """Begin a rerun of `law` at `tick` with the commands of later ticks, and count a stretch."""
+        """Begin a rerun of `law`, the memory of the snapshot at `tick`, with the commands of later ticks.
+
+        Counts one more of the report's `stretches`: ticks that are compared from one snapshot on.
+        """
         header = self._recording.header
         later_commands = self._commands[self._commands["tick"] > tick]
         self.report.stretches += 1
@@ -311,6 +314,6 @@ class Replay:
             self._record_difference(int(recorded[0, signals.TICK]), "rate_hz", rate_hz, 1e9 * periods / span_ns)
 
     def _record_difference(self, tick: int, signal: str, recorded: Any, replayed: Any) -> None:
-        """Store the first difference in the report."""
+        """Set `first_difference` of the report to {tick, signal, recorded, replayed}; NaN and infinities as text."""
         values = {"recorded": json_value(recorded), "replayed": json_value(replayed)}
         self.report.first_difference = {"tick": tick, "signal": signal, **values}

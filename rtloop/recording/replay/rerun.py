@@ -78,7 +78,10 @@ class SimulatedInputs:
     enable_input = None
 
     def __init__(self, driver: Driver, extra_channels: dict[str, str]) -> None:
-        """`driver` is a closed rig; `extra_channels` {name: channel} are the extra inputs of the recording."""
+        """`driver` is a simulated rig that is not open yet.
+
+        `extra_channels` {name: channel} are the recording's inputs and outputs besides sensors and drives.
+        """
         self.extra_channels = extra_channels
         self.facts, self.wiring, self._driver = driver.facts, driver.wiring, driver
 

@@ -35,8 +35,9 @@ def to_pandas(recording: RecordedSignals, selection: Selection) -> Any:
 def to_xarray(recording: RecordedSignals, selection: Selection) -> Any:
     """Return a Dataset of tick, deadline_ns and the selected signals over the time in s since the start of the run.
 
-    Each signal has `units` and `long_name`; the events are a JSON attribute. Raises RecordingError if a pattern fits no
-    signal or a limited time span holds no tick, MissingExtra without xarray.
+    Each signal has `units` and `long_name`. The Dataset's `attrs` have `recording` (the path), `name`, `rate_hz` and
+    `events` (JSON text). Raises RecordingError if a pattern fits no signal or a limited time span holds no tick,
+    MissingExtra without xarray.
     """
     try:
         import xarray

@@ -200,7 +200,10 @@ class RecordingTotals:
         self.extremes = SignalExtremes(imported_units)
 
     def add(self, column: dict[str, Real]) -> None:
-        """Add the next ticks, arrays (n,) by column name."""
+        """Add the next ticks, arrays (n,) by column name, n ≥ 1.
+
+        `tick`, `deadline_ns` and every imported signal must be there; other columns may be missing.
+        """
         self.ticks += len(column["tick"])
         self.first = self.first or (float(column["tick"][0]), float(column["deadline_ns"][0]))
         self.last = float(column["tick"][-1]), float(column["deadline_ns"][-1])
@@ -256,7 +259,7 @@ def _is_seamless(end: dict[str, Any] | None) -> bool:
 
 
 def _overview_span_s(readers: Sequence[Reader], totals: RecordingTotals) -> float:
-    """Time in s from the first to the last deadline, overview included; 0 if no ticks were omitted by intention."""
+    """Time in s from the first to the last deadline of ticks and overviews; 0 without overviews or without ticks."""
     deadlines = [reader.overview[:, DEADLINE] for reader in readers if len(reader.overview)]
     if not deadlines or totals.first is None:
         return 0.0
