@@ -127,9 +127,11 @@ class RecordedSignals:
         return (self._start_s, self._end_s) != (-math.inf, math.inf)
 
     def __contains__(self, name: object) -> bool:
+        """Whether the recording has a signal of this name."""
         return name in self.columns
 
     def __iter__(self) -> Iterator[str]:
+        """Iterate over the names of the signals, in recorded order."""
         return iter(self.columns)
 
     def __len__(self) -> int:
@@ -183,7 +185,10 @@ class RecordedSignals:
                         yield rows[in_interval, 1:]
 
     def snapshots(self) -> Generator[Snapshot]:
-        """Yield the recorded snapshots of the law, in order of their ticks; faults are added to `problems`."""
+        """Yield the recorded snapshots of the law in order of their ticks, also for a part those of the whole run.
+
+        Damaged ones are left out and added to `problems`. Raises RecordingError for a file that cannot be read.
+        """
         before = -1
         with self._open_readers() as readers:
             for reader in readers:

@@ -65,6 +65,7 @@ class TickBuffer:
         self._anchor = (0.0, 0.0)
 
     def __len__(self) -> int:
+        """Number of ticks in the buffer."""
         return self._row_count
 
     @property
@@ -105,7 +106,7 @@ class TickBuffer:
     def tick_time(self, tick: int) -> TickTime:
         """Return `tick` with its deadline, taken from its row or extrapolated from the last row before it.
 
-        Without a row before it, the base is the last dropped row, at first tick 0 with deadline 0.
+        Without a row before it, the base is the last dropped row; before any was dropped, tick 0 with deadline 0.
         """
         base_tick, base_ns = self._anchor
         row = int(np.searchsorted(self._rows[: self._row_count, TICK], tick, side="right")) - 1

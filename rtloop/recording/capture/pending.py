@@ -36,7 +36,7 @@ class PendingMessages:
         self.dropped = 0
 
     def count_pending(self, channel: int) -> int:
-        """Count the waiting messages of topic `channel`, without events that the recorder itself made."""
+        """Count the waiting messages with channel id `channel`, without events that the recorder itself made."""
         return count_pending(self._entries, channel)
 
     def add_event(self, event: Event) -> None:
@@ -44,7 +44,10 @@ class PendingMessages:
         self._entries.append(self.make_entry(event))
 
     def make_entry(self, event: Event) -> PendingEntry:
-        """Return an event as an entry, without appending it."""
+        """Return an event as an entry of the queue, without appending it.
+
+        `from_loop` of the entry is False if the recorder itself made the event.
+        """
         return PendingEntry(
             event["tick"], event_message(event, self._start_unix_ns()), from_loop=event["who"] != RECORDER
         )
@@ -88,7 +91,7 @@ class PendingMessages:
 
 
 def count_pending(entries: Iterable[PendingEntry], channel: int) -> int:
-    """Count the messages of topic `channel` among `entries`, without events that the recorder itself made."""
+    """Count the messages with channel id `channel` among `entries`, without events that the recorder itself made."""
     return sum(entry.message.channel == channel and (entry.from_loop or channel != format.EVENTS) for entry in entries)
 
 

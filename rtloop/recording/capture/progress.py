@@ -29,7 +29,7 @@ class RingPosition(NamedTuple):
     lost: int
 
     def furthest(self, position: RingPosition) -> RingPosition:
-        """Return the larger number for each ring, with `lost` of this position."""
+        """Return the larger of both positions' numbers for each ring, with `lost` of this one, not of `position`."""
         return self._make([*map(max, self[:3], position[:3]), self.lost])
 
 
@@ -45,19 +45,20 @@ class RecorderProgress:
 
     @property
     def flushed_position(self) -> RingPosition:
-        """Position that was stored last."""
+        """Ring position before which all data is in files or lost, as the shared block has it."""
         return self._load(FLUSHED)
 
     def store_flushed(self, position: RingPosition) -> None:
-        """Store that all data before `position` is in files or lost; no write is announced any more."""
+        """Store in the block that all data before `position` is in files or lost, and that no write is announced."""
         self._store(FLUSHED, position)
         self._store(ANNOUNCED, position)
 
     @contextmanager
     def announced_write(self, begin_byte: int, end_position: RingPosition) -> Iterator[None]:
-        """Announce a write, from `begin_byte` of the file to `end_position`, and store it as flushed afterwards.
+        """Announce the write inside the block to a replacement recorder, and store it as done afterwards.
 
-        An error withdraws the announcement; a write that raises must leave the file unchanged.
+        The write begins at byte `begin_byte` of the file; `end_position` is the ring position after it. An error
+        withdraws the announcement; a write that raises must leave the file unchanged.
         """
         previous = self.flushed_position
         # The byte comes first: the file holds nothing behind it yet, whatever position is announced.
@@ -71,9 +72,9 @@ class RecorderProgress:
         self._store(FLUSHED, end_position)
 
     def predecessor_position(self, part: Path | None) -> RingPosition:
-        """Position that the previous recorder reached, by its words in the block and its unfinished file `part`.
+        """Ring position that the dead recorder reached, by the shared block and its unfinished file `part`, if any.
 
-        An announced write counts if its chunk is in `part`; `part` None: there is no such file.
+        A write that was announced, but not stored as done, counts if its chunk is in `part`.
         """
         position, announced = self.flushed_position, self._load(ANNOUNCED)
         for content in _chunk_contents_from(part, self._block.load(Word.ANNOUNCED_BYTE)) if part else []:
@@ -84,17 +85,17 @@ class RecorderProgress:
         return position
 
     def _load(self, words: Sequence[Word]) -> RingPosition:
-        """Load a position from words of the block."""
+        """Load a position from four words of the block: ticks, snapshots, events, lost ticks."""
         return RingPosition(*map(self._block.load, words))
 
     def _store(self, words: Sequence[Word], position: RingPosition) -> None:
-        """Store a position in words of the block."""
+        """Store a position in four words of the block: ticks, snapshots, events, lost ticks."""
         for word, value in zip(words, position, strict=True):
             self._block.store(word, value)
 
 
 def _chunk_contents_from(part: Path, byte: int) -> list[bytes]:
-    """Return the contents of the chunks of a file from `byte` on; [] if it is missing, finished or unreadable."""
+    """Return the contents of the undamaged chunks of a file from `byte` on; [] if it is missing or unreadable."""
     try:
         return list(chunk_contents_from(part, byte))
     except RecordingError:

@@ -68,7 +68,7 @@ class Recorder:
             RingReader(block, name).take_into(block.ring(name).slots[:0])  # Compiles; takes no slot.
 
     def record(self, session: Session, orders: SupervisorOrders, pause_s: float) -> str:
-        """Poll the rings every `pause_s` until the loop ends. Returns "finished", "failed" or "abandoned".
+        """Poll the rings every `pause_s` until the loop ends. Returns how: "finished", "failed" or "abandoned".
 
         Writes what is due, records removed files, and stores cursor and state in the block. "abandoned": the supervisor
         closed the orders, or died, and no living process drives the block or nothing came from the rings for
@@ -102,9 +102,10 @@ def _is_supervisor_gone() -> bool:
 
 
 def record_run(fd: int, names: RequesterNames | None = None) -> int:
-    """Record one run from the shared block at descriptor `fd`; print its totals as a JSON line.
+    """Record one run from the shared block at descriptor `fd`, as a line on stdin orders; print the totals as JSON.
 
-    Returns the exit code: 0, also if no block ever came, or 1 after an error.
+    Waits for the block and the order, and stores RECORDER_STATE in the block. Returns the exit code: 0, also if the
+    supervisor ended before there was a block (then nothing is printed), or 1 after an error, which the totals name.
     """
     try:
         block = SharedBlock.attach(fd, _is_supervisor_gone)

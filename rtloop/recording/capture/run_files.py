@@ -81,7 +81,7 @@ class RunFiles:
 
     @property
     def ticks_skipped(self) -> int:
-        """Number of ticks that overviews replace."""
+        """Number of ticks that overviews replace in the files of this recorder."""
         return self._closed_skipped + (self.writer.ticks_skipped if self.writer else 0)
 
     @property
@@ -182,6 +182,9 @@ class RunFiles:
             self.end_place = self._repeats_before
 
     def _abandon(self, writer: Writer) -> None:
-        """Close the file of `writer`; no file is present then, and `end_place` is its first tick again."""
+        """Close the present file, of `writer`, whose ticks are lost; no file is present afterwards.
+
+        `end_place` moves back to the first tick of that file.
+        """
         writer.close()
         self.writer, self.end_place = None, self.file_begin

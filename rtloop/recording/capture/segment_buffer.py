@@ -92,7 +92,7 @@ class SegmentBuffer:
         return next((int(part.rows[0, TICK]) for part in self._batches() if len(part.rows)), self._newest_tick + 1)
 
     def count_pending(self, channel: int) -> int:
-        """Count the waiting messages of topic `channel`, without events that the recorder itself made."""
+        """Count the waiting messages with channel id `channel`, without events that the recorder itself made."""
         return sum(count_pending(entries, channel) for entries in self._entry_lists())
 
     def find_hits(self, entries: list[PendingEntry], rows: Real) -> list[Hit]:
@@ -136,11 +136,11 @@ class SegmentBuffer:
             segment.retain = True
 
     def next_batch(self, file_is_due: Callable[[int], bool], *, decide_all: bool = False) -> WriteBatch | None:
-        """Remove and return the next decided batch in order; None if the next ticks are undecided or none wait.
+        """Remove and return the next batch to write, in order; None if none is ready.
 
         The batch is retained ticks, an overview, or a cut: `file_is_due(tick)` tells whether a file should begin at the
-        snapshot of `tick`. `decide_all` also decides the segments still open, and takes an overview before
-        OVERVIEW_BATCH_S is full.
+        snapshot of `tick`. Ticks that a later event may still retain are not ready, nor is an overview of less than
+        OVERVIEW_BATCH_S that no retained ticks follow; `decide_all` returns both as well.
         """
         while self._segments:
             head = self._segments[0]
@@ -240,5 +240,5 @@ class SegmentBuffer:
 
 
 def _event_kind(entry: PendingEntry) -> str | None:
-    """Kind of an event of the loop; None for any other message."""
+    """Kind of an event of the loop, such as "tripped"; None for any other message."""
     return json.loads(entry.message.payload)["kind"] if entry.from_loop else None

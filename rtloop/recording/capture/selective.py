@@ -86,9 +86,10 @@ class SelectiveSession(Session):
         self._write_decided(decide_all=True)
 
     def _write_decided(self, *, decide_all: bool = False) -> None:
-        """Write the decided batches until one fails, which is put back and recorded as failure.
+        """Write the batches of segments that are decided (retained, or replaced by an overview); `decide_all`: of all.
 
-        While no file can be written, drop data beyond the limits of the buffer.
+        A batch whose write fails is put back, and recording stops. While no file can be written, drop data beyond the
+        limits of the segments.
         """
         while (
             self.failure is None
@@ -125,7 +126,10 @@ class SelectiveSession(Session):
         super()._finish_file(kind, result, end_tick, min(end_tick, event_tick))
 
     def _count_pending(self, channel: int) -> int:
-        """Count the waiting messages of topic `channel`, in the queue and in the buffer."""
+        """Count the waiting messages with channel id `channel`, in the queue and in the segments.
+
+        Events that the recorder itself made do not count.
+        """
         return super()._count_pending(channel) + self._segments.count_pending(channel)
 
     def _tick_time(self, tick: int) -> TickTime:

@@ -256,7 +256,7 @@ class Session:
                 self._block.store(Word.RECORDER_FAILURE, problem.number or errno.EIO)
 
     def _fail(self, error: OutputError) -> None:
-        """Queue the event of a failed write and stop recording until a file can be begun."""
+        """Queue the event of a failed write and stop recording until a file can be begun; the first sets `error`."""
         self.error = self.error or str(error)
         self._pending.add_event(recorder_event(RECORDING_FAILED, *self._failure_time(), {"error": str(error)}))
         self._stop_recording(error)
@@ -340,11 +340,11 @@ class Session:
         self._block.store(Word.RECORDER_FAILURE, 0)
 
     def _count_pending(self, channel: int) -> int:
-        """Count the unwritten messages of topic `channel` taken from the rings, without the recorder's events."""
+        """Count the unwritten messages with channel id `channel` from the rings, without the recorder's own events."""
         return self._pending.count_pending(channel)
 
     def _store_progress(self, tick: int) -> None:
-        """Store that ticks before `tick` are in a file or lost; snapshots and events may still be in the rings."""
+        """Store in the block that ticks before `tick` are in a file or lost; the other rings' positions stay."""
         lost = tick - self._files.ticks_logged - self._files.ticks_skipped
         self._progress.store_flushed(self._progress.flushed_position._replace(ticks=tick, lost=lost))
 

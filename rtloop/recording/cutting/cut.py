@@ -30,6 +30,7 @@ class RangeCopy:
     """Copy of a range of ticks into `writer`."""
 
     def __init__(self, source: RunSource, writer: Writer, tick_range: TickRange) -> None:
+        """Prepare to copy `tick_range` from `source` to `writer`, which has written its header."""
         self._source, self._writer, self._range = source, writer, tick_range
         self._account = CopyAccount(tick_range.first, source.header["rate_hz"])
         self.gaps: list[tuple[int, int]] = []

@@ -35,6 +35,7 @@ class ChunkSeeker:
     """
 
     def __init__(self, reader: Reader) -> None:
+        """Search in the file of `reader`, which must be tolerant; no chunk is read yet."""
         self.reader = reader
         self.span = lru_cache(CACHED_SPANS)(self._read_span)
         self.chunk = lru_cache(2)(self._read_chunk)

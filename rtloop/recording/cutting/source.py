@@ -32,6 +32,7 @@ class RunSource:
     """Files of one run, in its order."""
 
     def __init__(self, seekers: Sequence[ChunkSeeker]) -> None:
+        """Take the files of one run, one or more, in the order of the run; `header` is the first one's, for the run."""
         self._seekers = seekers
         header = seekers[0].reader.header
         self.header: dict[str, Any] = {key: value for key, value in header.items() if key not in FILE_KEYS}

@@ -122,7 +122,8 @@ class _Conversion:
     def finish(self) -> Path:
         """Complete the copy. Returns its path, the one of an unfinished file if no event ends the recording.
 
-        Raises RecordingError if no header was added; DamagedChunk for ticks out of order; OutputError.
+        Raises RecordingError if no header was added; DamagedChunk for ticks out of order or log times that contradict
+        the deadlines; OutputError if the copy cannot be written.
         """
         if self._writer is None:
             raise RecordingError(
@@ -221,9 +222,10 @@ class _Conversion:
         return record.tobytes()[MESSAGE_HEAD.size :]
 
     def _flush(self, writer: Writer) -> None:
-        """Write the waiting messages of the slow topics, then the ticks that follow them, and empty both queues.
+        """Write the waiting messages of topics other than /ticks, then the waiting ticks, and empty both queues.
 
-        Raises DamagedChunk for ticks out of order or log times that contradict the deadlines; OutputError.
+        Raises DamagedChunk for ticks out of order or log times that contradict the deadlines; OutputError if the copy
+        cannot be written.
         """
         writer.write_messages(self._slow_messages)
         self._slow_messages = []

@@ -127,9 +127,10 @@ class Reader:
         return int(self.header["created_unix_ns"])
 
     def chunk(self, entry: ChunkEntry) -> Ticks | list[Message] | None:
-        """Ticks of a chunk, or the messages of a chunk without ticks; None for a damaged chunk, which is reported.
+        """Ticks of a chunk, or the valid messages of a chunk without ticks; None for a damaged chunk.
 
-        Repeated data is included. Raises RecordingError for a damaged chunk unless the reader is tolerant.
+        Data that another file of the run holds too is included. Damage is listed in `problems`, or raises
+        RecordingError unless the reader is tolerant.
         """
         try:
             return self._parse(entry)
@@ -156,9 +157,9 @@ class Reader:
 
         Ticks may be missing between rows. Ticks that an earlier file of the run holds are left out. `entries` restricts
         the ticks to some of `tick_chunks`; without it, their number is compared with the recorder's. With `ahead`,
-        threads decompress the next chunks; a process that shares its processors with others needs none. Raises
-        RecordingError for an unknown name and, unless tolerant, for a damaged chunk or a wrong
-        number of ticks.
+        threads decompress the next chunks; a process that shares its processors with others needs none. Damaged chunks
+        are skipped; these and a wrong number of ticks are listed in `problems`, or raise RecordingError unless the
+        reader is tolerant. Raises RecordingError for an unknown name.
         """
         columns = self._require_columns(self.columns if names is None else names)
         account = TickAccount(self.first_tick, self.totals, self._end_of_repetition)
@@ -223,8 +224,8 @@ class Reader:
     def overview(self) -> Intervals:
         """Intervals (n, columns, 3: minimum, maximum, mean) of the omitted ticks, in order.
 
-        See `rtloop.recording.file.topics.overview`. Intervals without ticks, or with ticks of another one, are reported
-        and left out.
+        See `rtloop.recording.file.topics.overview`. Intervals without ticks, or with ticks of another one, are left out
+        and reported in `problems`; unless the reader is tolerant, they raise RecordingError.
         """
         intervals = self.overview_intervals(self._messages(format.OVERVIEW))
         is_plausible = are_plausible(intervals)
@@ -277,7 +278,10 @@ class Reader:
     def _read_ahead(
         self, entries: Iterable[ChunkEntry], names: Sequence[str]
     ) -> Iterator[tuple[ChunkEntry, ReadTicks]]:
-        """Yield each entry with a function that returns its ticks with columns `names`, read ahead in threads."""
+        """Yield each entry with a function that returns its ticks with columns `names`, read ahead in threads.
+
+        The function returns None for a chunk of other messages, and raises DamagedChunk.
+        """
         queue: deque[tuple[ChunkEntry, ReadTicks]] = deque()
         with ThreadPoolExecutor(WORKERS) as pool:
             for entry in entries:
@@ -290,7 +294,10 @@ class Reader:
     def _read_in_turn(
         self, entries: Iterable[ChunkEntry], names: Sequence[str]
     ) -> Iterator[tuple[ChunkEntry, ReadTicks]]:
-        """Yield each entry with a function that reads and returns columns `names` of its ticks when it is called."""
+        """Yield each entry with a function that reads and returns columns `names` of its ticks when it is called.
+
+        The function returns None for a chunk of other messages, and raises DamagedChunk.
+        """
         for entry in entries:
             yield entry, partial(self._read_ticks, entry, names)
 
@@ -305,14 +312,18 @@ class Reader:
     def _messages(self, channel: int) -> Iterator[Message]:
         """Yield the valid messages of a topic other than /ticks, by its channel id, in the order of the file.
 
-        Damaged chunks, and invalid messages of any topic in the same chunks, are reported.
+        Damaged chunks, and invalid messages of any topic in the same chunks, are listed in `problems`, or raise
+        RecordingError unless the reader is tolerant.
         """
         for entry in self.entries:
             if may_hold_slow(entry, channel):
                 yield from (message for message in self._slow_messages(entry) if message.channel == channel)
 
     def _slow_messages(self, entry: ChunkEntry) -> list[Message]:
-        """Return the valid messages of a chunk; [] if it holds ticks or is damaged, which is reported."""
+        """Return the valid messages of a chunk; [] if it holds ticks or is damaged.
+
+        Damage is listed in `problems`, or raises RecordingError unless the reader is tolerant.
+        """
         try:
             content = self._layout.content(entry)
             return [] if starts_with_tick(content) else self._valid_messages(split_messages(content))

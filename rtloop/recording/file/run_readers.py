@@ -40,7 +40,10 @@ def find_files(files: RecordingPaths) -> list[Path]:
 
 
 def run_files(path: Path, suffix: str) -> list[Path]:
-    """Files of the run recorded as `path` (NAME.mcap) that end in `suffix`: NAME, then NAME-0001, …; may be []."""
+    """Existing files of the run recorded as `path` (NAME.mcap) whose names end in `suffix`, such as .mcap.part.
+
+    NAME comes first, then NAME-0001, …; [] if there is none.
+    """
     folder, stem = path.parent, glob.escape(path.stem)
     return [*folder.glob(f"{stem}{suffix}"), *sorted(folder.glob(f"{stem}-[0-9][0-9][0-9][0-9]{suffix}"))]
 

@@ -73,9 +73,9 @@ class Writer:
         return self.file.part
 
     def write(self, messages: Sequence[Message], rows: Real) -> None:
-        """Write messages of the slow topics and at most one chunk of ticks: both, or neither.
+        """Write messages of topics other than /ticks, and rows (n, columns) of at most one chunk of ticks.
 
-        Raises OutputError if either fails.
+        Both are written, or neither. Raises OutputError if either fails.
         """
         self.write_messages(messages)
         try:

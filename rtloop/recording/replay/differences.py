@@ -22,6 +22,7 @@ class SignalDifferences:
     """Largest and RMS difference of each computed signal; ticks with a non-finite difference are ignored."""
 
     def __init__(self, axes: Sequence[str]) -> None:
+        """Begin without ticks; rows will have the columns of a recording with the named `axes`."""
         self._columns = [signals.axis_column(axis, signal) for axis in range(len(axes)) for signal in COMPARED_SIGNALS]
         self._names = [f"{axis}_{AXIS_SIGNALS[signal].name}" for axis in axes for signal in COMPARED_SIGNALS]
         size = len(self._columns)
@@ -65,6 +66,7 @@ class TrackingPerformance:
     """Tracking error over closed-loop ticks, largest drive and steps of every axis."""
 
     def __init__(self, axes: Sequence[str], rate_hz: float) -> None:
+        """Begin without ticks; rows will have the columns of a recording with the named `axes`, at `rate_hz`."""
         self._axes, self._rate_hz = range(len(axes)), rate_hz
         self._square_sum, self._count = np.zeros(len(axes)), 0
         self._drive_v, self._error_um = np.zeros(len(axes)), np.zeros(len(axes))

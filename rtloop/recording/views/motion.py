@@ -45,10 +45,10 @@ class Motion:
         self._highest_v = max(self._highest_v, float(drive_v.max()))
 
     def ran_away_opposed(self) -> bool:
-        """Whether the position moved against the drive, below OPPOSED_CORRELATION, and the drive did not oscillate.
+        """Whether the position moved against the drive, and the drive did not oscillate.
 
-        The path of a drive that does not is at most MOST_TRAVEL times its range, whatever its size. False where drive
-        or position is constant, or a number is not finite.
+        Their correlation is then below OPPOSED_CORRELATION, and the path of the drive at most MOST_TRAVEL times its
+        range. False without ticks, where drive or position is constant, or a number is not finite.
         """
         if not self._count or not np.all(np.isfinite(self._products)):
             return False

@@ -111,7 +111,7 @@ class ChunkFile:
     def append_chunk(self, content: ChunkContent) -> None:
         """Compress and write one chunk and its index records, if it has any, as a whole or not at all.
 
-        The first chunk gives the file the name PATH.part.
+        The first chunk gives the file the name PATH.part. Raises OutputError.
         """
         chunk = pack_chunk(content.records, content.start, content.end, self._compressor)
         index_begin = self.size + len(chunk)
@@ -215,7 +215,10 @@ class ChunkFile:
         return fd
 
     def _rename_to_part(self) -> None:
-        """Give the file, which has its first chunk, the name PATH.part under which it grows."""
+        """Give the file, which has its first chunk, the name PATH.part under which it grows.
+
+        Raises OutputError if a recording of this name, finished or unfinished, exists.
+        """
         self._refuse_to_replace()
         with self._output_errors():
             os.rename(self._name, self.part)

@@ -47,6 +47,7 @@ class _Decompressors(threading.local):
     of messages."""
 
     def __init__(self) -> None:
+        """Make the decompressor of a thread, at its first use there."""
         self.of_thread = zstandard.ZstdDecompressor()
 
 

@@ -125,6 +125,7 @@ class _Stream:
     """Stream of a file for the stock reader, from its beginning on."""
 
     def __init__(self, source: McapSource) -> None:
+        """Begin at the first byte of `source`; nothing is read yet."""
         self._source, self._begin = source, 0
         self._window = io.BytesIO()
 

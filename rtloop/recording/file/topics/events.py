@@ -93,7 +93,10 @@ def law_label(kind: str, file: str = "") -> str:
 
 
 def _failure_text(code: int, value: float) -> str:
-    """Describe a failure of a law by its `Failure` code; odd codes raised, even codes returned `value`."""
+    """Describe a failure of a law by its `Failure` code: "returned nan from output of the controller".
+
+    An odd code names the function that raised an exception, an even one the function that returned `value`.
+    """
     slot, _, function = _member_name(Failure, code - code % 2).partition("_")
     return (
         f"raised an exception in {function} of the {slot}"

@@ -49,8 +49,9 @@ def header_payload(content: bytes) -> bytes:
 
 
 def read_header(path: Path, payload: bytes, content: bytes | None = None) -> dict[str, Any]:
-    """Parse the header of a recording and compare it with the schemas in `content`, its first chunk, if not None.
+    """Parse the header `payload` of a recording; compare it with the schemas in `content`, its unpacked first chunk.
 
+    Without `content`, the schemas are not compared; `path` is the file named in errors.
     Raises RecordingError for a newer version, a malformed header, a configuration that does not match its SHA-256, and
     columns that do not match the schemas or the axes.
     """

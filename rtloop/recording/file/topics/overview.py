@@ -97,6 +97,7 @@ class OverviewLayout:
     """Layout of the overview messages of a recording with `columns`."""
 
     def __init__(self, columns: Sequence[str]) -> None:
+        """Make the layout of messages with three figures for each of `columns`, at most MAX_COLUMNS of them."""
         self._columns, names = len(columns), _field_names(columns)
         self._dtype = np.dtype(format.doubles(names))
         self._names = names

@@ -63,9 +63,9 @@ class StepReason(IntEnum):
 
 
 REASON_TEXTS = {
-    StepReason.NO_TICKS: "ticks were not seen in time",
-    StepReason.OUTPUTS: "an output is not at its safe value, or the driver refuses it",
-    StepReason.DRIVER: "the driver's status is not good",
+    StepReason.NO_TICKS: "ticks are missing, so their readings are unknown",
+    StepReason.OUTPUTS: "an output is not at its safe value, or the driver refused to write it",
+    StepReason.DRIVER: "the driver reports a fault (driver_status is not 0)",
     StepReason.AGE: "the sample is older than interlocks.sample_age_us",
     StepReason.SENSOR: "a reading is not finite, beyond its limits or at the end of the channel's range",
     StepReason.POSITION: "a position is beyond interlocks.position_um",
@@ -77,7 +77,7 @@ REASON_TEXTS = {
     StepReason.ACTIVITY: "a measurement or the preparation of the actuator moved the loop",
     StepReason.FAULT: "the service has another fault",
     StepReason.CHANGED: "the configuration or the law changed since the trip",
-    StepReason.REFUSED: "a step was refused",
+    StepReason.REFUSED: "a step of the recovery failed",
     StepReason.REFERENCE: "the former mode or reference is unknown",
     StepReason.DISARMED: "the outputs are not armed",
 }

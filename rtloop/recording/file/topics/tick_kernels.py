@@ -13,12 +13,13 @@ WORD_BYTES = 8
 
 
 class RecordLayout:
-    """Layout of equal records: `template` (size,) uint8 with the bytes of each record where `is_fixed` (size,) holds.
-
-    Raises ValueError for records of less than eight bytes, and for arrays of different lengths.
-    """
+    """Layout of records of equal length, some of whose bytes are the same in all records."""
 
     def __init__(self, template: npt.NDArray[np.uint8], is_fixed: npt.NDArray[np.bool_]) -> None:
+        """Take a record `template` (size,), whose bytes are the same in all records where `is_fixed` (size,) is True.
+
+        Raises ValueError for records of less than eight bytes, and for arrays of different lengths.
+        """
         self.size = len(template)
         if self.size < WORD_BYTES or len(is_fixed) != self.size:
             raise ValueError(

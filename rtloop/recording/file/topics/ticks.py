@@ -39,7 +39,7 @@ class Ticks(NamedTuple):
     last: int
 
     def from_tick(self, tick: int) -> Ticks | None:
-        """Ticks numbered `tick` or above; None if all are below it."""
+        """Return the ticks numbered `tick` or above, as views of these; None if all are below it."""
         if self.last < tick:
             return None
         index = int(np.searchsorted(self.numbers, tick))
@@ -50,6 +50,7 @@ class TickLayout:
     """Byte layout of the ticks of a recording with `columns`."""
 
     def __init__(self, columns: Sequence[str]) -> None:
+        """Make the layout of tick messages with `columns`, the first two of which are tick and deadline_ns."""
         self.columns = tuple(columns)
         self._template = format.blank_ticks(self.columns, 1)
         varying = (*TIME_FIELDS, *self.columns)
@@ -111,7 +112,10 @@ def missing_ranges(first: Real, expected: int, last: Real | None = None) -> list
 
 
 def integer_problem(name: str, values: Real) -> str | None:
-    """Describe the first of `values` that is not whole or out of range in INTEGER_COLUMNS; None if there is none."""
+    """Describe the first of `values` (n,) that is no whole number in the range of column `name`; None if there is none.
+
+    `name` is a key of INTEGER_COLUMNS.
+    """
     low, high = INTEGER_COLUMNS[name]
     is_valid = (values >= low) & (values <= high) & (values == np.floor(values))
     if is_valid.all():

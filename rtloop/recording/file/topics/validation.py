@@ -280,7 +280,9 @@ def require_columns(header: dict[str, Any]) -> None:
         if header["columns"][:2] != ["tick", "deadline_ns"]:
             raise MalformedText(f"columns: {_shorten(header['columns'])}; allowed: tick and deadline_ns first")
         if unknown := header["imported"]["units"].keys() - header["columns"]:
-            raise MalformedText(f"imported.units: there is no column {_shorten(sorted(unknown))}; allowed: columns")
+            raise MalformedText(
+                f"imported.units: there is no column {_shorten(sorted(unknown))}; allowed: names of columns"
+            )
         return
     axes, observed, extras = header["axes"], header["observed"], header_extras(header).columns
     expected = list(signals.column_names(axes, observed, extras))
@@ -390,7 +392,10 @@ def _parse_object(payload: bytes) -> dict[str, Any]:
 
 
 def _validate(model: type[BaseModel], values: dict[str, Any], place: str = "") -> None:
-    """Raise MalformedText for the first value that does not fit `model`; `place` precedes its name."""
+    """Raise MalformedText for the first of `values` that does not fit `model`.
+
+    `place`, such as "what.", precedes the value's name in the message.
+    """
     try:
         model.model_validate(values)
     except ValidationError as error:
