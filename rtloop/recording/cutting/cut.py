@@ -91,7 +91,7 @@ def cut(
 
     `from_s` and `until_s`, in s since the start, give the first tick and the tick after the last one by their deadlines
     instead; a limit that is None is the recording's. The ticks from the last snapshot before the range are copied as
-    well. Lost ticks are reported. `output` is by default NAME.cut-TICK.mcap beside the recording. At least
+    well. Missing ticks are listed in `gaps`. `output` is by default NAME.cut-TICK.mcap beside the recording. At least
     `min_free_bytes` of the disk stay free. `progress` receives the number of ticks so far.
 
     Returns {recording, output, first, end, begin, ticks, gaps [(first tick, count)], problems, complete}: `begin` is

@@ -114,10 +114,10 @@ def recover(
 ) -> dict[str, Any]:
     """Write a finished recording of the readable data in `path`, opened by `opener`; `progress` receives tick counts.
 
-    `output` is `recovered_path` if None. Returns {recording, output, ticks, gaps [(first tick, count)], problems,
-    complete}: `complete` is True for a finished run without a loss. Raises RecordingError if a recorder is writing
-    `path` or it cannot be read, OutputError if the output exists or cannot be written completely; an incomplete output
-    is removed.
+    `output` is `recovered_path` if None; an unfinished output of an earlier attempt is removed. Returns {recording,
+    output, ticks, gaps [(first tick, count)], problems, complete}: `complete` is True for a finished run without a
+    loss. Raises RecordingError if a recorder is writing `path` or it cannot be read, OutputError if the output exists
+    or cannot be written completely; an incomplete output is removed.
     """
     path = Path(path)
     output = recovered_path(path) if output is None else Path(output)

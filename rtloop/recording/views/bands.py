@@ -158,7 +158,7 @@ def signal_kind(name: str) -> str:
 def _overview_band(
     recording: Recording, names: list[str], start_s: float, end_s: float, points: int
 ) -> tuple[Any, Any, Any]:
-    """Times (n,), s, and least and largest values (n, names) of the omitted ticks, n about 2 `points`; (0,) if none."""
+    """Return times (n,) in s, least and largest values (n, names) of the omitted ticks; n is about 2 `points`, or 0."""
     empty = np.empty((0, len(names)))
     if not recording.skipped:
         return np.empty(0), empty, empty
@@ -194,7 +194,10 @@ def full_rate_spans(recording: Recording) -> list[tuple[float, float]]:
 
 
 def event_marks(recording: Recording, start_s: float, end_s: float) -> list[Mark]:
-    """Marks of the events between two times, both included, in s since the start, without events that end a file."""
+    """Marks of the events between two times, both included, in s since the start, without events that end a file.
+
+    Each is labelled with its mode, or with its kind and the causes of a trip.
+    """
     events = []
     for event in recording.events:
         time_s, kind, details = event["time_ns"] * 1e-9, event["kind"], event["what"]
