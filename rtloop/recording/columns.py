@@ -15,7 +15,7 @@ def signal_unit(name: str) -> str:
 def describe_signal(name: str) -> Signal:
     """Return name, unit and meaning of a signal by its name; an axis's meaning begins with the axis's name.
 
-    For a name that rtloop does not define, the meaning is "" and the unit that of the name's end (`_um`: µm), or "".
+    For a name that rtloop does not define, the meaning is "", and the name's end gives the unit (`_um`: µm), or "".
     """
     for signal in COMMON_SIGNALS:
         if name == signal.name:

@@ -185,7 +185,7 @@ class RecordedSignals:
                         yield rows[in_interval, 1:]
 
     def snapshots(self) -> Generator[Snapshot]:
-        """Yield the recorded snapshots of the law in order of their ticks, also for a part those of the whole run.
+        """Yield the recorded snapshots of the law in order of their ticks, of the whole run also for a part.
 
         Damaged ones are left out and added to `problems`. Raises RecordingError for a file that cannot be read.
         """

@@ -81,7 +81,7 @@ class TickBuffer:
     def take_from(self, reader: RingReader) -> int:
         """Append ticks from the ring, as many as there is room for.
 
-        Returns the number of ticks appended plus that of ticks lost in the ring before them.
+        Returns the number of ticks appended plus the number of ticks lost in the ring before them.
         """
         copied, lost = reader.take_into(self._rows[self._row_count :])
         self._row_count += copied

@@ -69,7 +69,7 @@ class Decimation:
                 self._end_interval()
 
     def _end_interval(self) -> None:
-        """End the present interval and queue its minimum, maximum and mean; nothing happens if it has no tick.
+        """End the present interval, unless it has no tick, and queue its minimum, maximum and mean.
 
         The three are NaN for a column whose values are all NaN.
         """

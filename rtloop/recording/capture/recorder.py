@@ -70,9 +70,8 @@ class Recorder:
     def record(self, session: Session, orders: SupervisorOrders, pause_s: float) -> str:
         """Poll the rings every `pause_s` until the loop ends. Returns how: "finished", "failed" or "abandoned".
 
-        Writes what is due, records removed files, and stores cursor and state in the block. "abandoned": the supervisor
-        closed the orders, or died, and no living process drives the block or nothing came from the rings for
-        ABANDONED_S.
+        Writes due data, records removed files, and stores cursor and state in the block. "abandoned": the supervisor
+        closed the orders, or died, and no living process drives the block or the rings were empty for ABANDONED_S.
         """
         last_tick_s = time.monotonic()
         while True:
@@ -105,7 +104,7 @@ def record_run(fd: int, names: RequesterNames | None = None) -> int:
     """Record one run from the shared block at descriptor `fd`, as a line on stdin orders; print the totals as JSON.
 
     Waits for the block and the order, and stores RECORDER_STATE in the block. Returns the exit code: 0, also if the
-    supervisor ended before there was a block (then nothing is printed), or 1 after an error, which the totals name.
+    supervisor ended before there was a block (without a print), or 1 after an error, which the totals name.
     """
     try:
         block = SharedBlock.attach(fd, _is_supervisor_gone)

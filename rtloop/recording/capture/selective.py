@@ -55,7 +55,7 @@ class SelectiveSession(Session):
         self._write_decided()
 
     def _write_all(self) -> None:
-        """Move all drained ticks, and the messages up to the last of them, to the segments, and write what is decided.
+        """Move all drained ticks, and the messages up to the last of them, to the segments; write decided segments.
 
         Later messages wait for their ticks.
         """

@@ -31,11 +31,11 @@ class TickAccount:
             return None
         if ticks.first < self._next_tick:
             raise DamagedChunk(
-                f"ticks out of order: it begins with tick {ticks.first}; allowed: tick {self._next_tick} or later"
+                f"ticks out of order: the chunk begins with tick {ticks.first}; allowed: {self._next_tick} or later"
             )
         if ticks.last >= self._end:
             raise DamagedChunk(
-                f"ticks out of order: it ends with tick {ticks.last}, but the run ended before tick {self._end}"
+                f"ticks out of order: the chunk ends with tick {ticks.last}, but the run ended before tick {self._end}"
             )
         self._next_tick = ticks.last + 1
         self._tick_count += len(chunk.rows)

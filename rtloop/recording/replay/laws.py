@@ -119,7 +119,7 @@ def _find_law(entry: Mapping[str, Any], recording: Recording, trust: TrustedLaws
 
 
 def _in_place(name: str, digest: str, file: Any) -> LawReference:
-    """Read the law `name` from `file`, the one that it ran from; `digest` is the recorded SHA-256 of its text.
+    """Read the law `name` from `file`, from which it ran; `digest` is the recorded SHA-256 of its text.
 
     Raises ValueError if the file is not recorded, unreadable or untrusted, has another SHA-256, or does not import
     rtloop.

@@ -181,7 +181,7 @@ def _run_spans(
 
 
 def _received(receiver: Connection) -> SpanCounts | None:
-    """Return what a span's process sent; None if it died before."""
+    """Return the counts that a span's process sent; None if the span is not identical or the process died before."""
     try:
         return receiver.recv()
     except EOFError:

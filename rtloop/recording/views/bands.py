@@ -125,7 +125,7 @@ def read_bands(
 
 
 def make_panels(recording: Recording) -> list[Panel]:
-    """Return the panels of a picture, from the top, each with a recorded signal; an unpaced run has none of its timing.
+    """Return the panels of a picture, from the top, each with a recorded signal; unpaced runs have no timing panel.
 
     Raises RecordingError if there is no signal to draw.
     """

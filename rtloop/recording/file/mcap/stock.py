@@ -57,7 +57,7 @@ def library_name(source: McapSource) -> str:
 def encoding(channel: Channel, schema: Schema | None) -> str:
     """Return the encoding of a channel's messages as text, or "unnamed encoding".
 
-    That of the schema follows in brackets, unless it is the same or the usual one for it (`jsonschema` for `json`).
+    The schema's encoding follows in brackets, unless it is the same or the usual one for it (`jsonschema` for `json`).
     """
     name = schema.encoding if schema else ""
     is_implied = name in ("", channel.message_encoding, f"{channel.message_encoding}schema")
@@ -125,7 +125,7 @@ class _Stream:
     """Stream of a file for the stock reader, from its beginning on."""
 
     def __init__(self, source: McapSource) -> None:
-        """Begin at the first byte of `source`; nothing is read yet."""
+        """Begin at the first byte of `source`, without reading it."""
         self._source, self._begin = source, 0
         self._window = io.BytesIO()
 

@@ -91,7 +91,7 @@ def tick_schema(columns: Sequence[str]) -> bytes:
 
 
 def schemas(columns: Sequence[str]) -> list[Schema]:
-    """Schema records of `/ticks` with `columns`, `/events` and `/configuration`; not the one of `/overview`."""
+    """Schema records of `/ticks` with `columns`, `/events` and `/configuration`, but not of `/overview`."""
     return [
         Schema(id=TICK_SCHEMA, name="rtloop.Tick", encoding="protobuf", data=tick_schema(columns)),
         Schema(id=EVENT_SCHEMA, name="rtloop.Event", encoding="jsonschema", data=json.dumps(_EVENT).encode()),

@@ -29,8 +29,8 @@ RUN_KEYS = ("created_unix_ns", "name", "columns")
 def header_payload(content: bytes) -> bytes:
     """Return the header's JSON text from `content`, the unpacked first chunk of a file that rtloop wrote.
 
-    Raises DamagedChunk if the chunk holds no header or a further message, or if its channels are unreadable or not
-    those of a recording.
+    Raises DamagedChunk if the chunk holds no header or a further message, or if its channels are unreadable or differ
+    from a recording's.
     """
     messages = split_messages(content)
     if [message.channel for message in messages] != [format.CONFIGURATION]:
