@@ -233,7 +233,8 @@ class Session:
         """Finish the file, which accounts for the ticks before `end_tick`; its last event is at `event_tick`.
 
         `kind` of that event is FINISHED or ROTATED; `result` tells how the loop ended, "rotated" for ROTATED. An error
-        sets `error`; after a rotation it is also an event and a word of the block, and recording continues.
+        sets `error`; after a rotation it is also queued as an event and stored in the block (RECORDER_FAILURE), and
+        recording continues.
         """
         writer = self._files.writer
 

@@ -94,7 +94,7 @@ class Reader:
         self._source.close()
 
     def restrict_begin(self, tick: int) -> None:
-        """Let this file begin at `tick`, where the earlier parts of the run end; data that it repeats is skipped.
+        """Let this file begin at `tick`, where the earlier files of the run end; data that it repeats is skipped.
 
         Repeated data lies before `repeats_before` of the header. Any other tick before `tick` is a fault.
         """
@@ -102,16 +102,16 @@ class Reader:
         self.first_tick = max(self.first_tick, tick)
 
     def restrict_end(self, tick: int) -> None:
-        """Skip the events and snapshots from `tick` on: a later part holds them as well."""
+        """Skip events of the loop and snapshots from `tick` on, which a later file holds as well; ticks stay."""
         self._end_tick = min(self._end_tick, tick)
 
     def owns(self, tick: int) -> bool:
-        """Whether the events and snapshots of a tick are read from this part of the run."""
+        """Whether the loop's events and the snapshots of a tick are read from this file of the run."""
         return self._end_of_repetition <= tick < self._end_tick
 
     @property
     def repeated_ticks(self) -> int:
-        """Number of leading ticks that are read from an earlier part of the run instead."""
+        """Number of leading ticks that are read from an earlier file of the run instead."""
         return max(self._end_of_repetition - self.header.get("first_tick", 0), 0)
 
     @cached_property
@@ -212,7 +212,7 @@ class Reader:
 
     @property
     def events(self) -> list[Event]:
-        """Events in the order of the file, without events of the loop that are read from another part of the run."""
+        """Events in the order of the file, without events of the loop that are read from another file of the run."""
         return [event for event in self._events if event["who"] == RECORDER or self.owns(event["tick"])]
 
     @cached_property

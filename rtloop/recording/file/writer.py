@@ -171,7 +171,7 @@ class Writer:
             self.ticks_skipped -= self._skipped_counts.pop()
 
     def _try_write_end(self, final_message: Callable[[int], Message], require_all: bool) -> bool:
-        """Write the final event, the index and the footer. Returns False on a full disk with a chunk left to drop.
+        """Write the final event, the index and the footer. Returns True, or False on a full disk with chunks to drop.
 
         Raises OutputError for any other failure, and with `require_all` for a full disk too.
         """

@@ -244,10 +244,10 @@ class Replay:
             rows = rows[count:]
 
     def _take_snapshot(self, tick: int) -> Snapshot | None:
-        """Start a rerun from the snapshot at `tick`, if none runs; else return it, to compare it with the rerun's.
+        """Take the recorded snapshot at `tick`: start a rerun from it if none runs, else return it to be compared.
 
-        The rerun then takes its snapshot at `tick` too. None if there is no snapshot to compare. Earlier snapshots are
-        skipped. Raises RecordingError for a malformed snapshot.
+        In the latter case the rerun will take a snapshot of its own state at `tick`. None if there is no snapshot at
+        `tick`, or the rerun started from it. Earlier snapshots are skipped. Raises RecordingError for a malformed one.
         """
         while self._next_snapshot is not None and self._next_snapshot.tick < tick:
             self._next_snapshot = next(self._snapshots, None)

@@ -144,7 +144,10 @@ class Rerun:
         return self._slots[start : start + int(self._assembly.loop.tick) - first]
 
     def expect_snapshot(self, recorded: bytes) -> None:
-        """Take a snapshot in the next tick, and provide the coefficients of `recorded` to a command that loads them."""
+        """Let the next tick take a snapshot, and provide coefficients to a command that loads new ones.
+
+        The coefficients are from `recorded`, the recorded snapshot of that tick, which begins with the tick's number.
+        """
         size = self.law.coefficients.nbytes
         self._block["staged"][:size] = np.frombuffer(recorded, np.uint8, size, TICK_BYTES)
         self._assembly.loop.next_snapshot = 0

@@ -130,12 +130,18 @@ def name_problem(name: str) -> str | None:
 
 
 def is_kind_name(name: str) -> bool:
-    """Whether `name` is a Kind or Note of the loop's messages, or a number of at most 9 digits."""
+    """Whether `name`, in capitals or not, is a Kind or Note of the loop's messages, or a number of at most 9 digits.
+
+    A number stands for a kind that this version does not know.
+    """
     return is_member_name(Kind, name) or is_member_name(Note, name)
 
 
 def is_member_name(kinds: Any, name: str) -> bool:
-    """Whether `name` is a member of `kinds` or a number of at most 9 digits (a member unknown to this version)."""
+    """Whether `name`, in capitals or not, is a member of the enumeration `kinds`, or a number of at most 9 digits.
+
+    A number stands for a member that this version does not know.
+    """
     return name.upper() in kinds.__members__ or (name.isascii() and name.isdigit() and len(name) < 10)
 
 
@@ -155,7 +161,7 @@ def _kind_value(name: str) -> int:
 
 
 def _member_name(kinds: Any, value: float) -> str:
-    """Member's name in lower case, or the number as text if this version has no such member."""
+    """Name of member `value` of the enumeration `kinds` in lower case, or the number as text without such a member."""
     try:
         return str(kinds(int(value)).name).lower()
     except (ValueError, OverflowError):
@@ -168,7 +174,7 @@ def _origin_value(who: str) -> int:
 
 
 def _member_value(kinds: Any, name: str) -> int:
-    """Number of the member `name`, or of a number as text."""
+    """Number of the member `name` of the enumeration `kinds`, or the number of which `name` is the text."""
     return int(kinds[name.upper()]) if name.upper() in kinds.__members__ else int(name)
 
 

@@ -65,12 +65,12 @@ def _varint(value: int) -> bytes:
 
 
 def _number(field: int, value: int) -> bytes:
-    """Encode a protobuf field that holds a number."""
+    """Encode the protobuf field with number `field`, which holds the number `value`."""
     return _varint(field << 3) + _varint(value)
 
 
 def _text(field: int, value: bytes | str) -> bytes:
-    """Encode a protobuf field that holds text or another message."""
+    """Encode the protobuf field with number `field`, which holds text or another, encoded message."""
     data = value.encode() if isinstance(value, str) else value
     return _varint(field << 3 | _WIRE_BYTES) + _varint(len(data)) + data
 
