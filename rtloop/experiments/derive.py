@@ -29,12 +29,12 @@ def derive_configuration(
     base: Configuration, axis: str, experiment: str, parameters: dict[str, Any], run: Run, run_count: int,
     specification: dict[str, Any], is_comparison: bool = False, reductions: Sequence[str] = (),
 ) -> Configuration:  # fmt: skip
-    """Return `base` with the timeline of `run` for `axis`, every other axis at rest at 0.
+    """Return a copy of `base` that executes `run`: its timeline for `axis`, and its changes of the axis's plant.
 
-    The first line of the text describes the run, as `read_metadata` returns it: with the name of the `experiment`, its
-    `parameters`, the number of its runs `run_count` and the axis's `specification`. `is_comparison` marks a run of the
-    second configuration (`--beside`), `reductions` are sentences on reduced defaults. Raises ConfigError if the text
-    is no valid configuration, for example with an unsuitable plant.
+    All other axes hold the reference 0. The first line of the text describes the run, as `read_metadata` returns it:
+    with the name of the `experiment`, its `parameters`, the number of its runs `run_count` and the axis's
+    `specification`. `is_comparison` marks a run of the second configuration (`--beside`), `reductions` are sentences on
+    reduced defaults. Raises ConfigError if the text is no valid configuration, for example with an unsuitable plant.
     """
     raw = tomllib.loads(base.text)
     first_segment, timeline = run.timeline.segments[0], run.timeline
@@ -103,7 +103,7 @@ def read_metadata(configuration: str) -> dict[str, Any] | None:
 
 
 def _change_plant(driver: dict[str, Any], axis: str, changes: Any) -> None:
-    """Merge `changes`, section by section, into the axis's plant in `driver`.
+    """Merge `changes`, values by section and key, into the axis's plant in the table [driver], in place.
 
     An axis without an entry in `plants` gets a copy of `plant` first.
     """
@@ -114,5 +114,5 @@ def _change_plant(driver: dict[str, Any], axis: str, changes: Any) -> None:
 
 
 def _file_name(label: str) -> str:
-    """Return a label with every character that does not suit a file's name replaced."""
+    """Return a label as part of a file's name: "-" for all but letters, digits, "+", "-", "."; no "-" at the end."""
     return "".join(letter if letter.isalnum() or letter in "+-." else "-" for letter in label).rstrip("-")

@@ -21,22 +21,28 @@ FEEDFORWARD_PEAK = 1.02
 
 
 def largest_command(setting: Setting) -> Bound:
-    """Return the largest slow command without feedback, µm."""
+    """Return the largest slow command without feedback, µm to both sides, with the limit that sets it."""
     return setting.reach.divided(FEEDFORWARD_PEAK, "with a dead band the command is up to")
 
 
 def largest_step_up(setting: Setting) -> Bound:
-    """Return the largest step of the reference up from 0, µm, and back."""
+    """Return the largest height of a step of the reference up from 0 and back, µm, with the limit that sets it.
+
+    With a drive of one sign, the step is about the middle.
+    """
     return _largest_step_towards(setting, 1.0)
 
 
 def largest_step_down(setting: Setting) -> Bound:
-    """Return the largest step of the reference down from 0, µm, and back."""
+    """Return the largest height ≥ 0 of a step of the reference down from 0 and back, µm, with the limit that sets it.
+
+    With a drive of one sign, the step is about the middle.
+    """
     return _largest_step_towards(setting, -1.0)
 
 
 def _largest_step_towards(setting: Setting, direction: float) -> Bound:
-    """Return the largest step of the reference from 0 towards ±1, and back, in µm.
+    """Return the largest height in µm of a step of the reference from 0 and back; up for `direction` 1, down for −1.
 
     The longer side of the drive comes first; steps towards the other side find the memory that its steps leave. With a
     drive of one sign, steps are about the middle of the reachable range, and have equal room to both sides.
@@ -73,13 +79,13 @@ def _largest_step_towards(setting: Setting, direction: float) -> Bound:
 
 
 def largest_sine(setting: Setting) -> Bound:
-    """Return the largest amplitude of a sine of the reference, µm."""
+    """Return the largest amplitude of a sine of the reference at any frequency, µm, with the limit that sets it."""
     peak = max((setting.model and setting.model.sine_peak) or UNKNOWN_PEAK, MIN_PEAK)
     return setting.reach.divided(peak, "the command of a sine is up to")
 
 
 def largest_swept_sine(setting: Setting) -> Bound:
-    """Return the largest amplitude of a sine at any frequency, µm, with and without control.
+    """Return the largest amplitude of a sine at any frequency, µm, with and without control, and what limits it.
 
     It neither trips nor is clipped at the resonance.
     """
@@ -109,7 +115,10 @@ def largest_part_of_drive(setting: Setting) -> Bound:
 
 
 def largest_true(condition: Callable[[float], bool], upper: float) -> float:
-    """Return the largest number from 0 to `upper` up to which `condition` holds, to a part in 10⁹, by bisection."""
+    """Return the largest number from 0 to `upper` up to which `condition` holds, to a part in 10⁹ of `upper`.
+
+    By bisection: `condition` must be true up to one number, and false above it. 0 if it is true nowhere.
+    """
     if condition(upper):
         return upper
     low, high = 0.0, upper

@@ -68,7 +68,7 @@ class LinearModel:
 
     @property
     def static_gain(self) -> float:
-        """Static gain D(0) of the plant."""
+        """Static gain D(0) of the plant, µm of position per µm of command."""
         return self.dynamics.dc_gain
 
     @cached_property
@@ -89,7 +89,7 @@ class LinearModel:
         return self._plant.response(np.exp(2j * np.pi * np.atleast_1d(hz) / self.rate_hz))
 
     def tracking(self, hz: npt.ArrayLike) -> Complex | None:
-        """Return the complex response (k,) from reference to position, at frequencies (k,) in Hz.
+        """Return the complex response (k,) from reference to position, pre-filter included, at frequencies (k,) in Hz.
 
         None without a loop.
         """
@@ -107,7 +107,10 @@ class LinearModel:
         return simulate(*self._plant, command)[0]
 
     def closed_response(self, reference: Real) -> tuple[Real, Real] | None:
-        """Return position and command, (n,) each, for a reference (n,), from rest; None without a loop."""
+        """Return position and command, (n,) each, for a reference (n,) before the pre-filter, from rest.
+
+        None without a loop.
+        """
         if self.loop is None:
             return None
         a, b, c, d = self.loop.matrices
@@ -157,7 +160,7 @@ class LinearModel:
 
     @cached_property
     def open_peak(self) -> float:
-        """Largest |P|/|D(0)| at any frequency up to half the rate."""
+        """Largest magnitude of the plant's response over its static gain, from 0.1 Hz to half the rate."""
         resonances_hz = [self.resonance_hz] if self.resonance_hz else []
         hz = np.concatenate([*(GRID_HZ * 10.0**decade for decade in range(5)), resonances_hz])
         return float(np.abs(self.plant(hz[hz < self.rate_hz / 2])).max() / abs(self.static_gain))
@@ -187,9 +190,10 @@ class LinearModel:
 
     @cached_property
     def tolerated_shifts(self) -> PercentRange | None:
-        """Shifts of the resonance in % within which the loop is stable.
+        """Shifts of the resonance in %, down and up, within which the loop is stable; (0, 0) for an unstable loop.
 
-        None without a resonance, or without a linear controller of this axis alone.
+        An end is None if the loop is stable for all shifts that the search tries. None without a resonance, or without
+        a linear controller of this axis alone.
         """
         if self._controller is None or not self.resonance_hz:
             return None

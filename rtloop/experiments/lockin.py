@@ -63,7 +63,9 @@ def tone(signal: Real, hz: float, rate_hz: float) -> Tone:
 
 
 def response(u: Real, x: Real, hz: float, rate_hz: float) -> Response:
-    """Return gain and coherence from input `u` to output `x`, each (samples,), at `hz`; the gain is NaN for no input.
+    """Return gain and coherence from input `u` to output `x`, each (samples,), at `hz`.
+
+    The gain is NaN where `u` has no part at `hz`, such as for a constant 0.
 
     Raises ValueError as `tone`.
     """

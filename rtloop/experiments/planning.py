@@ -130,7 +130,8 @@ def _plan_experiment(
 
     `reductions` are sentences on reduced defaults, for the report.
 
-    Raises UnsuitableLoop if the loop does not allow it; ConfigError for an invalid derived configuration; OutputError.
+    Raises UnsuitableLoop if the loop does not allow it, ConfigError for an invalid configuration of a run, OutputError
+    if a table cannot be written.
     """
     base, setting = stage.base, stage.setting
     runs = experiment.runs(options, setting)

@@ -78,14 +78,18 @@ class Experiment:
         return self._fit(options, setting, compared)[0]
 
     def reductions(self, options: Options, setting: Setting, compared: Setting | None = None) -> list[str]:
-        """Return a sentence for each default that `fit_options` scales down: its key, old and new value, and the limit.
+        """Return a text for each default that `fit_options` scales down: its key, new and old value, and the limit.
 
-        Raises ConfigError as `fit_options`.
+        Raises ConfigError and UnsuitableLoop as `fit_options`.
         """
         return self._fit(options, setting, compared)[1]
 
     def _fit(self, options: Options, setting: Setting, compared: Setting | None) -> tuple[Options, list[str]]:
-        """Return the fitted options, and a sentence for each default that was scaled down. Raises ConfigError."""
+        """Return a copy of the options as `fit_options`, and the texts of `reductions`.
+
+        Raises ConfigError for values that a user set beyond the limits, UnsuitableLoop for a default of which less than
+        LEAST_SHARE would remain.
+        """
         changes = {key: default(setting) for key, default in self.defaults.items() if getattr(options, key) is None}
         faults, reductions = [], []
         for key in self.limits:
@@ -115,9 +119,10 @@ class Experiment:
         return options.model_copy(update=changes), reductions
 
     def _bound(self, key: str, sign: float, setting: Setting, compared: Setting | None) -> tuple[float, str]:
-        """Return the largest magnitude of the numbers of an option with a sign, and the key of the axis that limits it.
+        """Return the largest allowed magnitude of an option's positive or negative numbers, and the key that limits it.
 
-        The smaller one of both settings counts.
+        `sign` is 1 or −1; `key` is the option's. The smaller limit of both settings counts, of one if `compared` is
+        None.
         """
         bound_of_setting = self.limits[key] if sign > 0 else self.lower_limits.get(key, self.limits[key])
         limit, reason = bound_of_setting(setting)
@@ -128,9 +133,10 @@ class Experiment:
 
 
 def _scale_down(value: Any, limits: Sequence[float]) -> Any:
-    """Return a number, or numbers, scaled down to `limits`: magnitudes of positive and of negative numbers.
+    """Return a number, or a tuple of numbers, scaled down to `limits`, the largest positive and negative magnitudes.
 
-    Equal limits scale all numbers by one factor, unequal ones each sign by its own; with two digits at the limit.
+    The limits are first rounded down to two significant digits. Equal limits scale all numbers by one factor, unequal
+    ones each sign by its own. Numbers within the limits stay.
     """
     numbers = np.atleast_1d(np.asarray(value, dtype=float))
     rounded = [_round_down(limit) for limit in limits]
@@ -143,7 +149,7 @@ def _scale_down(value: Any, limits: Sequence[float]) -> Any:
 
 
 def _round_down(limit: float) -> float:
-    """Return a number rounded down to two digits; 0 for one that is not above 0."""
+    """Return a number rounded down to two significant digits; 0 for one that is not above 0."""
     if limit <= 0.0:
         return 0.0
     step = 10.0 ** (math.floor(math.log10(limit)) - 1)
@@ -151,5 +157,5 @@ def _round_down(limit: float) -> float:
 
 
 def _value_text(value: Any) -> str:
-    """Return a number, or numbers with commas, with four digits each."""
+    """Return as text a number, or a tuple of numbers separated by commas, with four significant digits each."""
     return ", ".join(f"{number:.4g}" for number in (value if isinstance(value, tuple) else (value,)))

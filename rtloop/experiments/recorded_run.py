@@ -67,12 +67,12 @@ class RecordedRun:
 
     @cached_property
     def configuration(self) -> dict[str, Any]:
-        """Tables of the configuration as plain values."""
+        """The recorded configuration as nested dictionaries of its TOML tables; defaults are not filled in."""
         return tomllib.loads(self.recording.configuration)
 
     @cached_property
     def axis_options(self) -> AxisOptions:
-        """Options of the axis as configured."""
+        """Options of the run's axis, from the recorded configuration, with defaults."""
         return AxisOptions.model_validate(
             next(axis for axis in self.configuration["axis"] if axis["name"] == self.axis)
         )
@@ -112,7 +112,7 @@ class RecordedRun:
 
     @property
     def first_trip(self) -> dict[str, Any] | None:
-        """Return {tick, causes} of the first trip; None without a trip."""
+        """Return {tick, causes} of the first trip, `causes` being a list of texts; None without a trip."""
         for event in self.recording.events:
             if event["kind"] == "tripped":
                 return {"tick": event["tick"], "causes": event["what"]["causes"]}
@@ -146,8 +146,9 @@ class RecordedRun:
             )
 
     def _flags(self) -> Real:
-        """Return the recorded flags (ticks,), 0 before the run is at its middle: at 0 V noise alone clips a drive of
-        one sign.
+        """Return a copy of the recorded flags (ticks,), with 0 until the approach to the middle has ended.
+
+        Before, at 0 V, noise alone clips a drive of one sign.
         """
         flags = self.recording["flags"].copy()
         if approaches := self.segments_labelled(APPROACH):
@@ -155,7 +156,10 @@ class RecordedRun:
         return flags
 
     def signal(self, name: str) -> Real:
-        """Return a signal (ticks,) of the axis, as `read`; `name` is without the axis."""
+        """Return a signal (ticks,) of the axis; `name` is without the axis.
+
+        Reference, position and command are relative to the middle of the run's motion.
+        """
         return self.read(name)[0]
 
     def read(self, *names: str) -> list[Real]:
@@ -176,12 +180,15 @@ class RecordedRun:
         return [segment for segment in self.segments if segment.label in labels]
 
     def shortest_duration_s(self, label: str) -> float:
-        """Duration in s of the shortest segment with a label."""
+        """Return the duration in s of the shortest segment with a label. Raises ValueError if there is none."""
         return min(segment.ticks for segment in self.segments_labelled(label)) / self.rate_hz
 
     @property
     def simulated_hysteresis(self) -> str | None:
-        """Value `truth` of the simulated actuator's hysteresis; None for other drivers than the rig."""
+        """Model that simulated the actuator's hysteresis, the option `truth` of the plant: "residual" by default.
+
+        None for drivers other than "sim" and "shm".
+        """
         driver = self.configuration["driver"]
         if driver["kind"] not in ("sim", "shm"):
             return None

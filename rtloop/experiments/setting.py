@@ -84,7 +84,10 @@ class Setting:
         return self.trip.magnitude
 
     def trip_towards(self, direction: float) -> Bound:
-        """Return the largest displacement before the dynamics, µm, towards ±1, that trips no interlock."""
+        """Return the largest displacement before the dynamics, µm, up (`direction` 1) or down (−1), without a trip.
+
+        The interlocks of position and sensor count.
+        """
         return self._trip_bound(self.sensor_ends_um[1] if direction > 0 else -self.sensor_ends_um[0], "on this side")
 
     def _trip_bound(self, sensor_end_um: float, place: str) -> Bound:
@@ -129,7 +132,10 @@ class Setting:
 
     @cached_property
     def _one_sided_range(self) -> PositionRange:
-        """Slow commands in µm in any order with a drive of one sign, within limits, interlocks and sensor."""
+        """Lowest and highest slow command in µm that can follow in any order with a drive of one sign.
+
+        They are within the limits, the interlocks and the sensor's range.
+        """
         actuator, gain = self.axis.feedforward.actuator(), abs(self.model.static_gain) if self.model else 1.0
         low_um, high_um = reachable_range(actuator, *self.drive_range_v, self.axis.limits.command_um)
         low_end_um, high_end_um = (end_um / gain for end_um in self.sensor_ends_um)
@@ -175,6 +181,6 @@ class Setting:
 
     @property
     def um_per_v(self) -> float:
-        """Static gain in µm/V of the axis's hysteresis model over its whole range."""
+        """Static gain in µm/V of the axis's hysteresis model, from 0 V to the largest drive."""
         largest_v = self.axis.limits.drive_v
         return float(loading_curve(self.axis.feedforward.actuator(), largest_v) / largest_v)

@@ -45,9 +45,9 @@ class Middle(NamedTuple):
     v: float = 0.0
 
     def shifted(self, reference: Reference, mode: ModeName) -> Reference:
-        """Return a reference of kind hold, sine or steps, given about 0, about the middle.
+        """Return a reference about 0, of kind hold, sine or steps, moved to the middle: by `v` in mode raw, else `um`.
 
-        Samples of a table are in a file: they stay as they are.
+        A table is returned unchanged: its samples are in a file.
         """
         offset = self.v if mode == "raw" else self.um
         if not offset or reference["kind"] == "table":
@@ -79,7 +79,11 @@ class Timeline:
         return self.segments[-1].start_tick + self.segments[-1].ticks if self.segments else 0
 
     def add(self, label: str, mode: ModeName, reference: Reference, duration_s: float, **values: Any) -> None:
-        """Append a segment of `duration_s`, at least one tick; `values` are facts for the analysis."""
+        """Append a segment of `duration_s`, at least one tick; `reference` is about 0, and moved to the middle.
+
+        Before the first of them, segments APPROACH are appended that lead to a middle other than 0. `values` are facts
+        for the analysis.
+        """
         if any(self.middle) and not any(segment.label == APPROACH for segment in self.segments):
             half = (self.middle.v if mode == "raw" else self.middle.um) / 2
             self._append(APPROACH, mode, sine(half, 0.5 / APPROACH_S, half, -90.0), APPROACH_S)
@@ -87,7 +91,7 @@ class Timeline:
         self._append(label, mode, self.middle.shifted(reference, mode), duration_s, **values)
 
     def _append(self, label: str, mode: ModeName, reference: Reference, duration_s: float, **values: Any) -> None:
-        """Append a segment whose reference is about 0."""
+        """Append a segment of at least one tick, with `reference` as it is."""
         ticks = max(1, round(duration_s * self._rate_hz))
         self.segments.append(Segment(label, mode, self.ticks, ticks, values))
         self.references.append(reference)

@@ -28,7 +28,7 @@ class CharacteriseOptions(Options):
     """Options of the slow sines, which take half and all of the drive from its lowest to its highest value."""
 
     frequency_hz: float = Field(default=0.1, gt=0)
-    """Slow enough for no lag, fast enough for no creep."""
+    """Frequency of the sines: slow enough for no lag, fast enough for no creep."""
     cycles: float = Field(default=2.0, ge=1.5)
     """Number of cycles of each loop."""
 
@@ -136,7 +136,10 @@ def _table(shapes: Mapping[str, tuple[LoopShape, LoopShape]]) -> Table:
 
 
 def draw(figure: Any, curves: Mapping[str, Any], ink: Palette) -> None:
-    """Draw the loops, the model over the major loop, and their difference over time."""
+    """Draw the loops, the model with the major loop, and their difference over time.
+
+    `curves` are those of `analyse`.
+    """
     grid = figure.add_gridspec(2, 2, height_ratios=(3, 1))
     loops, comparison, error = (figure.add_subplot(cell) for cell in (grid[0, 0], grid[0, 1], grid[1, :]))
     for label, color in (("major", ink.measured), ("half", ink.drive), ("minor", ink.comparison)):

@@ -37,7 +37,7 @@ class CompensationOptions(Options):
 
 
 def runs(options: CompensationOptions, setting: Setting) -> list[Run]:
-    """Plan a slow sine of the command, from rest."""
+    """Plan one run with feedforward alone: rest, then a slow sine of the command."""
     timeline = setting.timeline("feedforward")
     timeline.add(
         "sine",
@@ -95,7 +95,7 @@ def _modelled_output(run: RecordedRun, drive: Real, rest: Segment, segment: Segm
 
 
 def draw(figure: Any, curves: Mapping[str, Any], ink: Palette) -> None:
-    """Draw y over v, and the error."""
+    """Draw y over v, and the error v − y over v; `curves` are those of `analyse`."""
     loop, error_panel = figure.subplots(1, 2)
     v, y, error = curves["v_y_error"]
     ends = np.array([v.min(), v.max()])

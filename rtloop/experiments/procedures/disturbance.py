@@ -67,7 +67,7 @@ def _plan_run(
 
 
 def disturbance_um(setting: Setting) -> float:
-    """Return the largest Ω of the axis's specification in µm, else PART_OF_REACH of the largest command."""
+    """Return the largest Ω of the axis's specification in µm; without one, PART_OF_REACH of the largest command."""
     limits = setting.specification.disturbance
     return limits.largest_um if limits else PART_OF_REACH * setting.reach_um
 
@@ -135,9 +135,10 @@ def _row(
 
 
 def _step_rows(run: RecordedRun, error: Real, model: Real | None, amplitude_um: float) -> list[Row]:
-    """Return rows of largest error, static error and, with a limit, settling time after a step.
+    """Return rows of largest error, static error and, with a limit, settling time after a step, in nm and ms.
 
-    A step contains every frequency: a limit up to some frequency applies to its end alone.
+    `error` (n,) and the `model`'s, None without one, are in µm, from the step on. A step contains every frequency: a
+    limit up to some frequency applies to its end alone.
     """
     static_limit_um, peak_limit_um = (
         error_limit_um(run, 0.0, amplitude_um),
@@ -197,7 +198,7 @@ def _frequency_curves(run: RecordedRun, amplitude_um: float) -> dict[str, Any]:
 
 
 def draw(figure: Any, curves: Mapping[str, Any], ink: Palette) -> None:
-    """Draw the step's decay, and the error over frequency."""
+    """Draw the step's decay, and the error over frequency; `curves` are those of `analyse`."""
     step_panel, frequency_panel = figure.subplots(1, 2, width_ratios=(3, 2))
     limit_nm = curves["asked_nm"]
     if limit_nm is not None:

@@ -52,7 +52,10 @@ MAX_RATE_RATIO = 0.4
 
 
 def default_frequencies(setting: Setting) -> tuple[float, ...]:
-    """Return frequencies from 0.01 Hz to beyond the resonance of the axis's model, dense about it."""
+    """Return frequencies in Hz, rising, from 0.01 Hz to beyond the resonance of the axis's model, dense about it.
+
+    Without a resonance they are those for REFERENCE_HZ; those above MAX_RATE_RATIO of the rate are left out.
+    """
     resonance_hz = setting.model and setting.model.resonance_hz
     scale = (resonance_hz or REFERENCE_HZ) / REFERENCE_HZ
     fast_hz = FAST_HZ if abs(scale - 1) < 0.001 else [float(f"{scale * hz:.4g}") for hz in FAST_HZ]
@@ -60,7 +63,9 @@ def default_frequencies(setting: Setting) -> tuple[float, ...]:
 
 
 class HarmonicOptions(Options):
-    """Options of the excitation; the drive alone gets the drive that moves so far at the model's mean gain."""
+    """Options of the excitation. The drive alone has the amplitude in V that moves the stage by `amplitude_um` at the
+    mean gain of the hysteresis model.
+    """
 
     amplitude_um: float = Field(default=AMPLITUDE_UM, gt=0)
     """Amplitude of reference and command, reduced by default to fit limits and interlocks."""
@@ -71,7 +76,7 @@ class HarmonicOptions(Options):
 
 
 def runs(options: HarmonicOptions, setting: Setting) -> list[Run]:
-    """Plan all three modes in one recording, each from high to low frequencies."""
+    """Plan one run: all three MODES in turn, each with sines from high to low frequencies."""
     timeline = setting.timeline()
     for mode in MODES:
         timeline.add("rest", mode, hold(0.0), REST_S)
@@ -87,7 +92,10 @@ def runs(options: HarmonicOptions, setting: Setting) -> list[Run]:
 
 
 def analyse(recordings: Sequence[RecordedRun], options: HarmonicOptions) -> Analysis:
-    """Evaluate magnitude, phase and coherence of each mode over frequency."""
+    """Evaluate magnitude, phase and coherence of each mode over frequency, beside the model's.
+
+    Rows: peak without control, gain at low frequencies, and bandwidth and largest response of the closed loop.
+    """
     (run,) = recordings
     sweeps = {mode: _sweep(run, mode) for mode in MODES}
     raw, feedforward, closed = (sweeps[mode] for mode in MODES)
@@ -189,7 +197,7 @@ def _raw_gain(run: RecordedRun) -> float:
 
 
 def _low_frequency_db(sweep: Real) -> float:
-    """Median magnitude in dB up to LOW_HZ, or at the lowest frequency if it is above."""
+    """Median magnitude in dB of a sweep (frequencies, 4) up to LOW_HZ, or at its lowest frequency if it is above."""
     is_low = sweep[:, 0] <= max(LOW_HZ, sweep[0, 0])
     return float(np.median(sweep[is_low, 1]))
 
@@ -217,7 +225,10 @@ def bandwidth_hz(sweep: Real) -> float:
 
 
 def draw(figure: Any, curves: Mapping[str, Any], ink: Palette) -> None:
-    """Draw magnitude, phase and coherence over frequency, and again near the resonance."""
+    """Draw magnitude, phase and coherence over frequency, and again near the resonance.
+
+    `curves` are those of `analyse`.
+    """
     panels = figure.subplots(3, 2, sharex="col", sharey="row", height_ratios=(4, 2, 1.2), width_ratios=(3, 1.3))
     for column in panels.T:
         _draw_column(column, curves, ink)
@@ -234,7 +245,10 @@ def draw(figure: Any, curves: Mapping[str, Any], ink: Palette) -> None:
 
 
 def _draw_column(panels: Any, curves: Mapping[str, Any], ink: Palette) -> None:
-    """Draw magnitude, phase and coherence of all modes in one column of panels."""
+    """Draw magnitude, phase and coherence of all modes in the three `panels` of a column, in this order.
+
+    Points of less coherence than MIN_COHERENCE are left out of the first two. `curves` are those of `analyse`.
+    """
     magnitude, phase, coherence = panels
     for mode, color in zip(MODES, (ink.error, ink.drive, ink.measured), strict=True):
         hz, decibels, degrees, coherences = curves["found"][mode].T

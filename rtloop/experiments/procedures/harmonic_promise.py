@@ -39,27 +39,36 @@ class HarmonicPromise:
 
     @property
     def peak_hz(self) -> float | None:
-        """Frequency in Hz of the plant's largest response; None without a resonance."""
+        """Frequency in Hz of the plant's largest response; None without a model, and for one without resonance."""
         if self._open_db is None or self._model is None or not self._model.resonance_hz:
             return None
         return float(self._hz[self._open_db.argmax()])
 
     @property
     def peak_db(self) -> float | None:
-        """Largest |P|/D(0) at the measured frequencies, in dB; None without a resonance."""
+        """Largest response of the plant at the measured frequencies, in dB relative to its static gain.
+
+        None without a model, and for one without resonance.
+        """
         if self._model is None or not self._model.resonance_hz:
             return None
         return float(20 * np.log10(np.abs(self._model.plant(self._measured_hz) / self._model.static_gain).max()))
 
     @property
     def closed_low_db(self) -> float | None:
-        """Response of the closed loop at the lowest measured frequency, in dB."""
+        """Response of the model's closed loop at the lowest measured frequency, in dB.
+
+        None without a model, and for an unstable loop.
+        """
         tracking = self._model.tracking(self._measured_hz[0]) if self._model else None
         return None if tracking is None else float(20 * np.log10(abs(tracking[0])))
 
     @property
     def bandwidth_hz(self) -> float | None:
-        """Frequency in Hz at which the closed loop is first 3 dB below its lowest frequency; None if never."""
+        """Frequency in Hz at which the model's closed loop is first 3 dB below its response at the lowest frequency.
+
+        None if it never is, without a model, and for an unstable loop.
+        """
         if self._closed_db is None:
             return None
         attenuated = np.flatnonzero(self._closed_db < self._closed_db[0] - HALF_POWER_DB)

@@ -68,7 +68,10 @@ def runs(options: ResponseOptions, setting: Setting) -> list[Run]:
 
 
 def _reference_period(options: ResponseOptions, setting: Setting) -> Real:
-    """Return one period of the reference in µm, (samples,), beginning where it is nearest to 0."""
+    """Return one period of the reference in µm, (samples,), beginning where it is nearest to 0.
+
+    Raises ConfigError for a band or period that `make_grid` refuses.
+    """
     lines = _line_grid(options, setting)
     model = setting.model
     tracking = None if model is None else model.tracking(lines.hz)
@@ -93,7 +96,7 @@ def _line_grid(options: ResponseOptions, setting: Setting) -> LineGrid:
 
 
 def analyse(recordings: Sequence[RecordedRun], options: ResponseOptions) -> Analysis:
-    """Evaluate margins, the resonance, and every line.
+    """Evaluate measured margins and resonance beside the model's; the curves are the loop L at every line.
 
     Raises UnsuitableData if the position moved further than planned, ValueError if the signals allow no measurement.
     """
@@ -143,9 +146,9 @@ def analyse(recordings: Sequence[RecordedRun], options: ResponseOptions) -> Anal
 
 
 def _motion_at_rest_um(run: RecordedRun, position_um: Real) -> float:
-    """Return how far the position at rest moves from its mean at most, in µm, after the multisine has ended.
+    """Return how far the position at rest moves from its mean at most, in µm, in the last half of the last rest.
 
-    `position_um` (ticks,) has the whole run.
+    This rest follows the multisine. `position_um` (ticks,) has the whole run.
     """
     *_, segment = run.segments_labelled("rest")
     rest_um = position_um[segment.tail_slice(segment.ticks // 2)]
@@ -173,7 +176,7 @@ def _row(
 
 
 def draw(figure: Any, curves: Mapping[str, Any], ink: Palette) -> None:
-    """Draw L in magnitude and phase, and |S|, over the model's."""
+    """Draw L in magnitude and phase, and |S|, each with the model's; `curves` are those of `analyse`."""
     hz, loop, model = curves["hz"], curves["loop"], curves["model"]
     magnitude, phase, sensitivity = figure.subplots(3, 1, sharex=True)
     std = np.abs(loop) * curves["spread"]

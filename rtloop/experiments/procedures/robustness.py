@@ -49,14 +49,14 @@ class Outcome(NamedTuple):
 
     @property
     def text(self) -> str:
-        """The outcome as text for the table."""
+        """The outcome as text: "settles", "keeps ringing", or "trips" with the causes in brackets."""
         if self.trip:
             return f"trips ({', '.join(self.trip['causes'])})"
         return "settles" if self.is_settled else "keeps ringing"
 
 
 def runs(options: RobustnessOptions, setting: Setting) -> list[Run]:
-    """Plan one run for each shift."""
+    """Plan a run for each shift: rest, then a step in closed loop on the rig with shifted resonance; it may trip."""
     planned_runs = []
     for shift in options.shifts_percent:
         timeline = setting.timeline("closed_loop")
@@ -123,7 +123,7 @@ def range_about_zero(is_good: Mapping[float, bool]) -> tuple[float, float]:
 
 
 def next_shift_distance(shift: float, shifts: Sequence[float], is_downward: bool) -> float:
-    """Distance from `shift` to the next of `shifts` beyond it, below if `is_downward`; 0 without one."""
+    """Distance from `shift` to the next of `shifts` above it, or below it if `is_downward`; 0 without one."""
     distances = [
         abs(other_shift - shift)
         for other_shift in shifts
@@ -133,12 +133,12 @@ def next_shift_distance(shift: float, shifts: Sequence[float], is_downward: bool
 
 
 def _stability_text(predicted: Mapping[float, bool] | None, shift_percent: float) -> str:
-    """Return the model's prediction for a shift; a dash without a prediction."""
+    """Return the model's prediction for a shift as text, "stable" or "unstable"; a dash if `predicted` is None."""
     return "–" if predicted is None else "stable" if predicted[shift_percent] else "unstable"
 
 
 def draw(figure: Any, curves: Mapping[str, Any], ink: Palette) -> None:
-    """Draw the step at each shift."""
+    """Draw the step at each shift, coloured by its outcome; `curves` are those of `analyse`."""
     traces = curves["traces"]
     columns = min(5, len(traces))
     rows = -(-len(traces) // columns)

@@ -64,7 +64,7 @@ def plan_next_run(run_records: Sequence[RecordedRun], options: ScanOptions, sett
     """Plan the next run, with the tables learned from the recordings so far; None after the last.
 
     `run_records` are in order, cycle 0 first. At a frequency where the error grew beyond MAX_ERROR_GROWTH of the least
-    one, the table of the least error is played again.
+    one, the table of the least error is played again. Raises UnsuitableLoop as `_learning_gains`.
     """
     if len(run_records) > options.cycles:
         return None
@@ -96,7 +96,7 @@ def _plan_run(cycle: int, options: ScanOptions, setting: Setting, tables: Sequen
 
 
 def _period_ticks(hz: float, rate_hz: float) -> int:
-    """Return a period in ticks. Raises ConfigError for a frequency whose period is no whole number of ticks."""
+    """Return a period in ticks. Raises ConfigError if it is no whole number of ticks, or less than 4."""
     ticks = round(rate_hz / hz)
     if ticks < 4 or abs(rate_hz / ticks / hz - 1) > 1e-9:
         faults = [f"scan.frequencies_hz: {hz:g} Hz; allowed: periods of 4 or more whole ticks of {1 / rate_hz:g} s"]
@@ -166,7 +166,10 @@ def analyse(recordings: Sequence[RecordedRun], options: ScanOptions) -> Analysis
 
 
 def draw(figure: Any, curves: Mapping[str, Any], ink: Palette) -> None:
-    """Draw the error over a period before and after learning, and its size over the cycles."""
+    """Draw the error over a period before and after learning, and its size over the cycles.
+
+    `curves` are those of `analyse`.
+    """
     traces = curves["traces"]
     panels = figure.subplots(1, len(traces) + 1)
     for panel, (hz, _, first_error, last_error) in zip(panels, traces, strict=False):

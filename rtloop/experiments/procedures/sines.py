@@ -36,7 +36,7 @@ class SinesOptions(Options):
 
 
 def runs(options: SinesOptions, setting: Setting) -> list[Run]:
-    """Plan whole cycles of one frequency after the other, the first cycle of each to settle."""
+    """Plan one run: a sine at each frequency in turn, in whole cycles, of which the first one is to settle."""
     timeline = setting.timeline("closed_loop")
     for hz in options.frequencies_hz:
         cycles = max(options.cycles, round(MIN_DURATION_S * hz))
@@ -79,7 +79,7 @@ def analyse(recordings: Sequence[RecordedRun], options: SinesOptions) -> Analysi
 
 
 def draw(figure: Any, curves: Mapping[str, Any], ink: Palette) -> None:
-    """Draw two cycles of each frequency with the error below."""
+    """Draw the first two cycles of each frequency with the error below; `curves` are those of `analyse`."""
     traces = curves["traces"]
     columns = min(3, len(traces))
     rows = -(-len(traces) // columns)

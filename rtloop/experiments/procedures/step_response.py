@@ -34,7 +34,7 @@ class StepResponseOptions(Options):
     """Options: height and duration of the step of the drive."""
 
     part_of_drive: float = Field(default=1.0, gt=0, le=1)
-    """Height over the drive limit."""
+    """Height of the step, as a fraction of the drive limit."""
     duration_s: float = Field(default=0.5, ge=0.2)
     """Duration of the recording after the step, in which the ringing is fitted."""
 
@@ -50,7 +50,8 @@ class Ringing(NamedTuple):
 class ModelResponse(NamedTuple):
     """Position (n,) of the model after the step, scaled to the measured final position, and its figures.
 
-    All are None without a model; the ringing's also without a resonance.
+    `difference_percent` is the largest distance to the measured position, in % of the final one. All are None without a
+    model; the ringing's also without a resonance.
     """
 
     response: Real | None
@@ -61,7 +62,7 @@ class ModelResponse(NamedTuple):
 
 
 def runs(options: StepResponseOptions, setting: Setting) -> list[Run]:
-    """Plan rest, then the step."""
+    """Plan one run: rest, then a step of the drive without control."""
     timeline = setting.timeline("raw", uses_whole_drive=True)
     timeline.add("step", "raw", hold(options.part_of_drive * setting.axis.limits.drive_v), options.duration_s)
     return [Run("", timeline)]
@@ -130,9 +131,10 @@ def ringing_window(model: LinearModel | None) -> tuple[float, float]:
 
 
 def fit_ringing(height: Real, rate_hz: float, window_s: tuple[float, float] = RINGING_S) -> Ringing:
-    """Fit c + Re(a e^{(−σ + jω)t}) to the position `height` (n,) since a step, within the window.
+    """Return the ringing of the position `height` (n,) since a step, in µm, within the window.
 
-    Raises UnsuitableData for fewer than 50 ticks in the window, or no motion faster than MIN_PERIODS in it.
+    It is the fit of c + Re(a e^{(−σ + jω)t}), c being the level. Raises UnsuitableData for fewer than 50 ticks in the
+    window, or no motion faster than MIN_PERIODS in it.
     """
     from scipy.optimize import least_squares  # a quarter of a second of import, for one experiment of many
 
@@ -167,7 +169,7 @@ def _columns(unknowns: Real, time_s: Real) -> Real:
 
 
 def draw(figure: Any, curves: Mapping[str, Any], ink: Palette) -> None:
-    """Draw the whole response, and its first milliseconds."""
+    """Draw the response, and enlarged its first milliseconds; `curves` are those of `analyse`."""
     overview, zoom = figure.subplots(1, 2, sharey=True, width_ratios=(3, 2))
     for panel in (overview, zoom):
         panel.axhline(curves["final"], color=ink.faint, linewidth=0.8)

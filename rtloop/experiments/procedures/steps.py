@@ -37,7 +37,7 @@ class StepsOptions(Options):
 
 
 def runs(options: StepsOptions, setting: Setting) -> list[Run]:
-    """Plan one level after the other."""
+    """Plan one run in closed loop: rest, then one level of the reference after the other."""
     timeline = setting.timeline("closed_loop")
     for level in options.levels_um:
         timeline.add("level", "closed_loop", hold(level), options.dwell_s, level_um=level)
@@ -128,7 +128,7 @@ def _evaluate_steps(run: RecordedRun, reference: Real, position: Real, command: 
 
 
 def _scaled_steps(run: RecordedRun, position: Real, ticks: int) -> list[Real]:
-    """Return position − level before over the step's height in the first `ticks` of every step, (ticks,) each."""
+    """Return (position − level before)/height, without unit, in the first `ticks` of every step, (ticks,) each."""
     return [
         (position[segment.start_tick : segment.start_tick + ticks] - previous_um) / (level - previous_um)
         for segment, previous_um, level in _level_changes(run)
@@ -146,8 +146,10 @@ def _level_changes(run: RecordedRun) -> Iterator[tuple[Segment, float, float]]:
 
 
 def _steps_table(steps: Sequence[Step]) -> Table:
-    """Return a row for each step: levels in µm, overshoot and static error in %, settling time in ms, and the peak of
-    the command per height of the step.
+    """Return a table with a row for each step.
+
+    Its columns are levels in µm, overshoot in %, settling time in ms, static error in %, and the peak of the command
+    per height of the step.
     """
     rows = [[f"{step.before_um:g} → {step.level_um:g} µm", *(f"{value:.{digits}f}" for value, digits in
              zip(step.figures, (2, 1, 3, 2), strict=True))] for step in steps]  # fmt: skip
@@ -156,7 +158,7 @@ def _steps_table(steps: Sequence[Step]) -> Table:
 
 
 def draw(figure: Any, curves: Mapping[str, Any], ink: Palette) -> None:
-    """Draw the series with its drive, and all steps over each other."""
+    """Draw the series with its drive, and all steps over each other; `curves` are those of `analyse`."""
     grid = figure.add_gridspec(2, 2, height_ratios=(2, 1), width_ratios=(3, 2))
     series, drive, zoom = (figure.add_subplot(cell) for cell in (grid[0, 0], grid[1, 0], grid[:, 1]))
     series.plot(*curves["position"], color=ink.measured, label="position x")
