@@ -212,7 +212,8 @@ def discrete_loop(
 def sampled_plant(plant: Transfer, period_s: float, delay_ticks: int = 0) -> System:
     """Return D(s) behind a zero-order hold and `delay_ticks` samples of delay, sample to sample.
 
-    Raises ValueError for a negative delay and for a period that is not a positive number.
+    D(s) must have fewer zeros than poles, which is not checked. Raises ValueError for a negative delay and for a period
+    that is not a positive number.
     """
     return hold_plant(plant, period_s, delay_ticks).system
 

@@ -47,10 +47,10 @@ class StepMetrics(NamedTuple):
 
 
 def step_response(loop: Loop, duration_s: float | None = None) -> StepResponse:
-    """Return the response to a unit step for `duration_s`, by default ten times 1/|Re s| of the slowest closed-loop
-    pole.
+    """Return the response to a unit step of the reference, from rest, for `duration_s`.
 
-    A discrete response ends after SAMPLE_COUNT ticks at the latest.
+    By default these are ten times 1/|Re s| of the slowest closed-loop pole, in discrete time plus the pre-filter's
+    settling. A discrete response ends after SAMPLE_COUNT ticks at the latest.
     """
     if loop.period_s is not None:
         return _discrete_response(loop, loop.period_s, duration_s)

@@ -126,18 +126,18 @@ class RecordedRun:
         if self.first_trip and not self._may_trip:
             causes = ", ".join(self.first_trip["causes"])
             raise UnsuitableData(
-                f"{self._label_prefix}tripped at tick {self.first_trip['tick']} ({causes}); not analysed"
+                f"{self._label_prefix}the loop tripped at tick {self.first_trip['tick']} ({causes}); not analysed"
             )
         end_tick = self._ticks[-1] + 1 if self._ticks.size else 0
         if end_tick < self.planned_ticks:
             raise UnsuitableData(
-                f"{self._label_prefix}ended after {end_tick / self.rate_hz:.1f} of "
+                f"{self._label_prefix}the run ended after {end_tick / self.rate_hz:.1f} of "
                 f"{self.planned_ticks / self.rate_hz:g} s; "
                 "not analysed"
             )
         if not self._may_trip and (clipping := clipping_text(self._flags())):
             raise UnsuitableData(
-                f"{self._label_prefix}{clipping}; the recording shows the limit and not the loop; not analysed. "
+                f"{self._label_prefix}{clipping}; the recording shows the limit, not the loop; not analysed. "
                 "Use a smaller amplitude"
             )
         if missing_ticks := int(end_tick) - self._ticks.size:

@@ -22,14 +22,17 @@ FileName = str | Path
 
 
 def as_path(value: Any, argument: str) -> Path:
-    """Return a file's name as a path. Raises RtloopError for another value."""
+    """Return a file's name as a path. Raises RtloopError, which begins with `argument`, for another or empty value."""
     if not isinstance(value, str | Path) or "\0" in str(value) or not str(value):
         raise RtloopError(f"{argument}: value is {value!r}; allowed: the name of a file")
     return Path(value)
 
 
 def as_paths(value: Any, argument: str) -> list[Path]:
-    """Return one file's name, or several, as paths. Raises RtloopError for other values."""
+    """Return one file's name, or a sequence of names, as a list of paths; [] for an empty sequence.
+
+    Raises RtloopError, which begins with `argument`, for other values.
+    """
     if isinstance(value, str | Path):
         return [as_path(value, argument)]
     if not isinstance(value, Sequence) or isinstance(value, bytes):
@@ -38,7 +41,7 @@ def as_paths(value: Any, argument: str) -> list[Path]:
 
 
 def load_configuration(configuration: FileName | Configuration, argument: str) -> Configuration:
-    """Return a configuration, read from its file if `configuration` is a name; `argument` names the function.
+    """Return a configuration, read from its file if `configuration` is a name; `argument` is the function in messages.
 
     Raises InputFileError, ConfigError with all faults, RtloopError for another value.
     """
@@ -52,7 +55,8 @@ def load_configuration(configuration: FileName | Configuration, argument: str) -
 def recording_paths(value: Any, argument: str) -> list[Path]:
     """Return the files of a recording: of a loaded one, or of the name or names of its files.
 
-    Raises RtloopError for another value, for none, and for a part of a recording by time.
+    Raises RtloopError, which begins with `argument`, for another value, for an empty list, and for a part of a
+    recording by time.
     """
     if isinstance(value, Recording):
         if value.is_part:
@@ -68,7 +72,8 @@ def recording_paths(value: Any, argument: str) -> list[Path]:
 def single_files(value: Any, argument: str) -> list[Path]:
     """Return the one file of each recording in `value`: a recording, the name of its file, or a list of these.
 
-    Raises RtloopError for another value, an empty list, a part of a recording, and a recording of several files.
+    Raises RtloopError, which begins with `argument`, for another value, an empty list, a part of a recording, and a
+    recording of several files.
     """
     items = [value] if isinstance(value, str | Path | Recording) else value
     if not isinstance(items, Sequence) or isinstance(items, bytes) or not items:
@@ -85,14 +90,17 @@ def single_files(value: Any, argument: str) -> list[Path]:
 
 
 def require_seconds(value: Any, argument: str) -> float:
-    """Return a number of seconds above 0. Raises RtloopError for another value."""
+    """Return a finite number of seconds above 0 as float. Raises RtloopError, naming `argument`, for another value."""
     if not isinstance(value, Real) or isinstance(value, bool) or not 0 < float(value) < math.inf:
         raise RtloopError(f"{argument}: value is {value!r}; allowed: a number of seconds above 0")
     return float(value)
 
 
 def require_count(value: Any, argument: str, least: int, largest: int | None = None) -> None:
-    """Raise RtloopError for a value that is no whole number from `least` to `largest`; None: without a largest one."""
+    """Raise RtloopError, naming `argument`, unless `value` is a whole number from `least` to `largest`, both included.
+
+    `largest` None: there is no largest one.
+    """
     count = int(value) if isinstance(value, Integral) and not isinstance(value, bool) else None
     if count is None or count < least or (largest is not None and count > largest):
         allowed = f"from {least} on" if largest is None else f"{least} to {largest}"
@@ -100,7 +108,7 @@ def require_count(value: Any, argument: str, least: int, largest: int | None = N
 
 
 def require_numbers(value: Any, argument: str) -> list[float]:
-    """Return finite numbers as a list. Raises RtloopError for other values."""
+    """Return finite numbers as a list. Raises RtloopError, naming `argument`, for other values."""
     try:
         numbers = [float(number) for number in value]
     except (TypeError, ValueError):
@@ -111,7 +119,7 @@ def require_numbers(value: Any, argument: str) -> list[float]:
 
 
 def require_names(value: Any, argument: str) -> list[str]:
-    """Return one name, or several, as a list. Raises RtloopError for other values."""
+    """Return one name, or a list or tuple of names, as a list. Raises RtloopError, naming `argument`, for others."""
     names = [value] if isinstance(value, str) else value
     if not isinstance(names, list | tuple) or not all(isinstance(name, str) for name in names):
         raise RtloopError(f"{argument}: value is {value!r}; allowed: a name, or a list of names")
@@ -119,6 +127,6 @@ def require_names(value: Any, argument: str) -> list[str]:
 
 
 def require_choice(value: Any, argument: str, allowed: Sequence[str]) -> None:
-    """Raise RtloopError for a value that is not one of `allowed`."""
+    """Raise RtloopError, naming `argument`, for a value that is not one of `allowed`."""
     if value not in allowed:
         raise RtloopError(f"{argument}: value is {value!r}; allowed: {', '.join(map(repr, allowed))}")

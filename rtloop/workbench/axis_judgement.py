@@ -61,7 +61,7 @@ class AxisJudgement:
         return [row.label for row in (self.verification.on_rig or self.verification).missed_rows]
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the JSON object of the axis."""
+        """Return the object of the axis in `axes` of `rtloop check --json`; parts that do not exist are None."""
         check, coupled = self.check, self.check.together
         return {
             "name": check.name,

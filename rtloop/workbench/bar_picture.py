@@ -15,9 +15,10 @@ if TYPE_CHECKING:
 
 
 def draw_bars(title: str, names: Sequence[str], values: Mapping[str, Sequence[float | None]]) -> Figure:
-    """Return a picture with a row of bars for each of `names`: one bar for each of `values`; None draws no bar.
+    """Return a picture with a row of bars for each of `names`: one bar for each of `values`.
 
-    Raises MissingExtra without matplotlib.
+    `values` has, by label in the legend, a length for each name; None draws no bar. Raises MissingExtra without
+    matplotlib.
     """
     figure = create_picture(8.0, 1.5 + 0.4 * len(names))
     panel = figure.subplots()

@@ -124,7 +124,7 @@ def _loops(check: AxisCheck) -> dict[str, Loop]:
 
 
 def _verdict(judgement: AxisJudgement) -> str:
-    """Return the verdict on an axis in a few words."""
+    """Return the verdict on an axis in a few words; "UNSTABLE" on the model or on the simulated rig comes first."""
     if judgement.running is None:
         return "without a known loop"
     if not judgement.running.stable or judgement.is_stable_on_rig is False:

@@ -42,7 +42,7 @@ def print_plan(out: Console, prepared: Prepared) -> None:
 
 
 def print_axis(out: Console, judgement: AxisJudgement, sensor: Channel) -> None:
-    """Print limits, law, analyses and verdict of one axis; `sensor` is its input."""
+    """Print limits, law, analyses and verdict of one axis; `sensor` is the driver's input of its position sensor."""
     from rtloop.design.verification.text import answer
 
     axis = judgement.axis
@@ -75,7 +75,10 @@ def _command_text(axis: AxisOptions) -> str:
 
 
 def _sensor_text(interlocks: InterlockOptions, sensor: Channel) -> str:
-    """Return the sensor's limits as text, without those that the input cannot read."""
+    """Return the voltages at which the sensor interlock trips, as the end of a sentence on the position interlock.
+
+    A limit outside the input's range never trips; then the text also has this range.
+    """
     low_v, high_v = interlocks.sensor_min_v, interlocks.sensor_max_v
     has_low, has_high = low_v > sensor.minimum_v, high_v < sensor.maximum_v
     if has_low and has_high:

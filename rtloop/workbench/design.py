@@ -166,7 +166,10 @@ class DesignResult(Result):
 
     @cached_property
     def verdict(self) -> str:
-        """The sentence of `rtloop check` on the loop of the plant and the sampled controller, by the specification."""
+        """The sentence of `rtloop check` on the loop of the plant and the sampled controller, by the specification.
+
+        "not judged: " and the faults if their configuration is invalid.
+        """
         from rtloop.design.verification.axes import verify_axis  # half a second of import
         from rtloop.design.verification.text import answer
 
@@ -185,8 +188,8 @@ def design(specification: FileName, *, model: FileName | None = None, cross_chec
 
     `model` is a file with [axis.model], as `identify` writes it, in place of the specification's [plant]; its
     [axis.feedforward] goes into the configuration that `write` writes. `cross_check` computes γ_opt with SLICOT too.
-    Raises InputFileError for a file that cannot be read, ConfigError for
-    an invalid or incomplete specification, NoDesign where no controller meets it, MissingExtra without slycot.
+    Raises InputFileError for a file that cannot be read, ConfigError for an invalid or incomplete specification,
+    NoDesign where no controller meets it, MissingExtra for `cross_check` without slycot.
 
     >>> result = rtloop.design("deploy/paper-spec.toml")
     >>> result.order, result.full_order, round(result.gamma_opt, 3)

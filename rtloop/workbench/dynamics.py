@@ -173,8 +173,8 @@ def fit_dynamics(
 def _section_text(fit: DynamicsFit, run: AxisRecording, input_kind: Input, actuator: PlayModel | None) -> str:
     """Return [axis.model] as TOML; before it, where the input is not the command, [axis.feedforward].
 
-    It is `actuator` scaled by the static gain, or, for the input "drive", the static gain without hysteresis; a gain
-    that is not positive gets no section.
+    [axis.feedforward] is `actuator` scaled by the static gain, or, for the input "drive", the static gain without
+    hysteresis; for a gain that is not above 0 it is left out. Raises UnsuitableData for hysteresis without an inverse.
     """
     content = model_section(fit, dynamics_provenance(fit, run, input_kind))
     comments = [f"Hysteresis with the static gain {fit.static_gain:.6g} of the dynamics below included"]

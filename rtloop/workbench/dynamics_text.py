@@ -15,7 +15,10 @@ if TYPE_CHECKING:
 
 
 def print_dynamics(out: Console, report: dict[str, Any]) -> None:
-    """Print orders that were tried, modes with their uncertainty, tests of the residuals, and a measured response."""
+    """Print orders that were tried, modes with their uncertainty, tests of the residuals, and a measured response.
+
+    `report` is the object of `DynamicsResult.as_dict`.
+    """
     loop = report["loop"]
     ticks = ""
     if loop:  # `to_tick` is the tick after the last

@@ -65,7 +65,7 @@ class HysteresisResult(IdentifiedModel):
 
     @property
     def held_out(self) -> list[dict[str, Any]]:
-        """Held-out errors of the model, a row for each recording."""
+        """Held-out errors of the model: a row, as of `judgement_row`, for each recording, fitted ones first."""
         return [
             judgement_row(judgement, fitted=is_fitted)
             for judgements, is_fitted in zip(self.judgements, (True, False), strict=True)
@@ -133,9 +133,10 @@ def fit_hysteresis(
 ) -> HysteresisResult:
     """Identify `operators` plays from recordings.
 
-    `thresholds` (V) replace the `placement` of thresholds. `memory` at the start of each recording is none ("rest"),
-    unknown, or found from its drive. `validate` are recordings that judge the model, and are not fitted. Raises
-    RtloopError, ConfigError where no model can be fitted.
+    `thresholds` (V) replace the `placement` of thresholds. `memory` says whether the actuator has none at the start of
+    each recording ("rest"), an unknown one ("unknown"), or whether this is found from the drive ("auto"). `validate`
+    are recordings that judge the model, and are not fitted. Raises RtloopError, ConfigError where no model can be
+    fitted.
     """
     collect = WarningCollector(warn)
     runs = read_distinct_runs(paths, axis, collect)
@@ -159,9 +160,10 @@ def fit_hysteresis(
 def read_distinct_runs(
     paths: Sequence[Path], axis: str | None, warn: Warn, other_runs: Sequence[AxisRecording] = ()
 ) -> list[AxisRecording]:
-    """Read recordings and return those that are no copies of one another or of `other_runs`; `warn` receives the rest.
+    """Read recordings and return those that are no copies of one another or of `other_runs`.
 
-    Raises RtloopError for a recording that cannot be read or lacks the axis (None: the only one).
+    `warn` is called once, with a sentence for each copy that is left out. Raises RtloopError for a recording that
+    cannot be read or lacks the axis (None: the only one).
     """
     runs, warnings = distinct([read_axis_recording(path, axis) for path in paths], other_runs)
     warn(warnings)

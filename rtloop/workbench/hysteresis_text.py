@@ -12,7 +12,10 @@ if TYPE_CHECKING:
 
 
 def print_hysteresis(out: Console, report: dict[str, Any]) -> None:
-    """Print thresholds, weights, errors, and the measured and the model's relative loop height h/H."""
+    """Print thresholds, weights, errors, and the measured and the model's relative loop height h/H.
+
+    `report` is the object of `HysteresisResult.as_dict`.
+    """
     model = report["model"]
     plays = enumerate(zip(model["thresholds_v"], model["weights_um_per_v"], strict=True))
     rows = [(str(i), f"{threshold:.4f}", f"{weight:.4f}") for i, (threshold, weight) in plays]

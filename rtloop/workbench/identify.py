@@ -67,7 +67,8 @@ def identify(recordings: Any, kind: str = "hysteresis", **options: Any) -> Hyste
     `options` have the names of the options of `rtloop identify hysteresis` and `rtloop identify dynamics`, with `_` for
     `-`: operators, placement, thresholds (V), weights, memory, validate; and hysteresis, input, order, largest_order,
     delay (samples), criterion, loop, outside, compare; axis for both. Raises UnsuitableData for recordings that tell
-    too little, RecordingError for files that cannot be read, RtloopError for an option that is not allowed.
+    too little, RecordingError for files that cannot be read, ConfigError where no model can be fitted, RtloopError for
+    an option that is not allowed.
     """
     require_choice(kind, "identify: kind", ("hysteresis", "dynamics"))
     fit = fit_hysteresis if kind == "hysteresis" else fit_dynamics

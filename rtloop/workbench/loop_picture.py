@@ -20,7 +20,10 @@ LINE_COLOUR = "0.35"
 
 
 def draw_loops(loops: Mapping[str, Mapping[str, Loop]]) -> Figure:
-    """Return a picture of `loops`, by axis and then by label. Raises MissingExtra without matplotlib."""
+    """Return a picture of `loops`, by axis and then by label in the legend: a column for each axis with |L|, |S|, step.
+
+    Raises MissingExtra without matplotlib.
+    """
     figure, panels = create_figure(3, len(loops), (COLUMN_INCH * len(loops), HEIGHT_INCH), squeeze=False)
     for (axis, loops_by_label), (open_panel, sensitivity_panel, step_panel) in zip(
         loops.items(), panels.T, strict=True

@@ -128,7 +128,7 @@ class LawComparison(Result):
         return to_jsonable(self.report)
 
     def print_text(self, out: Console) -> None:
-        """Print the largest and the root mean square difference of each signal."""
+        """Print the largest and the root mean square difference of each signal, the law's trip, and problems."""
         print_differences(out, self.report)
 
     def plot(self) -> Figure:
@@ -153,7 +153,7 @@ class Resimulation(Result):
 
     @property
     def axes(self) -> dict[str, dict[str, Any]]:
-        """Tracking figures of each axis by its name, each with `recorded` and `resimulated`."""
+        """Tracking figures of each axis by its name: `recorded` and `resimulated`, a dict each, and the name."""
         return {axis["name"]: axis for axis in self.report["axes"]}
 
     @property
@@ -172,7 +172,7 @@ class Resimulation(Result):
         return to_jsonable(self.report)
 
     def print_text(self, out: Console) -> None:
-        """Print figures of the recorded and the resimulated run side by side."""
+        """Print figures of the recorded and the resimulated run side by side, their first trips, and problems."""
         print_resimulation(out, self.report)
 
     def plot(self) -> Figure:

@@ -60,7 +60,10 @@ def _range_text(entry: dict[str, Any]) -> str:
 
 
 def print_differences(out: Console, report: dict[str, Any]) -> None:
-    """Print the largest and the root mean square difference of each signal."""
+    """Print the largest and the root mean square difference of each signal, the law's trip, and problems.
+
+    `report` is the dict of `replay_with_other_law`.
+    """
     law, recording = escape(report["config"]), escape(report["recording"])
     out.print(f"the law of {law} on the inputs of {recording}: {count_text(report['ticks'], 'tick')}")
     rows = table("difference", "largest", "at tick", "rms")
@@ -72,7 +75,10 @@ def print_differences(out: Console, report: dict[str, Any]) -> None:
 
 
 def print_resimulation(out: Console, report: dict[str, Any]) -> None:
-    """Print figures of the recorded and the resimulated run side by side."""
+    """Print figures of the recorded and the resimulated run side by side, their first trips, and problems.
+
+    `report` is the dict of `replay_on_the_rig`.
+    """
     law = report["config"] or "the recorded law and rig"
     reference = f"the reference of {escape(report['recording'])}"
     out.print(f"{reference} through {escape(law)}: {count_text(report['ticks'], 'tick')}")

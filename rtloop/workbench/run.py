@@ -37,7 +37,10 @@ class RunObserver(Protocol):
         """Receive the folder of recordings, before the loop begins; it may hold unfinished files of killed runs."""
 
     def watch(self, prepared: Prepared) -> AbstractContextManager[Callable[[Supervisor], None] | None]:
-        """Return a context for the time in which the loop runs; its value is called every PROGRESS_PERIOD_S."""
+        """Return a context for the time in which the loop runs.
+
+        Its value is called with the supervisor every PROGRESS_PERIOD_S; None: nothing is called.
+        """
         ...
 
 

@@ -74,22 +74,25 @@ class RunResult(Result):
 
     @property
     def trips(self) -> list[TripSummary]:
-        """Trips of the loop, with tick, causes and reason."""
+        """Trips of the loop, with tick, causes and reason; [] without a recording."""
         return [] if self.summary is None else self.summary.trips
 
     @property
     def ticks(self) -> int:
-        """Number of recorded ticks."""
+        """Number of recorded ticks; 0 without a recording."""
         return 0 if self.summary is None else self.summary.ticks_logged
 
     @property
     def lateness_us(self) -> dict[str, float] | None:
-        """Quantiles of the ticks' lateness in µs: p50, p99, p999, max; None in virtual time."""
+        """Quantiles of the ticks' lateness in µs: p50, p99, p999, max; None in virtual time and without a recording."""
         return None if self.summary is None else self.summary.lateness_us
 
     @property
     def exec_us(self) -> dict[str, float] | None:
-        """Quantiles of the ticks' execution time in µs: p50, p99, p999, max; None in virtual time."""
+        """Quantiles of the ticks' execution time in µs: p50, p99, p999, max.
+
+        None in virtual time and without a recording.
+        """
         return None if self.summary is None else self.summary.exec_us
 
     @cached_property

@@ -88,5 +88,5 @@ def _signal_response(grid: LineGrid, signal: Real, reference: Complex) -> tuple[
 
 
 def _peak_value(grid: LineGrid, lines: Complex) -> float:
-    """Return the peak of the waveform of `lines`."""
+    """Return the largest magnitude of the waveform with the complex amplitudes `lines` (excited,)."""
     return float(np.abs(grid.waveform(lines)).max())

@@ -79,7 +79,10 @@ class MeasuredLoop:
 
 
 def measured_loop(measured_response: MeasuredResponse, rate_hz: float, mode: LightMode | None) -> MeasuredLoop:
-    """Return the loop of a measured response, smoothed; `mode` is the lightly damped mode, None without one."""
+    """Return the loop L = C·D of a measured response, its lines smoothed; `mode` is the lightly damped mode, or None.
+
+    The smoothing also reduces its `spread`.
+    """
     image = None if mode is None else mode.image(rate_hz)
     raw = measured_response.plant * measured_response.controller * _pole_distance(measured_response.hz, rate_hz, image)
     lifted, std = smooth_lines(np.log(measured_response.hz), raw, measured_response.spread * np.abs(raw))

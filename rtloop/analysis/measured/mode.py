@@ -124,7 +124,7 @@ class _ModeFit:
         return self._residuals(self._smooth)
 
     def _residuals(self, rows: Complex) -> Complex:
-        """Return residuals (k,) of the least-squares fit of `rows` (k, parameters)."""
+        """Return residuals (k,), in standard deviations, of the plant's least-squares fit by `rows` (k, parameters)."""
         solution, *_ = np.linalg.lstsq(rows, self._scaled, rcond=None)
         return self._scaled - rows @ solution
 
