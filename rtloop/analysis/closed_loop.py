@@ -198,7 +198,7 @@ def discrete_loop(
     """Return the loop of C(z) with D(s) behind a zero-order hold at the controller's period and `delay_ticks` samples
     of delay.
 
-    Raises ValueError for a plant with direct feedthrough and for a negative delay.
+    `reference` is the pre-filter. Raises ValueError for a plant with direct feedthrough and for a negative delay.
     """
     _require_strictly_proper(plant)
     period_s = controller.period_s

@@ -41,7 +41,7 @@ def cycle_periods(period_ticks: int, rate_hz: float) -> tuple[int, int]:
 
 
 def unlearned_table(wanted_um: Real) -> Real:
-    """Return the table (period, 2) before learning: the wanted reference, and 0 added to the command."""
+    """Return the table (period, 2) before learning: the wanted positions (period,), µm, and 0 added to the command."""
     return np.column_stack([wanted_um, np.zeros_like(wanted_um)])
 
 
@@ -110,7 +110,9 @@ def learning_gains(loops: Sequence[tuple[str, Loop]], period_ticks: int) -> Lear
 
 
 def _position_responses(loop: Loop, hz: Real) -> tuple[Complex, Complex]:
-    """Return the complex responses (k,) to the position, from the reference and from a signal added to the command."""
+    """Return the complex responses (k,) to the position at frequencies `hz` (k,), from the reference, which passes the
+    pre-filter, and from a signal added to the command.
+    """
     return loop.response_from_reference(hz)[0], loop.response_from_command(hz)
 
 

@@ -59,6 +59,8 @@ class Margins(NamedTuple):
 def loop_margins(loop: OpenLoop) -> Margins:
     """Return the lowest crossover, the smallest phase margin over all crossovers, the smallest gain factor > 1 that
     brings L to −1, and max |S|.
+
+    Without a crossover it is NaN and the phase margin inf; without such a factor the gain margin is inf.
     """
     hz = loop.frequencies
     response = loop.open(hz)

@@ -65,7 +65,9 @@ def step_response(loop: Loop, duration_s: float | None = None) -> StepResponse:
 
 def step_metrics(loop: Loop, times_s: Sequence[float]) -> StepMetrics:
     """Return the figures of a unit step of the reference, between ticks as well as at them, with the position at
-    `times_s`; all NaN for an unstable loop.
+    `times_s`.
+
+    All are NaN for an unstable loop, settling time and overshoot also if the final position is further than 5 % from 1.
     """
     if not loop.is_stable:
         return StepMetrics(math.nan, math.nan, math.nan, math.nan, tuple(math.nan for _ in times_s))

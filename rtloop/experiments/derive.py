@@ -66,9 +66,10 @@ def derive_configuration(
 
 
 def store_tables(run: Run, folder: Path) -> None:
-    """Write the tables of a run to a folder as npy files, and point its references, in place, to these files.
+    """Write the tables of samples that a run plays to `folder` as npy files, named as in `run.tables`.
 
-    Existing files are overwritten. Raises OutputError if a file cannot be written.
+    The run's references are changed in place: they then name these files by absolute path. A missing folder is made,
+    existing files are overwritten. Raises OutputError if a file cannot be written.
     """
     for name, samples in run.tables.items():
         with output_errors(folder / name):
@@ -85,7 +86,7 @@ def store_tables(run: Run, folder: Path) -> None:
 
 
 def read_metadata(configuration: str) -> dict[str, Any] | None:
-    """Return the description of the run in the first line of a configuration's text; None where it holds none.
+    """Return the description of the run in the first line of a configuration's text; None for any other first line.
 
     Keys, as `derive_configuration` writes them and unchecked: name (of the experiment), run (its label), runs (their
     number), axis, may_trip, ticks, middle_um (the middle of its motion; 0 if missing), parameters, asked (the axis's

@@ -42,10 +42,11 @@ def largest_step_down(setting: Setting) -> Bound:
 
 
 def _largest_step_towards(setting: Setting, direction: float) -> Bound:
-    """Return the largest height in µm of a step of the reference from 0 and back; up for `direction` 1, down for −1.
+    """Return the largest height ≥ 0, µm, of a step of the reference from 0 and back, with the limit that sets it.
 
-    The longer side of the drive comes first; steps towards the other side find the memory that its steps leave. With a
-    drive of one sign, steps are about the middle of the reachable range, and have equal room to both sides.
+    The step goes up for `direction` 1, down for −1. One towards the shorter side of the drive is taken to follow the
+    largest one to the longer side, because the hysteresis remembers that. With a drive of one sign, steps are about the
+    middle of the reachable range, and have equal room to both sides.
     """
     axis, model, drive_range_v = setting.axis, setting.model, setting.drive_range_v
     peak = max((model and model.step_peak) or UNKNOWN_PEAK, MIN_PEAK)
@@ -65,7 +66,7 @@ def _largest_step_towards(setting: Setting, direction: float) -> Bound:
     actuator = axis.feedforward.actuator()
 
     def is_held(height_um: float) -> bool:
-        """Whether the drive holds the commands of a step of a height and of the step back, after the earlier ones."""
+        """Whether the drive stays within its range in a step of this height and back, after the earlier commands."""
         commands_um = np.concatenate([earlier_commands_um, height_um * np.array([peak, -reversal])])
         return can_hold(actuator, direction * commands_um, *drive_range_v)
 
@@ -102,7 +103,10 @@ def largest_swept_sine(setting: Setting) -> Bound:
 
 
 def largest_part_of_drive(setting: Setting) -> Bound:
-    """Return the largest step of the drive without control, as a fraction 0 … 1 of the drive's limit."""
+    """Return the largest step of the drive without control, as a fraction 0 … 1 of the drive's limit.
+
+    Its overshoot trips neither the position interlock nor the sensor's. With the limit that sets it.
+    """
     drive_v = setting.axis.limits.drive_v
     overshoot_um = abs(setting.um_per_v) * drive_v * (setting.model.open_overshoot if setting.model else 2.0)
     return min(

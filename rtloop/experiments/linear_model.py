@@ -48,8 +48,9 @@ class LinearModel:
     def __init__(self, axis: AxisOptions, model: ModelOptions, rate_hz: float, rig_delay_ticks: int = 0) -> None:
         """Compute the plant of `model` at `rate_hz`, and its loop with the axis's controller and pre-filter.
 
-        `rig_delay_ticks` are the simulated rig's samples of delay, which count where the model states none. Raises
-        ValueError for a controller on a model with as many zeros as poles.
+        Without a linear controller of this axis alone, or a stable loop, `loop` is None. `rig_delay_ticks` are the
+        simulated rig's samples of delay, which count where the model states none. Raises ValueError for a controller on
+        a model with as many zeros as poles.
         """
         self.rate_hz = rate_hz
         self.dynamics = model.transfer()
@@ -147,14 +148,20 @@ class LinearModel:
 
     @cached_property
     def sine_peak(self) -> float | None:
-        """Largest command per amplitude of a sine of the reference, at any frequency; None without a loop."""
+        """Largest amplitude of the command per amplitude of a sine of the reference, over all frequencies.
+
+        None without a loop.
+        """
         if self.loop is None:
             return None
         return float(np.abs(self.loop.response_from_reference(self.loop.frequencies)[1]).max())
 
     @cached_property
     def tracking_peak(self) -> float | None:
-        """Largest position per amplitude of a sine of the reference, at any frequency; None without a loop."""
+        """Largest amplitude of the position per amplitude of a sine of the reference, over all frequencies.
+
+        None without a loop.
+        """
         tracking = None if self.loop is None else self.tracking(self.loop.frequencies)
         return None if tracking is None else float(np.abs(tracking).max())
 
@@ -211,6 +218,9 @@ def linear_model(axis: AxisOptions, rate_hz: float, rig_delay_ticks: int = 0) ->
 
 
 def simulate(a: Real, b: Real, c: Real, d: Real | float, values: Real) -> Real:
-    """Return outputs (outputs, n) of the discrete system a, b, c, d from rest for one input (n,)."""
+    """Return outputs (outputs, n) of the discrete system a, b, c, d from rest for one input `values` (n,).
+
+    `c` is (outputs, states), `d` (outputs,); (states,) and a number for one output.
+    """
     states = System(a, b, b, 0.0).simulate_states(values)
     return np.atleast_2d(c) @ states.T + np.outer(d, values)

@@ -75,7 +75,10 @@ def response(u: Real, x: Real, hz: float, rate_hz: float) -> Response:
 
 
 def _blocks(signal: Real, turns_per_sample: float) -> Iterator[tuple[Real, Real]]:
-    """Yield each block (count,) of a signal with cos, sin and 1 at its samples, (count, 3)."""
+    """Yield blocks (count,) of a signal, each with cos, sin and 1 at its samples, (count, 3).
+
+    `turns_per_sample` is the frequency of cos and sin over the rate; their phase is 0 at the signal's first sample.
+    """
     for start in range(0, signal.size, BLOCK_SAMPLES):
         block = signal[start : start + BLOCK_SAMPLES]
         k = np.arange(start, start + block.size, dtype=float)

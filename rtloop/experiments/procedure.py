@@ -85,7 +85,7 @@ class Experiment:
         return self._fit(options, setting, compared)[1]
 
     def _fit(self, options: Options, setting: Setting, compared: Setting | None) -> tuple[Options, list[str]]:
-        """Return a copy of the options as `fit_options`, and the texts of `reductions`.
+        """Return a fitted copy of the options, and a text for each default that was scaled down.
 
         Raises ConfigError for values that a user set beyond the limits, UnsuitableLoop for a default of which less than
         LEAST_SHARE would remain.

@@ -53,10 +53,11 @@ class Setting:
     def timeline(
         self, rest_mode: ModeName | None = None, rest_s: float = REST_S, *, uses_whole_drive: bool = False
     ) -> Timeline:
-        """Return a timeline that depolarises an actuator with a memory, then rests at `middle` in `rest_mode`.
+        """Return a new timeline that begins with depolarising, unless `is_virgin`, and a rest at `middle`.
 
-        None: no rest. It depolarises about 0, or about the middle of the allowed drive where that has one sign. With
-        `uses_whole_drive` it does so in any case, and rests and moves about 0.
+        The rest lasts `rest_s` in `rest_mode`; None: no rest. The actuator is depolarised about 0 V, with a drive of
+        one sign about the middle of the allowed drive. With `uses_whole_drive` it is always depolarised about that
+        middle, and the timeline rests and moves about 0.
         """
         timeline = Timeline(self.rate_hz, ABOUT_ZERO if uses_whole_drive else self.middle)
         low_v, high_v = self.drive_range_v
@@ -176,7 +177,7 @@ class Setting:
 
     @property
     def reach_um(self) -> float:
-        """Largest slow command in µm to both sides."""
+        """Largest slow command in µm to both sides of the middle, as `reach`."""
         return self.reach.magnitude
 
     @property

@@ -48,7 +48,7 @@ class Row:
 
     @property
     def limit_text(self) -> str:
-        """The limit as text; empty without a limit."""
+        """The limit as text, such as "≤ 5 ms"; "" without a limit."""
         if self.limit is None:
             return ""
         unit = "" if self.unit == "1" else f" {self.unit}"
@@ -56,7 +56,10 @@ class Row:
 
     @property
     def verdict(self) -> str:
-        """Whether the requirement, the claim and the model are met, as text; a difference to the model is named."""
+        """Whether the requirement, the claim and the model are met, as text; a difference to the model is named.
+
+        "" without any of these; "not shown by this run" for a value that is not finite.
+        """
         if not math.isfinite(self.run):
             return "not shown by this run"
         difference = "" if self.model is None else f"{self.run - self.model:+.3g} {self.unit.removeprefix('1')}".strip()

@@ -42,7 +42,10 @@ class AxisJudgement:
 
     @property
     def continuous(self) -> LoopAnalysis | None:
-        """Margins and step figures of C(s) on the model, without sampling or delay; None for other laws."""
+        """Margins and step figures of C(s) on the model, without sampling or delay.
+
+        None without a model, and for a law that is not made from a C(s).
+        """
         return self.check.continuous
 
     @property
@@ -79,7 +82,9 @@ class AxisJudgement:
 
 
 def judge_axis(prepared: Prepared, axis: AxisOptions, check: AxisCheck, host: HostDelay | None) -> AxisJudgement:
-    """Judge one axis; `host` is the measured delay of this host, None without a measurement.
+    """Return analyses, tolerated shifts, stability on the rig and verdict of one axis.
+
+    `host` is the measured delay of this host, None without a measurement.
 
     Raises ConfigError, InputFileError for a specification that is invalid or cannot be read.
     """

@@ -42,7 +42,11 @@ class CheckResult(Result):
         return f"{self.prepared.plan.name}: {verdicts}; {count_text(len(self.warnings), 'warning')}"
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the object of `rtloop check --json`."""
+        """Return the object of `rtloop check --json`.
+
+        Keys: name, rate_hz, mode, driver, recordings (the folder), columns, warnings and axes (`AxisJudgement.as_dict`
+        of each).
+        """
         plan = self.prepared.plan
         return to_jsonable(
             {

@@ -153,8 +153,8 @@ class DesignResult(Result):
     def write(self, path: FileName, axis: str = "x") -> Path:
         """Write a configuration with the controller and a simulated rig of its plant. Returns its path.
 
-        An existing file is replaced. `axis` is the name of the axis. Raises ConfigError for a configuration that cannot
-        run, OutputError if the system refuses.
+        The path is also stored as `output`. An existing file is replaced. `axis` is the name of the axis. Raises
+        ConfigError for a configuration that cannot run, OutputError if the system refuses.
         """
         target = as_path(path, "write: path")
         source, text, design = self.specification

@@ -133,7 +133,8 @@ def fit_hysteresis(
 ) -> HysteresisResult:
     """Identify `operators` plays from recordings.
 
-    `thresholds` (V) replace the `placement` of thresholds. `memory` says whether the actuator has none at the start of
+    `placement` is the rule for their thresholds, which `thresholds` (V) replace; `weights` "invertible" make a model
+    with an inverse, "free" perhaps one without. `memory` says whether the actuator has none at the start of
     each recording ("rest"), an unknown one ("unknown"), or whether this is found from the drive ("auto"). `validate`
     are recordings that judge the model, and are not fitted. Raises RtloopError, ConfigError where no model can be
     fitted.

@@ -23,11 +23,12 @@ class WarningCollector:
     """Receiver that keeps warnings, as `warnings`, and passes them to another receiver at once."""
 
     def __init__(self, warn: Warn) -> None:
+        """Begin without warnings; `warn` is the other receiver."""
         self.warnings: list[str] = []
         self._warn = warn
 
     def __call__(self, messages: Iterable[str]) -> None:
-        """Keep the messages and pass them on."""
+        """Append the messages to `warnings`, and pass them to the other receiver as a list."""
         texts = list(messages)
         self.warnings += texts
         self._warn(texts)
@@ -52,7 +53,7 @@ class IdentifiedModel(Result):
         """Return a picture of the model beside its recordings. Raises MissingExtra without matplotlib."""
 
     def write(self, path: str | Path) -> Path:
-        """Write the section to a new file. Returns its path.
+        """Write the section to a new file. Returns its path, which is also stored as `output`.
 
         Raises OutputError if the file exists or cannot be written, UnsuitableData for hysteresis without an inverse.
         """
@@ -62,7 +63,7 @@ class IdentifiedModel(Result):
         return target
 
     def save_plot(self, path: str | Path) -> Path:
-        """Write the picture as PNG, over an existing file. Returns its path.
+        """Write the picture as PNG, over an existing file. Returns its path, which is also stored as `picture`.
 
         Raises OutputError for a file that cannot be written, MissingExtra without matplotlib.
         """

@@ -11,7 +11,11 @@ from rtloop.design.identification.hysteresis.judgement import Judgement
 
 
 def judgement_row(judgement: Judgement, fitted: bool) -> dict[str, Any]:
-    """Return the report's row on the model's held-out error in one recording, which is `fitted` or validates only."""
+    """Return the report's row on the model's held-out error in one recording, which is `fitted` or validates only.
+
+    Its values are errors in µm and in % of the range, offset and drift, and from when and for which part, in %, the
+    memory of the hysteresis is known, so that the errors are judged.
+    """
     return {
         "recording": judgement.name,
         "fitted": fitted,

@@ -29,11 +29,12 @@ from rtloop.workbench.arguments import FileName, load_configuration
 def replay_with_other_law(
     files: Sequence[Path], config: FileName | Configuration, progress: ReportTicks | None = None
 ) -> dict[str, Any]:
-    """Compare the recorded outputs with the outputs of the law in `config` on the recorded inputs.
+    """Compare the recorded outputs with the outputs of the law in `config` on the recorded inputs, from rest.
 
     Returns {recording, config, ticks, problems, signals: {name: {max, at_tick, rms}}, trip}; `trip` is {tick, causes}
     of the first trip of the law, or None. `progress` receives the number of ticks so far. Raises RecordingError,
-    ConfigError for an invalid file or other axes.
+    InputFileError for a file that cannot be read, ConfigError for an invalid one or other axes or another rate,
+    DriverError if its driver's library is missing.
     """
     recording, configuration = _load_recording(files), load_configuration(config, "replay")
     differences = compare_law(recording, _configured_law(configuration, recording), progress)
@@ -103,7 +104,11 @@ def _recorded_library(recording: Recording, trust: TrustedLaws) -> Library:
 
 
 def _configured_law(configuration: Configuration, recording: Recording) -> LawWithCoefficients:
-    """Return the law of a configuration. Raises ConfigError if its axes or rate differ from the recording's."""
+    """Return the law of a configuration, with its coefficients.
+
+    Raises ConfigError if it is invalid, or its axes or rate differ from the recording's; DriverError if its driver's
+    library is missing.
+    """
     header, faults = recording.header, []
     names = [axis.name for axis in configuration.axes]
     if names != header["axes"]:

@@ -70,10 +70,11 @@ def replay(
     jobs: int = 1,
     progress: ReportTicks | None = None,
 ) -> ReplayResult | LawComparison | Resimulation:
-    """Execute a recording again and compare every output of every tick, byte by byte.
+    """Execute a recording again and compare every output of every tick, byte by byte; return a ReplayResult.
 
-    With `config`, run the law of this configuration on the recorded inputs, from rest. With `resimulate`, run the
-    recorded reference in closed loop with the simulated rig of `config`, or the recorded one. `law` are files with
+    With `config`, run the law of this configuration on the recorded inputs, from rest; return a LawComparison. With
+    `resimulate`, run the recorded reference in closed loop with the simulated rig of `config`, or the recorded one;
+    return a Resimulation. `law` are files with
     recorded laws that are not installed; `trust_recorded_law` runs the recorded text of laws. `jobs` processes replay
     at once, as forks of this process; `progress` receives the number of ticks so far. Raises RecordingError for a
     recording that cannot be replayed, ConfigError for a configuration that does not fit, InputFileError.

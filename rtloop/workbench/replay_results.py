@@ -158,7 +158,7 @@ class Resimulation(Result):
 
     @property
     def trips(self) -> dict[str, dict[str, Any] | None]:
-        """First trip of the recorded and of the resimulated run: tick and causes; None without a trip."""
+        """First trip of the `recorded` and of the `resimulated` run: tick and causes; None without a trip."""
         return self.report["trips"]
 
     @property

@@ -48,7 +48,10 @@ class RunResult(Result):
 
     @property
     def exit_code(self) -> int:
-        """Exit code of the command for this run: 0 for a good run, 1 also after a trip."""
+        """Exit code of the command for this run: 0 for a good run, else that of the failure.
+
+        LoopFault's after a trip and for an incomplete recording.
+        """
         code = 0 if self.supervised is None else self.supervised.exit_code
         return code or (LoopFault.exit_code if self.trips else 0)
 
@@ -113,7 +116,10 @@ class RunResult(Result):
         return f"{self.outcome}, {count_text(self.ticks, 'tick')}{trips}{file}"
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the object of `rtloop run --json`: that of `rtloop info --json`, and the result of the run."""
+        """Return the object of `rtloop run --json`: that of `rtloop info --json`, and the result of the run.
+
+        After a signal before the loop began, it has outcome, recording (None) and recordings ([]) alone.
+        """
         if self.supervised is None:
             return {"outcome": self.outcome, "recording": None, "recordings": []}
         report = {"trips": [], **(self.summary.as_dict() if self.summary else {"recording": None})} | {

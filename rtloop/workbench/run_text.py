@@ -27,7 +27,10 @@ SPECIFIED_STEP = (
 def print_run(
     out: Console, configuration: Configuration, summary: Summary | None, steps: Mapping[str, StepMetrics]
 ) -> None:
-    """Print the summary of a run, and its `steps` where there are some. `summary` is None without a recording."""
+    """Print the summary of a run, and its `steps` where there are some.
+
+    `summary` is None without a recording; then one line says that nothing is recorded.
+    """
     if summary is None:
         out.print("nothing is recorded")
         return

@@ -52,7 +52,7 @@ def specification_rows(
     """Yield the limits of an axis's specification, and the figures that it claims, if any.
 
     A limit that the worst of the `steps` does not meet is marked MISSED. Yields one row with the error for a
-    specification that cannot be read.
+    specification that cannot be read, and no row for an axis without one.
     """
     if axis.specification is None:
         return

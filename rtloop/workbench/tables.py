@@ -47,7 +47,8 @@ def render_html(print_text: Callable[[Console], None]) -> str:
 def table(*headings: str, rows: Iterable[Sequence[str]] = (), words: Sequence[int] = ()) -> Table:
     """Return a table without lines: the first column and the columns `words` to the left, the others to the right.
 
-    With empty headings alone, every column is to the left and no heading is printed.
+    `words` are numbers of columns, from 0. With empty headings alone, every column is to the left and no heading is
+    printed.
     """
     from rich.table import Table
 

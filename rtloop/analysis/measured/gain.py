@@ -1,6 +1,7 @@
 """Static gain of a plant, measured in closed loop: position per command at references that are held in turn.
 
-    x̄_i, v̄_i   means of position and command while reference i is held         K̂ = Σ |x̄_i+1 − x̄_i| / Σ |v̄_i+1 − v̄_i|
+    x̄_i, v̄_i   means of position and command while reference i is held         K̂ = Σ |x̄_i+1 − x̄_i| / Σ |v̄_i+1 −
+    v̄_i|
 
 The references go out in equal steps and back in the same ones. A step after a turn is left out: there hysteresis
 answers with its narrow loops alone. The slopes of the others scatter by noise and by the hysteresis that an inverse
@@ -35,6 +36,8 @@ class StaticGain(NamedTuple):
 def staircase(from_um: float, to_um: float, rate_hz: float) -> Real:
     """Return references (ticks,) from one value to the other and back, in STEPS steps each; the last sample is
     `from_um`.
+
+    A ramp of RAMP_S leads to each level, which is held for HELD_S.
     """
     ramp, held = round(RAMP_S * rate_hz), round(HELD_S * rate_hz)
     out = np.linspace(from_um, to_um, STEPS + 1)
@@ -46,7 +49,9 @@ def staircase(from_um: float, to_um: float, rate_hz: float) -> Real:
 
 
 def static_gain(reference: Real, position: Real, command: Real, rate_hz: float) -> StaticGain:
-    """Return the gain from a recorded `staircase`, with position and command, each (ticks,), in µm.
+    """Return the gain and its standard deviation from a recorded `staircase`, with position and command.
+
+    All three are (ticks,), in µm, of the staircase alone.
 
     Raises ValueError unless position and command move the same way at each step that counts.
     """

@@ -59,7 +59,9 @@ class LightMode:
 
 
 def fit_light_mode(measured: MeasuredResponse, rate_hz: float, near_hz: float, band: float = BAND) -> LightMode | None:
-    """Return the mode within `band` (a fraction) of `near_hz`; None where none stands out.
+    """Return the lightly damped mode, with standard deviations, within `band` (a fraction) of `near_hz`.
+
+    None where none stands out.
 
     Raises ValueError for fewer than MIN_LINES lines in it.
     """

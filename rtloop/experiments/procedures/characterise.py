@@ -34,7 +34,10 @@ class CharacteriseOptions(Options):
 
 
 def runs(options: CharacteriseOptions, setting: Setting) -> list[Run]:
-    """Plan half the drive, then all of it, so that both begin with their initial loading curve, then a minor loop.
+    """Plan one run without control: slow sines of half the drive, then of all of it, then of a minor loop.
+
+    The smaller one is first, so that both begin on the initial loading curve. The minor loop is from 0 V to half the
+    larger end of the drive.
 
     All sines begin at 0 V. The whole drive reaches from its lowest to its highest value, which need not be opposite.
     """
@@ -54,7 +57,7 @@ def runs(options: CharacteriseOptions, setting: Setting) -> list[Run]:
 
 
 def analyse(recordings: Sequence[RecordedRun], _: CharacteriseOptions) -> Analysis:
-    """Compare the measured loops with the model's for the recorded drive.
+    """Compare the measured loops of one recording with the model's for the recorded drive.
 
     Rows: height h and range H of the largest loop, µm, h/H of all loops, %, each with its range of the drive, and the
     largest difference, % of H.

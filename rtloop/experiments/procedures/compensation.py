@@ -49,7 +49,7 @@ def runs(options: CompensationOptions, setting: Setting) -> list[Run]:
 
 
 def analyse(recordings: Sequence[RecordedRun], options: CompensationOptions) -> Analysis:
-    """Evaluate the output y = x/D(0) of the compensation over the command v, both in µm.
+    """Evaluate the output y = x/D(0) of the compensation over the command v, both in µm, from one recording.
 
     x is the position relative to rest, D(0) the static gain of the dynamics. Rows: height h of the remaining loop, µm,
     and h over its range H, %; largest |v − y|; slope ρ of y over v after half a cycle; largest |Ω| = |y − ρ v|.

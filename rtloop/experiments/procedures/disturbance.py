@@ -42,7 +42,10 @@ class DisturbanceOptions(Options):
 
 
 def runs(options: DisturbanceOptions, setting: Setting) -> list[Run]:
-    """Plan a run for the step and one for each sine: the rig's disturbance is fixed when it is built."""
+    """Plan a run in closed loop for the disturbance's step, and one for each of its sines.
+
+    They are apart because the rig's disturbance is fixed when the rig is built.
+    """
     amplitude_um = options.amplitude_um or disturbance_um(setting)
     planned_runs = [_plan_run("step", {"step_um": amplitude_um}, STEP_S, setting, settle_s=0.0)]
     for hz in options.frequencies_hz:
@@ -73,7 +76,10 @@ def disturbance_um(setting: Setting) -> float:
 
 
 def analyse(recordings: Sequence[RecordedRun], options: DisturbanceOptions) -> Analysis:
-    """Evaluate the remaining error of the step over time, and of each sine, with the specification's limits."""
+    """Evaluate the remaining error of the step over time, and of each sine, with the specification's limits.
+
+    `recordings` has one run for each; the curves are the error over time and over frequency, and the model's.
+    """
     rows: list[Row] = []
     table: list[list[str]] = []
     amplitude_um = options.amplitude_um or 0.0
@@ -175,7 +181,7 @@ def _static_nm(error: Real) -> float:
 
 
 def _settling_ms(error: Real, limit_um: float, rate_hz: float) -> float:
-    """Time in ms after which the error (n,) stays within the limit; its whole duration if it never does."""
+    """Time in ms after which the error (n,), µm, stays within ±`limit_um`; its whole duration if it never does."""
     outside = np.flatnonzero(np.abs(error) > limit_um)
     return 1e3 * float(outside[-1] + 1) / rate_hz if outside.size else 0.0
 

@@ -92,7 +92,7 @@ def runs(options: HarmonicOptions, setting: Setting) -> list[Run]:
 
 
 def analyse(recordings: Sequence[RecordedRun], options: HarmonicOptions) -> Analysis:
-    """Evaluate magnitude, phase and coherence of each mode over frequency, beside the model's.
+    """Evaluate magnitude, phase and coherence of each mode over frequency, beside the model's, from one recording.
 
     Rows: peak without control, gain at low frequencies, and bandwidth and largest response of the closed loop.
     """

@@ -55,7 +55,7 @@ class ResponseOptions(Options):
 
 
 def runs(options: ResponseOptions, setting: Setting) -> list[Run]:
-    """Plan the multisine of the reference, one settling period and the measured ones, then rest.
+    """Plan one run in closed loop: a multisine of the reference, a settling period and the measured ones, then rest.
 
     Raises ConfigError for a band or period that `make_grid` refuses.
     """
@@ -96,9 +96,10 @@ def _line_grid(options: ResponseOptions, setting: Setting) -> LineGrid:
 
 
 def analyse(recordings: Sequence[RecordedRun], options: ResponseOptions) -> Analysis:
-    """Evaluate measured margins and resonance beside the model's; the curves are the loop L at every line.
+    """Evaluate measured margins and resonance beside the model's, from one recording.
 
-    Raises UnsuitableData if the position moved further than planned, ValueError if the signals allow no measurement.
+    The curves are the loop L at every line of the multisine, measured and modelled. Raises UnsuitableData if the
+    position moved further than planned, ValueError if the signals allow no measurement.
     """
     (run,) = recordings
     near_hz, loop = (run.model.resonance_hz, run.model.loop) if run.model else (None, None)

@@ -44,7 +44,7 @@ class Outcome(NamedTuple):
 
     @property
     def is_settled(self) -> bool:
-        """Whether it neither trips nor rings at the end."""
+        """Whether the step neither trips nor rings at the end."""
         return self.trip is None and self.swing_um <= MAX_SWING_UM
 
     @property
@@ -67,7 +67,10 @@ def runs(options: RobustnessOptions, setting: Setting) -> list[Run]:
 
 
 def analyse(recordings: Sequence[RecordedRun], options: RobustnessOptions) -> Analysis:
-    """Evaluate which shifts settle, ring or trip, and the range of shifts about 0 that settle, beside the model's."""
+    """Evaluate which shifts settle, ring or trip, and the range of shifts about 0 that settle, beside the model's.
+
+    `recordings` has one run for each shift, in any order.
+    """
     ordered = sorted(recordings, key=lambda run: run.segments_labelled("step")[0].values["shift_percent"])
     outcomes, traces = [], []
     for run in ordered:

@@ -48,7 +48,7 @@ def triangle(period_ticks: int, amplitude_um: float) -> Real:
 
 
 def runs(options: ScanOptions, setting: Setting) -> list[Run]:
-    """Plan the first run: unlearned triangles.
+    """Plan the first run, in closed loop: unlearned triangles at each frequency in turn.
 
     Raises UnsuitableLoop like `_learning_gains`, ConfigError for a frequency whose period is no whole number of ticks.
     """
@@ -131,21 +131,27 @@ def _measured_slice(run: RecordedRun, number: int) -> tuple[slice, int]:
 
 
 def _recorded_table(run: RecordedRun, number: int) -> Real:
-    """Return the table (period, 2) of reference and command in µm that scan `number` played."""
+    """Return the table (period, 2) that scan `number`, from 0, played: reference and addition to the command, µm."""
     measured_slice, ticks = _measured_slice(run, number)
     reference, feed = run.read("reference_um", "feed_um")
     return np.column_stack([reference[measured_slice][:ticks], feed[measured_slice][:ticks]])
 
 
 def _mean_error(run: RecordedRun, number: int) -> Real:
-    """Return the triangle minus the measured position (period,), µm, the mean of all evaluated periods."""
+    """Return the triangle minus the measured position of scan `number`, from 0, in µm: (period,).
+
+    It is the mean of all evaluated periods.
+    """
     measured_slice, ticks = _measured_slice(run, number)
     position = run.signal("position_um")[measured_slice].reshape(-1, ticks).mean(axis=0)
     return triangle(ticks, float(run.parameters["amplitude_um"])) - position
 
 
 def analyse(recordings: Sequence[RecordedRun], options: ScanOptions) -> Analysis:
-    """Evaluate the rms error of every frequency before and after learning, in % of peak to peak, and each cycle's."""
+    """Evaluate the rms error of every frequency before and after learning, in % of peak to peak.
+
+    `recordings` are in the order of the cycles; a table has the error of each cycle, and the curves too.
+    """
     rows: list[Row] = []
     table, traces = [], []
     extent_um = 2 * options.amplitude_um

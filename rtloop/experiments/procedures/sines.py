@@ -46,7 +46,10 @@ def runs(options: SinesOptions, setting: Setting) -> list[Run]:
 
 
 def analyse(recordings: Sequence[RecordedRun], options: SinesOptions) -> Analysis:
-    """Evaluate rms error and phase at each frequency beside the model's, and amplitudes and coherence in a table."""
+    """Evaluate rms error and phase at each frequency beside the model's, from one recording.
+
+    A table has the largest error, the gain and the coherence too; the curves are two cycles of each frequency.
+    """
     (run,) = recordings
     reference, position = run.read("reference_um", "position_um")
     rows, table, traces = [], [], []

@@ -71,7 +71,8 @@ def runs(options: StepResponseOptions, setting: Setting) -> list[Run]:
 def analyse(recordings: Sequence[RecordedRun], options: StepResponseOptions) -> Analysis:
     """Evaluate overshoot, frequency and damping of the ringing, and final position, beside the model's.
 
-    Raises UnsuitableData for too little ringing.
+    From one recording. The curves are the positions, measured and modelled, after the step. Raises UnsuitableData for
+    too little ringing.
     """
     (run,) = recordings
     position = run.signal("position_um")

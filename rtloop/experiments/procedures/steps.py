@@ -60,7 +60,7 @@ class Step(NamedTuple):
 
 
 def analyse(recordings: Sequence[RecordedRun], _: StepsOptions) -> Analysis:
-    """Evaluate overshoot, settling and static error of every step; the verdicts show their medians.
+    """Evaluate overshoot, settling and static error of every step, from one recording; the rows have their medians.
 
     Raises UnsuitableData if no level differs from the one before for long enough.
     """
@@ -116,7 +116,10 @@ def analyse(recordings: Sequence[RecordedRun], _: StepsOptions) -> Analysis:
 
 
 def _evaluate_steps(run: RecordedRun, reference: Real, position: Real, command: Real) -> list[Step]:
-    """Return the figures of every level that differs from the one before, if it is long enough for them."""
+    """Return the figures of every level that differs from the one before, and lasts long enough for them.
+
+    `reference`, `position` and `command` (ticks,) are those of the whole run, measured or by the model.
+    """
     steps = []
     for segment, previous_um, level in _level_changes(run):
         start, end = segment.start_tick, segment.start_tick + segment.ticks
