@@ -50,7 +50,7 @@ def print_axis(out: Console, judgement: AxisJudgement, sensor: Channel) -> None:
     drive = (
         f"±{limits.drive_v:g}" if limits.lowest_v == -limits.drive_v else f"{limits.lowest_v:g} … {limits.drive_v:g}"
     )
-    slew = "no running slew limit" if limits.slew_v_per_s is None else f"slew {limits.slew_v_per_s:g} V/s"
+    slew = "no slew limit while running" if limits.slew_v_per_s is None else f"slew {limits.slew_v_per_s:g} V/s"
     out.print(
         f"\n[bold]axis {axis.name}[/]: drive {drive} V, command {_command_text(axis)} µm, {slew}, "
         f"trip ramp {limits.trip_slew_v_per_s:g} V/s; trips beyond ±{axis.interlocks.position_um:g} µm"

@@ -43,7 +43,7 @@ def print_dynamics(out: Console, report: dict[str, Any]) -> None:
     out.print(f"delay {count_text(report['delay_ticks'], 'sample')}; fit {report['fit_percent']:.2f} %")
     out.print(
         f"prediction error, one step ahead: {report['rms_error_um']:.5f} µm rms over the whole recording; the table "
-        "has it where the model was not fitted, if the input changes there"
+        "has the error in the part to which the model was not fitted, provided that the input changes there"
     )
     if report["free_motion_s"]:
         out.print(
@@ -89,4 +89,4 @@ def _resolution_note(resolution_hz: float) -> str:
     """Return a note on a resolution that is coarser than usual, because the recording is short; else ""."""
     usual_hz = 1 / SEGMENT_S
     least_s = 2 * SEGMENT_S
-    return "" if resolution_hz <= 1.01 * usual_hz else f" (of {usual_hz:g} Hz from {least_s:g} s of excitation on)"
+    return "" if resolution_hz <= 1.01 * usual_hz else f" ({usual_hz:g} Hz needs {least_s:g} s of excitation)"

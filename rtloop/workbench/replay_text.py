@@ -38,7 +38,7 @@ def print_replay(out: Console, path: Path, report: ReplayReport) -> None:
     if report.skipped:
         stretches = count_text(report.stretches, "stretch", "stretches")
         extent += f" in {stretches}"
-        out.print(f"left out by intention: {count_text(report.skipped, 'tick')} outside the {stretches}")
+        out.print(f"not recorded, by intention: {count_text(report.skipped, 'tick')} outside {stretches} around events")
     name, difference = escape(path), report.first_difference
     if report.identical:
         out.print(f"[green]identical[/]: {name}: {extent} compared in bytes")

@@ -18,8 +18,8 @@ if TYPE_CHECKING:
 
 SPECIFIED_STEP = (
     "MISSED: the worst recorded step is beyond the limit. A specification is for the linear loop's step from rest at 0 "
-    "µm: between other levels the hysteresis acts, and a loop without integrator leaves its static error of the "
-    "position, not of the step."
+    "µm: between other levels the hysteresis adds to the error, and the static error of a loop without integrator is "
+    "a part of the position, not of the step."
 )
 """Difference between a recorded step and the step that a specification limits."""
 

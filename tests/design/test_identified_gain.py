@@ -125,7 +125,7 @@ def test_synthesis_prints_the_verdict_of_check_and_explains_gamma(folder: Path) 
         assert says in verdict
         assert verdict.removeprefix(f"{spec}: ") in " ".join(run("check", out).stdout.split())
         assert "fails" not in made.stderr
-        assert "as small as any controller reaches" in made.stderr
+        assert "is the smallest γ that a controller reaches" in made.stderr
         assert says in answer("design", "synthesise", spec, "--model", folder / "first.toml")["verdict"]
 
 
@@ -157,7 +157,7 @@ def test_a_comparison_with_a_short_recording_states_its_resolution(folder: Path)
         "identify", "dynamics", folder / "first.mcap", "--input", "drive", "--order", "2", "--compare",
         folder / "first.mcap",
     ).stdout  # fmt: skip
-    assert "resolution 6.67 Hz (of 1.25 Hz from 1.6 s of excitation on)" in " ".join(printed.split())
+    assert "resolution 6.67 Hz (1.25 Hz needs 1.6 s of excitation)" in " ".join(printed.split())
 
 
 def test_the_advice_after_a_trip_fits_its_cause() -> None:
