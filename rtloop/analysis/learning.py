@@ -33,9 +33,7 @@ again."""
 
 
 def cycle_periods(period_ticks: int, rate_hz: float) -> tuple[int, int]:
-    """Return two numbers of whole periods of a cycle: those in which the loop settles, then those that are
-    evaluated.
-    """
+    """Return how many whole periods of a cycle the loop has to settle, and how many after them are evaluated."""
     period_s = period_ticks / rate_hz
     return math.ceil(SETTLE_S / period_s), math.ceil(EVALUATION_S / period_s)
 

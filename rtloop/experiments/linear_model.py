@@ -167,7 +167,7 @@ class LinearModel:
 
     @cached_property
     def open_peak(self) -> float:
-        """Largest magnitude of the plant's response over its static gain, from 0.1 Hz to half the rate."""
+        """Largest magnitude of the plant's response over its static gain, from 0.1 Hz to half the rate or 10 kHz."""
         resonances_hz = [self.resonance_hz] if self.resonance_hz else []
         hz = np.concatenate([*(GRID_HZ * 10.0**decade for decade in range(5)), resonances_hz])
         return float(np.abs(self.plant(hz[hz < self.rate_hz / 2])).max() / abs(self.static_gain))

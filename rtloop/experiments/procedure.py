@@ -121,8 +121,8 @@ class Experiment:
     def _bound(self, key: str, sign: float, setting: Setting, compared: Setting | None) -> tuple[float, str]:
         """Return the largest allowed magnitude of an option's positive or negative numbers, and the key that limits it.
 
-        `sign` is 1 or −1; `key` is the option's. The smaller limit of both settings counts, of one if `compared` is
-        None.
+        `sign` is 1 or −1; `key` is the option's. The smaller limit of `setting` and, unless it is None, of
+        `compared` counts.
         """
         bound_of_setting = self.limits[key] if sign > 0 else self.lower_limits.get(key, self.limits[key])
         limit, reason = bound_of_setting(setting)

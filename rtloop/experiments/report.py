@@ -54,9 +54,9 @@ def make_report(runs: Sequence[RecordedRun], on_progress: ProgressCallback = lam
     """Analyse all experiments found in one or more runs; `on_progress` receives a line for each.
 
     Runs of a second configuration add a column and curves; an experiment of that configuration alone is left out.
-    Without runs of the first configuration, those of the second are reported in its place. An experiment that cannot be
-    analysed has a `problem` and no pictures. Raises RecordingError where two recordings are of the same run,
-    MissingExtra without matplotlib.
+    Without runs of the first configuration, the second takes its place. An experiment that cannot be analysed has a
+    `problem` and no pictures. Raises RecordingError where two recordings are of the same run, MissingExtra without
+    matplotlib.
     """
     sections, pictures_by_name = [], {}
     _require_distinct(runs)

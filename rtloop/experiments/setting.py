@@ -56,8 +56,8 @@ class Setting:
         """Return a new timeline that begins with depolarising, unless `is_virgin`, and a rest at `middle`.
 
         The rest lasts `rest_s` in `rest_mode`; None: no rest. The actuator is depolarised about 0 V, with a drive of
-        one sign about the middle of the allowed drive. With `uses_whole_drive` it is always depolarised about that
-        middle, and the timeline rests and moves about 0.
+        one sign about the middle of the allowed drive. With `uses_whole_drive`, any drive is taken about that middle
+        for this, and the timeline rests and moves about 0.
         """
         timeline = Timeline(self.rate_hz, ABOUT_ZERO if uses_whole_drive else self.middle)
         low_v, high_v = self.drive_range_v
@@ -144,7 +144,7 @@ class Setting:
 
     @cached_property
     def middle(self) -> Middle:
-        """Middle about which experiments move: 0, or that of the reachable range of a drive of one sign."""
+        """Middle about which experiments move: 0, with a drive of one sign the middle of the reachable range."""
         if not self.is_one_sided:
             return ABOUT_ZERO
         middle_um = float(f"{sum(self._one_sided_range) / 2:.3g}")

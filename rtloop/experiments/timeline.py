@@ -91,7 +91,7 @@ class Timeline:
         self._append(label, mode, self.middle.shifted(reference, mode), duration_s, **values)
 
     def _append(self, label: str, mode: ModeName, reference: Reference, duration_s: float, **values: Any) -> None:
-        """Append a segment of at least one tick, with `reference` as it is."""
+        """Append a segment of at least one tick, with `reference` unchanged."""
         ticks = max(1, round(duration_s * self._rate_hz))
         self.segments.append(Segment(label, mode, self.ticks, ticks, values))
         self.references.append(reference)

@@ -69,7 +69,7 @@ class DesignResult(Result):
 
     @property
     def order(self) -> int:
-        """Order of the controller."""
+        """Order of the controller after reduction."""
         return self.controller.order
 
     @property

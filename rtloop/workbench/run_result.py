@@ -48,9 +48,9 @@ class RunResult(Result):
 
     @property
     def exit_code(self) -> int:
-        """Exit code of the command for this run: 0 for a good run, else that of the failure.
+        """Exit code of the command for this run: 0 for a good run, else the code of the failure.
 
-        LoopFault's after a trip and for an incomplete recording.
+        It is LoopFault's after a trip and for an incomplete recording.
         """
         code = 0 if self.supervised is None else self.supervised.exit_code
         return code or (LoopFault.exit_code if self.trips else 0)

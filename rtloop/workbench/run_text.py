@@ -29,7 +29,7 @@ def print_run(
 ) -> None:
     """Print the summary of a run, and its `steps` where there are some.
 
-    `summary` is None without a recording; then one line says that nothing is recorded.
+    `summary` is None without a recording; then one line says so.
     """
     if summary is None:
         out.print("nothing is recorded")

@@ -81,7 +81,7 @@ class MeasuredLoop:
 def measured_loop(measured_response: MeasuredResponse, rate_hz: float, mode: LightMode | None) -> MeasuredLoop:
     """Return the loop L = C·D of a measured response, its lines smoothed; `mode` is the lightly damped mode, or None.
 
-    The smoothing also reduces its `spread`.
+    Its `spread` is smaller than before where neighbouring lines were combined.
     """
     image = None if mode is None else mode.image(rate_hz)
     raw = measured_response.plant * measured_response.controller * _pole_distance(measured_response.hz, rate_hz, image)

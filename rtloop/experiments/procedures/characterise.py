@@ -141,7 +141,7 @@ def _table(shapes: Mapping[str, tuple[LoopShape, LoopShape]]) -> Table:
 def draw(figure: Any, curves: Mapping[str, Any], ink: Palette) -> None:
     """Draw the loops, the model with the major loop, and their difference over time.
 
-    `curves` are those of `analyse`.
+    `curves` come from `analyse`.
     """
     grid = figure.add_gridspec(2, 2, height_ratios=(3, 1))
     loops, comparison, error = (figure.add_subplot(cell) for cell in (grid[0, 0], grid[0, 1], grid[1, :]))

@@ -95,7 +95,7 @@ def _modelled_output(run: RecordedRun, drive: Real, rest: Segment, segment: Segm
 
 
 def draw(figure: Any, curves: Mapping[str, Any], ink: Palette) -> None:
-    """Draw y over v, and the error v − y over v; `curves` are those of `analyse`."""
+    """Draw y over v, and the error v − y over v; `curves` come from `analyse`."""
     loop, error_panel = figure.subplots(1, 2)
     v, y, error = curves["v_y_error"]
     ends = np.array([v.min(), v.max()])

@@ -204,7 +204,7 @@ def _frequency_curves(run: RecordedRun, amplitude_um: float) -> dict[str, Any]:
 
 
 def draw(figure: Any, curves: Mapping[str, Any], ink: Palette) -> None:
-    """Draw the step's decay, and the error over frequency; `curves` are those of `analyse`."""
+    """Draw the step's decay, and the error over frequency; `curves` come from `analyse`."""
     step_panel, frequency_panel = figure.subplots(1, 2, width_ratios=(3, 2))
     limit_nm = curves["asked_nm"]
     if limit_nm is not None:

@@ -227,7 +227,7 @@ def bandwidth_hz(sweep: Real) -> float:
 def draw(figure: Any, curves: Mapping[str, Any], ink: Palette) -> None:
     """Draw magnitude, phase and coherence over frequency, and again near the resonance.
 
-    `curves` are those of `analyse`.
+    `curves` come from `analyse`.
     """
     panels = figure.subplots(3, 2, sharex="col", sharey="row", height_ratios=(4, 2, 1.2), width_ratios=(3, 1.3))
     for column in panels.T:
@@ -247,7 +247,7 @@ def draw(figure: Any, curves: Mapping[str, Any], ink: Palette) -> None:
 def _draw_column(panels: Any, curves: Mapping[str, Any], ink: Palette) -> None:
     """Draw magnitude, phase and coherence of all modes in the three `panels` of a column, in this order.
 
-    Points of less coherence than MIN_COHERENCE are left out of the first two. `curves` are those of `analyse`.
+    Points of less coherence than MIN_COHERENCE are left out of the first two. `curves` come from `analyse`.
     """
     magnitude, phase, coherence = panels
     for mode, color in zip(MODES, (ink.error, ink.drive, ink.measured), strict=True):

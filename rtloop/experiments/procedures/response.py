@@ -177,7 +177,7 @@ def _row(
 
 
 def draw(figure: Any, curves: Mapping[str, Any], ink: Palette) -> None:
-    """Draw L in magnitude and phase, and |S|, each with the model's; `curves` are those of `analyse`."""
+    """Draw L in magnitude and phase, and |S|, each with the model's; `curves` come from `analyse`."""
     hz, loop, model = curves["hz"], curves["loop"], curves["model"]
     magnitude, phase, sensitivity = figure.subplots(3, 1, sharex=True)
     std = np.abs(loop) * curves["spread"]

@@ -141,7 +141,7 @@ def _stability_text(predicted: Mapping[float, bool] | None, shift_percent: float
 
 
 def draw(figure: Any, curves: Mapping[str, Any], ink: Palette) -> None:
-    """Draw the step at each shift, coloured by its outcome; `curves` are those of `analyse`."""
+    """Draw the step at each shift, coloured by its outcome; `curves` come from `analyse`."""
     traces = curves["traces"]
     columns = min(5, len(traces))
     rows = -(-len(traces) // columns)

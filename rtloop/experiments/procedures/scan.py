@@ -174,7 +174,7 @@ def analyse(recordings: Sequence[RecordedRun], options: ScanOptions) -> Analysis
 def draw(figure: Any, curves: Mapping[str, Any], ink: Palette) -> None:
     """Draw the error over a period before and after learning, and its size over the cycles.
 
-    `curves` are those of `analyse`.
+    `curves` come from `analyse`.
     """
     traces = curves["traces"]
     panels = figure.subplots(1, len(traces) + 1)

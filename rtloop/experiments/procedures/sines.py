@@ -82,7 +82,7 @@ def analyse(recordings: Sequence[RecordedRun], options: SinesOptions) -> Analysi
 
 
 def draw(figure: Any, curves: Mapping[str, Any], ink: Palette) -> None:
-    """Draw the first two cycles of each frequency with the error below; `curves` are those of `analyse`."""
+    """Draw the first two cycles of each frequency with the error below; `curves` come from `analyse`."""
     traces = curves["traces"]
     columns = min(3, len(traces))
     rows = -(-len(traces) // columns)

@@ -170,7 +170,7 @@ def _columns(unknowns: Real, time_s: Real) -> Real:
 
 
 def draw(figure: Any, curves: Mapping[str, Any], ink: Palette) -> None:
-    """Draw the response, and enlarged its first milliseconds; `curves` are those of `analyse`."""
+    """Draw the response, and enlarged its first milliseconds; `curves` come from `analyse`."""
     overview, zoom = figure.subplots(1, 2, sharey=True, width_ratios=(3, 2))
     for panel in (overview, zoom):
         panel.axhline(curves["final"], color=ink.faint, linewidth=0.8)

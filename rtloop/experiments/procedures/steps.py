@@ -118,7 +118,7 @@ def analyse(recordings: Sequence[RecordedRun], _: StepsOptions) -> Analysis:
 def _evaluate_steps(run: RecordedRun, reference: Real, position: Real, command: Real) -> list[Step]:
     """Return the figures of every level that differs from the one before, and lasts long enough for them.
 
-    `reference`, `position` and `command` (ticks,) are those of the whole run, measured or by the model.
+    `reference`, `position` and `command` (ticks,) cover the whole run, measured or by the model.
     """
     steps = []
     for segment, previous_um, level in _level_changes(run):
@@ -161,7 +161,7 @@ def _steps_table(steps: Sequence[Step]) -> Table:
 
 
 def draw(figure: Any, curves: Mapping[str, Any], ink: Palette) -> None:
-    """Draw the series with its drive, and all steps over each other; `curves` are those of `analyse`."""
+    """Draw the series with its drive, and all steps over each other; `curves` come from `analyse`."""
     grid = figure.add_gridspec(2, 2, height_ratios=(2, 1), width_ratios=(3, 2))
     series, drive, zoom = (figure.add_subplot(cell) for cell in (grid[0, 0], grid[1, 0], grid[:, 1]))
     series.plot(*curves["position"], color=ink.measured, label="position x")
