@@ -56,8 +56,8 @@ class Setting:
         """Return a new timeline that begins with depolarising, unless `is_virgin`, and a rest at `middle`.
 
         The rest lasts `rest_s` in `rest_mode`; None: no rest. The actuator is depolarised about 0 V, with a drive of
-        one sign about the middle of the allowed drive. With `uses_whole_drive`, any drive is taken about that middle
-        for this, and the timeline rests and moves about 0.
+        one sign, or with `uses_whole_drive`, about the middle of the allowed drive. With `uses_whole_drive`, rests and
+        motions are about 0 instead of `middle`.
         """
         timeline = Timeline(self.rate_hz, ABOUT_ZERO if uses_whole_drive else self.middle)
         low_v, high_v = self.drive_range_v

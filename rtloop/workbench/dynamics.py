@@ -144,8 +144,8 @@ def fit_dynamics(
     """Identify D(s) from the first recording, and validate it with the others.
 
     `input` of D is the drive through the model of the hysteresis, the command, or the drive. `hysteresis` is a file
-    with the actuator's model (None: the recorded configuration). `order`, `delay` (samples) None: searched up to
-    `largest_order`, which `criterion` decides (None: by the held-out error). `loop` says whether the loop was closed
+    with the actuator's model (None: the recorded configuration). `order`, `delay` (samples) None: searched, the
+    order up to `largest_order` by `criterion` (None: "held-out"). `loop` says whether the loop was closed
     ("auto": by the recorded mode), `outside` which signals moved the closed loop. `compare` is a recording for a
     measured frequency response. `warn` receives warnings before the fit. Raises RtloopError, ConfigError where no model
     can be fitted.
