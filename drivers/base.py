@@ -119,9 +119,10 @@ class Driver(ABC):
         return [channel.safe_v for channel in self.facts.outputs]
 
     def measure_exchanges(self, count: int) -> Exchanges | None:
-        """Measure `count` exchanges at the tick rate with the outputs at their safe values; the driver is closed.
+        """Measure `count` exchanges at the tick rate with the outputs at their safe values.
 
-        The default, None, is for hardware that is read without an answer to wait for. Raises DriverError like `open`.
+        The driver must be closed before; it opens itself and is closed afterwards. The default does nothing and returns
+        None, for hardware that is read without an answer to wait for. Raises DriverError like `open`.
         """
         return None
 

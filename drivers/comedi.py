@@ -241,7 +241,10 @@ class ComediDriver(Driver):
         return np.array([board.channel_line(kind, reserved, int(name[2:]), range_v, aref) for name in names], LINE)
 
     def _fill_context(self, board: Board, inputs: np.ndarray, outputs: np.ndarray) -> None:
-        """Fill in the context of the compiled functions from the board and the records of its channels."""
+        """Store the addresses of the board's functions and of `inputs` and `outputs`, records of LINE, in the context.
+
+        The records are kept alive for the compiled functions; no channel counts as failed.
+        """
         self._arrays = inputs, outputs, np.zeros(1, np.uint32)
         context = self._context
         context["board"], context["data_read"], context["data_write"] = board.addresses

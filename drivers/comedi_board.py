@@ -23,7 +23,7 @@ class Kind(IntEnum):
 
     @property
     def prefix(self) -> str:
-        """Prefix of the names of the subdevice's channels."""
+        """Beginning of the names of this type's channels: "ai" for inputs, "ao" for outputs."""
         return "ai" if self is Kind.INPUT else "ao"
 
 
@@ -81,7 +81,7 @@ class Board:
 
     @property
     def addresses(self) -> tuple[int, int, int]:
-        """Addresses of the device's handle, of comedi_data_read and of comedi_data_write."""
+        """Addresses of the device's handle (0 after `close`), of comedi_data_read and of comedi_data_write."""
         functions = self._library.comedi_data_read, self._library.comedi_data_write
         read, write = (ctypes.cast(function, c_void_p).value or 0 for function in functions)
         return self._handle or 0, read, write
@@ -107,14 +107,15 @@ class Board:
             )
         if self._library.comedi_lock(self._handle, subdevice) < 0:
             busy = self._library.comedi_errno() == errno.EBUSY
-            reason = "another program uses it" if busy else self.error_text()
+            reason = "another program uses it; stop that program" if busy else self.error_text()
             raise DriverError(f"{self._device}: subdevice {subdevice}: {reason}")
         return subdevice
 
     def channel_line(self, kind: Kind, subdevice: int, channel: int, range_v: tuple[float, float], aref: str) -> tuple:
         """Return a channel's address and scale: subdevice, channel, range, aref, lowest_v, lsb_v, highest code.
 
-        Raises DriverError for a channel or a range in V that the board does not have.
+        Range and aref are libcomedi's numbers. Raises DriverError for a channel or a `range_v` (lowest and highest V)
+        that the board does not have.
         """
         name, count = f"{kind.prefix}{channel}", self._library.comedi_get_n_channels(self._handle, subdevice)
         if channel >= count:

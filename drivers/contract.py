@@ -98,7 +98,7 @@ class DriverContract:
         assert self.outputs(driver) == before, "reading the facts moved the outputs; facts must not touch the hardware"
 
     def test_a_configuration_can_name_it(self) -> None:
-        """`kind` is a name, equal to its entry point's name, and the options are of `options_model`."""
+        """`kind` is a text, equal to the name of its entry point if it has one; the options are of `options_model`."""
         driver = self.driver()
         place = f"{type(driver).__module__}:{type(driver).__qualname__}"
         names = [kind for kind, location in kinds().items() if location == place]
@@ -142,9 +142,10 @@ class DriverContract:
             driver.close()
 
     def test_open_says_where_the_outputs_are(self) -> None:
-        """`outputs_v` gives the outputs after `open`: unchanged if the card can read them back, else safe.
+        """`outputs_v` gives the volts at the outputs after `open`, or None for outputs that `open` has not moved.
 
-        Parking ramps from these values: a wrong one becomes a step. A card that parks itself may be in a ramp.
+        `open` leaves each output as it was or makes it safe. Parking ramps from the values of `outputs_v`: a wrong one
+        becomes a step. For a card with a watchdog, which may be in a ramp, the outputs themselves are not compared.
         """
         driver = self.driver()
         before_v = self.outputs(driver)

@@ -17,7 +17,7 @@ TIMING_COLUMNS = 4
 
 @cfunc(SIGNATURE)
 def playback_wait(context, timing):
-    """Fill `timing` with deadline, wake, missed periods and now of the next row; return 0.
+    """Fill `timing` with deadline and wake (ns), missed periods and now (ns) of the next row; return 0.
 
     After the last row return EXHAUSTED, which ends the run.
     """
@@ -33,7 +33,10 @@ def playback_wait(context, timing):
 
 @cfunc(SIGNATURE)
 def playback_read(context, values):
-    """Fill `values` from the row of the last `playback_wait`, go to the next row, and return the recorded status."""
+    """Fill `values` with inputs (V), age (µs) and observed signals of the row of the last `playback_wait`.
+
+    Goes to the next row, and returns the recorded status of the read.
+    """
     tape = carray(context, 1, CONTEXT)[0]
     data = carray(address_pointer(tape.address), (tape.rows, tape.columns), np.float64)
     first = TIMING_COLUMNS + 1
@@ -47,7 +50,7 @@ def playback_read(context, values):
 
 @cfunc(SIGNATURE)
 def playback_write(context, values):
-    """Return −1 if the recorded write of this tick failed, else 0; the caller compares `values` with the recording."""
+    """Return −1 if the recorded write of this tick failed, else 0. `values`, the loop's drives, are ignored."""
     tape = carray(context, 1, CONTEXT)[0]
     if tape.refusals == 0:
         return 0
@@ -67,9 +70,8 @@ class Playback:
     def load(self, rows: npt.NDArray[np.float64], refused_writes: npt.NDArray[np.bool_] | None = None) -> None:
         """Play `rows` (n, TIMING_COLUMNS + 1 + inputs + 1 + observed) from the first, in place of those loaded before.
 
-        Columns: deadline, wake, missed periods, now; status of the read; inputs in V, age in µs, observed signals.
-
-        `refused_writes` (n,) is True where the recorded write failed; None if none did.
+        Columns: deadline and wake in ns, number of missed periods, now in ns; status of the read; inputs in V, age in
+        µs, observed signals. `refused_writes` (n,) is True where the recorded write failed; None if none did.
         """
         self._rows = np.ascontiguousarray(rows, dtype=np.float64)
         self._refused_writes = None if refused_writes is None else np.ascontiguousarray(refused_writes)

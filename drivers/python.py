@@ -69,8 +69,8 @@ class PythonDriver(Driver):
                 row = (*self.read(), self.sample_age_us, *self.observe())
                 if len(row) != value_count:
                     raise ValueError(
-                        f"driver {self.kind!r}: read and observe gave {len(row)} numbers with the age; its facts need "
-                        f"{value_count}"
+                        f"driver {self.kind!r}: read and observe gave {len(row)} numbers, the age included; allowed: "
+                        f"{value_count}, one for each input and observed signal of its facts, and the age"
                     )
                 for i, value in enumerate(row):
                     values[i] = value
@@ -101,7 +101,7 @@ class PythonDriver(Driver):
     def close(self) -> None:
         """Write the safe values, then call `stop`; if the driver is not open, do nothing.
 
-        Raises DriverError, after `stop`, if `write` raises.
+        Raises DriverError, after `stop`, if `write` raises; errors of `stop` pass through.
         """
         if self._callbacks:
             self._callbacks = ()

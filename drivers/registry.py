@@ -19,9 +19,9 @@ BUILT_IN = {
 
 
 def kinds() -> dict[str, str]:
-    """Return "module:class" of every driver by its kind, built-in and installed, in the order of the kinds.
+    """Return "module:class" of every driver, built-in and installed, by its kind, sorted by kind.
 
-    A third party cannot replace a built-in kind.
+    An installed driver cannot replace a built-in one.
     """
     from importlib.metadata import entry_points  # Only a driver that is not built in needs it.
 

@@ -66,7 +66,8 @@ class SimDriver(Driver):
     def __init__(self, options: RigOptions, wiring: Mapping[str, Wiring], rate_hz: float) -> None:
         """Build the rig, at rest at 0 V.
 
-        Raises ValueError for a wiring that does not match the rig, and for options that no rig fits.
+        Raises ValueError if an axis does not use `adc<i>` with `dac<i>`, if two axes use the same plant, and as
+        `build_rig` for the options.
         """
         super().__init__(options, wiring, rate_hz)
         self._rig_options = options
@@ -99,7 +100,10 @@ class SimDriver(Driver):
 
     @property
     def facts(self) -> Facts:
-        """Properties of the driver: channel pairs of axes and loopback, with the ranges of the rig's converters."""
+        """Properties of the driver: channel pairs of the axes, with the ranges of their converters, then of loopback.
+
+        Observed are true position and hysteresis of each axis.
+        """
         axes = self._axes_by_plant()
         plants = [self._rig_options.plants.get(axis, self._rig_options.plant) for axis in axes]
         observed = tuple(f"{axis}_{name}" for axis in axes for name in ("true_position_um", "hysteresis_um"))

@@ -33,10 +33,10 @@ class RecordedMotion(NamedTuple):
 
 
 def fractions_of_period(coefficients: np.record, period_s: float, points: int) -> npt.NDArray[np.float64]:
-    """Return by how much each mode decays, and answers its input, until each of `points` places of a period.
+    """Return the factors that move each mode of an axis from a tick to `points` instants of the period after it.
 
-    Place i lies i/points of `period_s` after the tick. The array (modes, PARTS, points) has the real and the imaginary
-    part of the decay λᶠ, then those of (λᶠ − 1)/(λ − 1), the part of a whole period's answer to a constant input.
+    Instant i lies i/points of `period_s` after the tick. The array (modes, PARTS, points) has the real and imaginary
+    part of λᶠ, the factor of the mode's state, then those of (λᶠ − 1)/(λ − 1), the factor of its constant input.
     """
     count = coefficients.mode_count
     exponents = (coefficients.pole_real[:count] + 1j * coefficients.pole_imag[:count])[:, None] * period_s
@@ -63,8 +63,8 @@ def positions_between_ticks(
     modes, parts, points = factors.shape
     if axes != len(coefficients) or missed.shape != (ticks,) or not 0 <= axis < axes:
         raise ValueError(
-            f"{axes} axes, {missed.size} counts of missed periods, axis {axis}; allowed: {len(coefficients)} axes, "
-            f"{ticks} counts, an axis below {len(coefficients)}"
+            f"motion: {axes} axes, {missed.size} counts of missed periods, axis {axis}; allowed: {len(coefficients)} "
+            f"axes, {ticks} counts, an axis below {len(coefficients)}"
         )
     if (modes, parts) != (coefficients["mode_count"][axis], PARTS) or not factors.flags.c_contiguous:
         raise ValueError(f"factors: {factors.shape}; allowed: ({coefficients['mode_count'][axis]}, {PARTS}, points)")
@@ -103,7 +103,10 @@ def _fill_positions(
 
 @jit
 def _input_um(coefficients, state, displacements_um, axis):
-    """Return the input of the dynamics in a period, from the displacements of all axes, and advance the disturbance."""
+    """Return the input (µm) of the dynamics of axis `axis` in a period, and advance its disturbance by a period.
+
+    `displacements_um` (axes,) are those of all axes; the coupled ones count with their coupling.
+    """
     total_um = displacements_um[axis]
     for j in range(coefficients.coupled_count):
         total_um += coefficients.coupling[j] * displacements_um[j]
@@ -112,7 +115,10 @@ def _input_um(coefficients, state, displacements_um, axis):
 
 @jit
 def _fill_period(coefficients, state, factors, input_um, positions_um):
-    """Fill the true positions (points,) of one period from the modes at its tick; the inner loop is over points."""
+    """Fill `positions_um` (points,) with the true positions in a period of constant `input_um`; `state` stays.
+
+    The modes in `state` are those at the period's tick; `factors` are those of `fractions_of_period`.
+    """
     for j in range(positions_um.shape[0]):
         positions_um[j] = coefficients.true_direct * input_um
     for i in range(factors.shape[0]):

@@ -76,7 +76,10 @@ class BoardMemory:
     """Arrays over a board's file: `facts`, `words`, `sample_ns`, `adc_codes`, `evidence` (per channel) and `fifo`."""
 
     def __init__(self, fd: int) -> None:
-        """Map the file `fd` into memory. Raises ValueError for a file shorter than `file_bytes()`."""
+        """Map the file `fd` into memory; its contents stay.
+
+        Raises ValueError for a file shorter than `file_bytes()`, OSError if the system refuses.
+        """
         self._map = mmap.mmap(fd, file_bytes())
         offset = 0
         arrays = {}
@@ -135,7 +138,7 @@ def serve(
     """Run a board in the file `path` until `is_stopped()`, asked every SLICE_S; return the number of samples.
 
     The memory begins as zeros; `on_ready` is called before the first period. Raises ValueError for too many axes and
-    for options that no rig fits, BoardConflict if another board serves the file, OSError if it cannot be opened.
+    as `build_rig`, BoardConflict if another board serves the file, OSError if it cannot be opened.
     """
     if len(axes) > MAX_CHANNELS:
         raise ValueError(f"{len(axes)} axes; allowed: at most the {MAX_CHANNELS} channels of a board")
@@ -186,7 +189,7 @@ def lock_role(fd: int, byte: int) -> bool:
 
 @python_entry("int64(intp, int64, int64)")
 def advance_board(address, index, periods):
-    """Run `periods` periods of the clock of the RUNNING_BOARD at `address` from number `index` on; return the next one.
+    """Run `periods` periods of the board at `address` (RUNNING_BOARD), from number `index` on; return the next number.
 
     Each period sleeps until its time, samples the ADCs, examines the controller's writes and advances the rig. After a
     stall, periods follow one another without sleep until the rig has caught up.
@@ -259,7 +262,7 @@ def _record_position(evidence, state):
 
 @jit
 def _observe_outputs(words, fifo, evidence, levels, channels, follows, timespec):
-    """Examine all new writes and record the voltages at the outputs.
+    """Examine all new writes, store the time of this examination, and record the voltages at the outputs.
 
     Without `follows` the outputs are stuck: they keep their voltages.
     """

@@ -25,7 +25,10 @@ class FreeRunningRig:
         _advance(self._coefficients, self._state, self.drive_v, self.sample_v, 0)
 
     def advance_to(self, elapsed_s: float) -> None:
-        """Advance the rig to `elapsed_s` since its start with `drive_v` held; store readings in `sample_v`."""
+        """Advance the rig by whole periods to `elapsed_s` since its start with `drive_v` held.
+
+        Then store new readings, with new noise, in `sample_v`, also if no period has passed. `elapsed_s` never falls.
+        """
         index = int(elapsed_s * self._rate_hz)
         _advance(self._coefficients, self._state, self.drive_v, self.sample_v, index - self._index)
         self._index = index

@@ -54,8 +54,9 @@ STATE = np.dtype(
 def build_rig(options: RigOptions, axes: Sequence[str], period_s: float) -> tuple[np.recarray, np.recarray]:
     """Return coefficients and state, both (len(axes),), of a rig at rest at 0 V, with the memory of `history_v`.
 
-    Raises ValueError, naming axis and part: a bad period, repeated or unknown axes, a coupling that is not possible, a
-    part that cannot be discretised.
+    Raises ValueError, naming the axis and its part, for a period that is not finite or not above 0, repeated axes, an
+    axis in the options that is not one of `axes`, a coupling that is not possible, and a part, such as the dynamics,
+    that cannot be discretised at this period.
     """
     if not (math.isfinite(period_s) and period_s > 0):
         raise ValueError(f"period_s: {period_s} s; allowed: finite, above 0")
@@ -89,7 +90,7 @@ def build_rig(options: RigOptions, axes: Sequence[str], period_s: float) -> tupl
 
 
 def _fill_coupling(options: RigOptions, axes: Sequence[str], coefficients: np.recarray) -> None:
-    """Fill in the coupling of each axis, in µm per µm of each other axis.
+    """Fill in the coupling of each axis in `coefficients` (axes,), in µm per µm of each other axis.
 
     Raises ValueError for an unknown axis, for an axis coupled to itself, and for more than MAX_COUPLED axes.
     """
@@ -152,9 +153,10 @@ def _axis_coefficients(plant: PlantOptions, period_s: float) -> dict[str, object
 def _dynamics_coefficients(
     options: DynamicsOptions, sensor_bandwidth_hz: float | None, period_s: float
 ) -> dict[str, object]:
-    """Return the values of COEFFICIENTS that D(s) and the sensor's lag determine, by field; nobody may change them.
+    """Return the values of COEFFICIENTS that D(s) and the sensor's lag determine, by field.
 
-    Rigs with the same dynamics share them. Raises ValueError if D(s) cannot be discretised.
+    Rigs with the same dynamics share the returned dict, which must not be changed. Raises ValueError if D(s) cannot be
+    discretised.
     """
     modal = modal_sum(*zeros_poles_gain(options))
     return dynamics.discretise(dynamics.add_sensor_output(modal, sensor_bandwidth_hz), period_s)

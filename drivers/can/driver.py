@@ -162,7 +162,7 @@ class CanDriver(PythonDriver):
     def _await_node(self) -> None:
         """Send the safe values every RETRY_S until the node answers.
 
-        Raises DriverError if it does not within `wait_s`.
+        Raises DriverError if it does not within `wait_s`, and if another controller drives it.
         """
         deadline_s = time.monotonic() + self._options.wait_s
         while time.monotonic() < deadline_s:
@@ -179,7 +179,10 @@ class CanDriver(PythonDriver):
         self._send(0, [channel.safe_v for channel in self.facts.outputs])
 
     def _listen(self, duration_s: float) -> bool:
-        """Process frames until a new sample comes, for at most `duration_s`; return whether one came."""
+        """Process frames until a new sample comes, for at most `duration_s`; return whether one came.
+
+        Raises DriverError if another controller drives the node.
+        """
         deadline_s = time.monotonic() + duration_s
         while (remaining_s := deadline_s - time.monotonic()) > 0:
             message = self._receive(remaining_s)

@@ -61,7 +61,10 @@ class Frame:
         return self._struct.pack(*raw)
 
     def unpack(self, data: bytes | bytearray) -> list[float]:
-        """Return the physical values in `data`, in the order of the signals' bits."""
+        """Return the physical values in `data`, in the order of the signals' bits.
+
+        Raises struct.error for another number of bytes than `length`.
+        """
         raw = self._struct.unpack(data)
         return [number * scale + offset for number, (scale, offset, _, _) in zip(raw, self._scales, strict=True)]
 

@@ -32,7 +32,7 @@ class RigNode:
     def __init__(self, bus: can.BusABC, options: CanOptions, axes: Sequence[str]) -> None:
         """Build the rig at rest and compile it; nothing is sent.
 
-        Raises ValueError if rig, axes and DBC do not fit together.
+        Raises ValueError if rig, axes and DBC do not fit together, KeyError if the DBC has no frame Node.
         """
         self._bus, self._options = bus, options
         frames = load_frames(options)

@@ -72,7 +72,7 @@ SCALE = np.dtype(
 def make_card(
     fd: int, strangers_fd: int | None, **values: Any
 ) -> tuple[np.ndarray[Any, Any], dict[str, np.ndarray[Any, Any]]]:
-    """Return a record CARD with its arrays, which must live as long as it does.
+    """Return a record CARD, shape (1,), and by name the arrays at its addresses, which must live as long as it does.
 
     `fd` is connected to the node; `strangers_fd` is a socket of the same port for all others, None for a serial line.
     `values` are further fields; `in_scales` and `out_scales` are sequences of Scale.

@@ -8,7 +8,7 @@ LONGEST_CODE = 4096
 
 
 def encode(frame: bytes) -> bytes:
-    """Return the code of a frame, with the byte 0 at its end."""
+    """Return `frame` in COBS, with the byte 0 as its end."""
     coded = bytearray()
     for part in frame.split(b"\0"):
         while len(part) >= LONGEST_RUN:
@@ -19,7 +19,10 @@ def encode(frame: bytes) -> bytes:
 
 
 def decode(code: bytes) -> bytes | None:
-    """Return the frame of a code without its last byte 0; None if a run goes beyond the end."""
+    """Return the frame that `code` encodes, COBS without the byte 0 at its end.
+
+    None if `code` is malformed: a byte 0 begins a run, or a run goes beyond the end.
+    """
     frame, position = bytearray(), 0
     while position < len(code):
         run = code[position]
@@ -40,11 +43,17 @@ class FrameReader:
         self._bytes, self.broken, self._skips = bytearray(), 0, False
 
     def feed(self, data: bytes) -> None:
-        """Add received bytes; without an end for LONGEST_CODE bytes, they are discarded up to the next byte 0."""
+        """Add received bytes.
+
+        If more than LONGEST_CODE bytes have no byte 0, `next_frame` discards them and all up to the next byte 0.
+        """
         self._bytes += data
 
     def next_frame(self) -> bytes | None:
-        """Return the next whole frame; None until more bytes come."""
+        """Return the next whole frame, decoded; None if no further one is complete.
+
+        Malformed frames before it are left out and counted in `broken`.
+        """
         while (end := self._bytes.find(0)) >= 0:
             code = bytes(self._bytes[:end])
             del self._bytes[: end + 1]

@@ -64,7 +64,7 @@ class NodeDriver(Driver):
         )
 
     def _count(self, number: int | None) -> int:
-        """Return `number`, the number of axes if it is None."""
+        """Return `number`; if it is None, the number of axes, at least 1."""
         return number or max(len(self.wiring), 1)
 
     def _max_rate_hz(self, inputs: int, outputs: int) -> float:
@@ -80,8 +80,9 @@ class NodeDriver(Driver):
     def open(self) -> Pointers:
         """Open the line, compare the node with the options, and begin a session; its outputs ramp to safe values.
 
-        Raises DriverError, with the line closed, if no node answers within `wait_s`, if the node has other channels or
-        another version, if another controller drives it, and if the line fails.
+        Raises DriverError, with the line closed, if no node answers within `wait_s`, if the node has other channels,
+        ranges or safe values, another version, or a largest rate below the loop's, if another controller drives it, if
+        its outputs do not become safe in time, and if the line fails.
         """
         self._link = open_link(self._options)
         try:
@@ -94,7 +95,10 @@ class NodeDriver(Driver):
             raise
 
     def _open_node(self, link: Link) -> Pointers:
-        """Compare the node on an open line with the options, begin a session, and make the memory of the exchange."""
+        """Compare the node on an open line with the options, begin a session, and make the memory of the exchange.
+
+        Returns the pointers of `open`. Raises DriverError as `open`, and OSError if the line fails.
+        """
         options = self._options
         self._session = secrets.randbelow(frames.MAX_SESSION) + 1
         welcome = self._greet(link)
@@ -116,9 +120,8 @@ class NodeDriver(Driver):
     def measure_exchanges(self, count: int) -> Exchanges:
         """Open the node, whose outputs ramp to safe values, measure `count` exchanges at the tick rate, and close it.
 
-        An exchange waits for its answer for up to MEASURING_WAIT_S, with both values of the option `answer`, and is
-        counted as lost without it. Raises DriverError as
-        `open` does, and if the node ends the session.
+        Whatever the option `answer`, an exchange waits for its answer for up to MEASURING_WAIT_S, and is counted as
+        lost without it. Raises DriverError as `open` does, and if the node ends the session.
         """
         pointers, durations_us, lost = self.open(), list[float](), 0
         try:
@@ -262,7 +265,10 @@ class NodeDriver(Driver):
                 if answer.reason != frames.BUSY or time.monotonic() > start_s + BUSY_S:
                     raise DriverError(f"{self._options.label}: {failure_text(answer.reason)}")
                 time.sleep(RETRY_S)
-        raise DriverError(f"{self._options.label}: the node's outputs did not reach their safe values in time")
+        raise DriverError(
+            f"{self._options.label}: the node's outputs did not reach their safe values within "
+            f"{self._options.wait_s:g} s; check the node, or raise driver.wait_s"
+        )
 
     def _await_answer(self, link: Link, sequence: int, timeout_s: float) -> Sample | frames.Refusal | None:
         """Return the sample or refusal that answers this session's DRIVE `sequence`, None if none comes in time."""
@@ -276,9 +282,10 @@ class NodeDriver(Driver):
         return None
 
     def _park(self, link: Link, sequence: int) -> None:
-        """Send a PARK every CONFIRM_S until the node says that all outputs are safe, or that it has no such session.
+        """Send a PARK every CONFIRM_S until the node says that all outputs are safe, or refuses: the session has ended.
 
-        Raises DriverError if it does not answer within `wait_s`, or if its ramp takes longer than LONGEST_PARKING_S.
+        `sequence` is that of the last frame sent. Raises DriverError if the node does not answer within `wait_s`, or if
+        its ramp takes longer than LONGEST_PARKING_S, and OSError if the line fails.
         """
         start_s, heard_s = time.monotonic(), time.monotonic()
         codes = tuple(self._arrays["safe"].tolist())
@@ -297,7 +304,7 @@ class NodeDriver(Driver):
         raise DriverError(f"{self._options.label}: {UNCONFIRMED}")
 
     def _set_codes(self, codes: list[int]) -> None:
-        """Put the codes of the outputs into the frame that the first ticks send, and keep them for parking."""
+        """Write the codes of the outputs into the frame that the first ticks send, and store them for parking."""
         sent = self._arrays["sent"].view(np.uint8)[frames.DRIVE_HEAD :][: 4 * len(codes)]
         sent.view(np.int32)[:] = codes
         self._arrays["safe"] = np.array(codes, np.int32)

@@ -128,7 +128,7 @@ class Refusal(NamedTuple):
 
 
 def _frame(format_number: int, sequence: int, session: int, content: bytes) -> bytes:
-    """Return a frame with its header and check."""
+    """Return the bytes of a frame: header, `content`, CRC-32."""
     data = _HEADER.pack(MAGIC, format_number, BATCHES, sequence, session) + content
     return data + struct.pack("<I", zlib.crc32(data))
 
@@ -244,10 +244,10 @@ def _unpack_codes(data: bytes, start: int, count: int) -> tuple[int, ...] | None
 
 
 def drive_bytes(outputs: int) -> int:
-    """Return the length of a DRIVE with so many outputs."""
+    """Return the length in bytes of a DRIVE for `outputs` outputs."""
     return DRIVE_HEAD + 4 * outputs + CRC_BYTES
 
 
 def sample_bytes(inputs: int) -> int:
-    """Return the length of a SAMPLE with so many inputs."""
+    """Return the length in bytes of a SAMPLE of `inputs` inputs."""
     return SAMPLE_HEAD + 4 * inputs + CRC_BYTES

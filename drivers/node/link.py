@@ -42,7 +42,10 @@ class Link(ABC):
 
     @abstractmethod
     def receive(self, timeout_s: float) -> bytes | None:
-        """Return the next frame of the node, None if none comes within `timeout_s`. Raises OSError."""
+        """Return the next frame of the node, None if none comes within `timeout_s`.
+
+        Raises OSError if the line is broken.
+        """
 
     @abstractmethod
     def close(self) -> None:
@@ -105,7 +108,10 @@ class UdpLink(Link):
             self._socket.send(frame)
 
     def receive(self, timeout_s: float) -> bytes | None:
-        """Return the next datagram of the node's address, None if none comes within `timeout_s`."""
+        """Return the next datagram of the node's address, None if none comes within `timeout_s`.
+
+        Raises OSError if the socket fails; a node that does not listen yet is no failure.
+        """
         deadline_s = time.monotonic() + timeout_s
         while True:
             with contextlib.suppress(BlockingIOError, ConnectionRefusedError):  # Nobody listens there, perhaps yet.
@@ -126,7 +132,8 @@ class SerialLink(Link):
     def __init__(self, options: SerialOptions) -> None:
         """Open the terminal for raw bytes and discard received ones; a missing terminal may come within `wait_s`.
 
-        Raises DriverError if it cannot be opened, is no terminal, is locked by another program or lacks the rate.
+        Raises DriverError if it cannot be opened, is no terminal, or is locked by another program, and for a `baud`
+        that the system does not know.
         """
         deadline_s = time.monotonic() + options.wait_s
         while not os.path.exists(options.device) and time.monotonic() < deadline_s:
@@ -174,7 +181,10 @@ class SerialLink(Link):
 
 
 def open_link(options: NodeOptions) -> Link:
-    """Return an open line of the kind that the options describe. Raises DriverError as UdpLink and SerialLink do."""
+    """Return an open line of the kind that the options describe, UdpLink or SerialLink.
+
+    Raises DriverError as these do, TypeError for other options.
+    """
     if isinstance(options, UdpOptions):
         return UdpLink(options)
     if isinstance(options, SerialOptions):

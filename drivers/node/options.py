@@ -51,10 +51,14 @@ class NodeOptions(RigOptions):
 
     @model_validator(mode="after")
     def _check_ranges(self) -> Self:
-        """Require the lower end of each range before the higher, `safe_v` within `output_range_v`, and few channels."""
+        """Require the lower end of each range before the higher, `safe_v` within `output_range_v`, and no more than
+        MAX_CHANNELS inputs and outputs in all.
+        """
         require_ranges(self.input_range_v, self.output_range_v, self.safe_v)
         if (self.inputs or 1) + (self.outputs or 1) > MAX_CHANNELS:
-            raise ValueError(f"inputs, outputs: {self.inputs} and {self.outputs}; allowed: {MAX_CHANNELS} in all")
+            raise ValueError(
+                f"inputs, outputs: {self.inputs} and {self.outputs}; allowed: at most {MAX_CHANNELS} in all"
+            )
         return self
 
     @property

@@ -77,7 +77,10 @@ class TerminalPort(Port):
     """A pseudo-terminal with a link to it at `device`."""
 
     def __init__(self, options: SerialOptions) -> None:
-        """Make the terminal and the link. Raises DriverError if `device` is a file, or the link cannot be made."""
+        """Make the terminal and a link to it at `device`, in place of an older link.
+
+        Raises DriverError if `device` is a file, or the link cannot be made.
+        """
         self._fd, self._end = pty.openpty()  # The open end keeps the terminal while no loop has it open.
         tty.setraw(self._end)
         os.set_blocking(self._fd, False)
@@ -138,7 +141,10 @@ def _serial(options: NodeOptions) -> SerialOptions:
 
 
 def step(node: SimulatedNode, port: Port, start_s: float) -> None:
-    """Wait for a frame, at most IDLE_S or RAMP_S, and answer it; advance the node by its time since `start_s`."""
+    """Wait for a frame, at most IDLE_S, or RAMP_S in a ramp; advance the node to the present time and answer the frame.
+
+    `start_s` is the time of `time.monotonic` at which the node started.
+    """
     received = port.receive(RAMP_S if node.is_ramping else IDLE_S)
     now_us = (time.monotonic() - start_s) * US_PER_S
     if received is None:

@@ -62,7 +62,10 @@ class SimulatedNode:
         return all(code == scale.safe for scale, code in zip(self._outputs, self.codes, strict=True))
 
     def poll(self, now_us: float) -> None:
-        """Advance the rig to the time, end a session that its loop has left, and make a due step of a ramp."""
+        """Advance the rig to `now_us` since its start, and the outputs' ramp by a step if one is due.
+
+        A session without a DRIVE for its hold time is ended first, and the outputs begin to ramp to their safe codes.
+        """
         self._rig.advance_to(now_us / US_PER_S)
         if self._session and now_us - self._heard_us >= self._hold_us:
             self.watchdog_parkings += not self._is_safe
@@ -78,13 +81,17 @@ class SimulatedNode:
         self._set_outputs()
 
     def _begin_ramp(self, now_us: float) -> None:
-        """Set the digital outputs to 0, and let the others ramp to their safe codes, unless a ramp runs already."""
+        """Set the digital outputs to 0 and begin the ramp of the others to their safe codes; in a ramp, do nothing."""
         if not self.is_ramping:
             self.digital = self._applied = 0
             self.is_ramping, self._step_us = not self._is_safe, now_us + RAMP_STEP_US
 
     def receive(self, data: bytes, sender: Hashable, now_us: float) -> bytes | None:
-        """Process the bytes of a frame from an address at a time; return the answer to it, None without one."""
+        """Process the bytes of a frame that came from `sender` at `now_us`; return the bytes of the answer.
+
+        None without an answer: for bytes that are no frame for a node, counted in `invalid`, for a DRIVE that is not
+        newer than the last one, counted in `old`, and for a DRIVE that asks for none.
+        """
         self.poll(now_us)
         header = frames.read_header(data)
         if header is not None and header.format == frames.HELLO and (version := frames.read_hello(data)) is not None:
@@ -104,7 +111,10 @@ class SimulatedNode:
         return self._accept(content, sender, now_us)
 
     def _lack_of_access(self, content: Drive, sender: Hashable) -> int:
-        """Return why `sender` may not drive the node, judged by session, flags and address alone; 0 if it may."""
+        """Return the reason, a key of REFUSALS, for which `sender` may not drive the node now; 0 if it may.
+
+        Judged by session, flags and address alone.
+        """
         if self._session:
             return 0 if (content.session, sender) == (self._session, self._sender) else frames.BUSY
         if content.session == 0:
@@ -115,7 +125,10 @@ class SimulatedNode:
         return frames.WATCHDOG if content.session == self._ended else frames.UNKNOWN
 
     def _fault_of_content(self, content: Drive) -> int:
-        """Return the reason for which the content of a DRIVE is refused; 0 for none."""
+        """Return the reason, a key of REFUSALS, for which the content of a DRIVE is refused; 0 for none.
+
+        Refused are another number of outputs, codes out of range, no hold time, and contradictory flags.
+        """
         if len(content.codes) != len(self._outputs):
             return frames.SIZE
         if any(not s.lowest <= code <= s.highest for s, code in zip(self._outputs, content.codes, strict=True)):
@@ -130,7 +143,10 @@ class SimulatedNode:
         return 0 < step < HALF or (step == 0 and bool(content.flags & frames.OPEN))
 
     def _accept(self, content: Drive, sender: Hashable, now_us: float) -> bytes | None:
-        """Convert the inputs, obey the flags, and return the sample if the DRIVE asks for one."""
+        """Convert the inputs, then obey the flags of a DRIVE; return the bytes of the sample if it asks for one.
+
+        Else return None.
+        """
         codes, digital = self._read_inputs(), self.digital & ((1 << self._digital_counts[0]) - 1)
         if content.flags & frames.OPEN:
             self._session, self._sender = content.session, sender
@@ -150,7 +166,7 @@ class SimulatedNode:
         )
 
     def _obey(self, content: Drive, now_us: float) -> None:
-        """End the session if a DRIVE says PARK; set the outputs to its codes if it says APPLY and they may follow."""
+        """End the session and begin a ramp if a DRIVE says PARK; apply its codes if it says APPLY and no ramp runs."""
         if content.flags & frames.PARK:
             self._parked, self._session = (self._session, self._sender), 0
             self._ended = 0 if self._ended == self._parked[0] else self._ended
@@ -169,12 +185,12 @@ class SimulatedNode:
         ]
 
     def _set_outputs(self) -> None:
-        """Bring the rig's outputs to the volts of the codes."""
+        """Set the drives of the rig's axes to the volts of the outputs' codes."""
         count = min(len(self.codes), self._rig.drive_v.size)
         self._rig.drive_v[:count] = self.outputs_v[:count]
 
     def _refuse(self, header: frames.Header, reason: int) -> bytes:
-        """Count and return the refusal of a frame."""
+        """Return the bytes of the refusal of a frame with this header, for `reason`, a key of REFUSALS; count it."""
         self.refused += 1
         return frames.refusal(Refusal(header.sequence, header.session, self.boot, reason, frames.VERSION))
 
@@ -187,7 +203,10 @@ class SimulatedNode:
 
 
 def _scale(range_v: tuple[float, float], safe_v: float | None, change_v: float) -> Scale:
-    """Return a channel of CODE_BITS bits over a range in V; `change_v` is its change in 1 ms of a ramp."""
+    """Return a channel of CODE_BITS bits over a range in V; `change_v` is its change in 1 ms of a ramp.
+
+    `safe_v` is None for an input, whose safe code and change are 0.
+    """
     lowest_v, highest_v = range_v
     volts_per_code = (highest_v - lowest_v) / (2**CODE_BITS - 1)
     half = 2 ** (CODE_BITS - 1)

@@ -21,7 +21,10 @@ COBS_RUN = 254
 
 
 def _library_call(name: str, result: Any, *types: Any) -> Callable[..., Any]:
-    """Return a Python function that calls the C library's function `name`, for kernels that run uncompiled."""
+    """Return a Python function that calls the C library's function `name`, for kernels that run uncompiled.
+
+    `result` and `types` are the ctypes types of its result and its arguments.
+    """
 
     def call(*arguments: Any) -> Any:
         """Call the C function with integers and return its result."""
@@ -33,7 +36,7 @@ def _library_call(name: str, result: Any, *types: Any) -> Callable[..., Any]:
 
 
 def _errno_address_in_python() -> int:
-    """Return the address of a copy of the number of the last error of `_library_call`."""
+    """Copy the errno of the last call through `_library_call`; return the address of this copy, an int32."""
     _errno_copy.value = ctypes.get_errno()
     return ctypes.addressof(_errno_copy)
 
@@ -65,7 +68,10 @@ def send_frame(card, length):
 
 @jit
 def receive_frame(card):
-    """Copy the next frame to `card.received` and return its length, else EMPTY, BROKEN or GONE; never wait."""
+    """Copy the next frame to `card.received` and return its length; never wait.
+
+    Returns EMPTY if no frame has come, BROKEN for bytes that are no frame, GONE if the serial line has ended.
+    """
     if card.is_serial == 0:
         return _receive_datagram(card)
     return _receive_line(card)
@@ -73,7 +79,10 @@ def receive_frame(card):
 
 @jit
 def _receive_datagram(card):
-    """Receive a datagram from the node; see `receive_frame`. A datagram that is longer than any frame is BROKEN."""
+    """Receive a datagram from the node; return its length as `receive_frame` does.
+
+    EMPTY also for an error of the socket, BROKEN for a datagram that is longer than any frame.
+    """
     length = _recv(card.fd, card.received, ROOM_BYTES, MSG_DONTWAIT)
     if length < 0:
         return EMPTY
@@ -82,9 +91,9 @@ def _receive_datagram(card):
 
 @jit_rare
 def take_strangers(card, largest):
-    """Receive what other senders than the node have sent to the loop's port; return the number of datagrams.
+    """Receive, and discard, datagrams of senders other than the node at the loop's port; return their number.
 
-    Takes at most `largest`. The bytes go to `card.received`, whose frame is lost. A serial line has no strangers.
+    Takes at most `largest` datagrams. They overwrite the frame at `card.received`. Returns 0 on a serial line.
     """
     count = 0
     while count < largest and card.is_serial == 0:

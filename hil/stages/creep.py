@@ -24,7 +24,7 @@ STATE = [("lags_um", "f8", (MAX_LAGS,))]
 
 
 def discretise(gains: Sequence[float], time_constants_s: Sequence[float], period_s: float) -> dict[str, object]:
-    """Return the kernel's coefficients by field.
+    """Return the values of COEFFICIENTS by name for lags c_i, τ_i: `gains` and as many `time_constants_s`.
 
     A lag with the time constant τ approaches its input, in each period T, by its `lag_shares` = 1 − exp(−T/τ) of the
     difference.

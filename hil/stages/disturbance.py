@@ -21,7 +21,11 @@ STATE = [("disturbance_um", "f8"), ("disturbance_wait", "i8"), ("sine_um", "f8")
 
 
 def discretise(step_um: float, sine_um: float, sine_hz: float, period_s: float) -> dict[str, object]:
-    """Return the kernel's coefficients by field. Raises ValueError for a sine at or above half the sampling rate."""
+    """Return the values of COEFFICIENTS by name.
+
+    The amplitude `sine_um` is not among them, but the initial `cosine_um` of STATE; unless it is 0, ValueError is
+    raised for a `sine_hz` of half the sampling rate or more.
+    """
     if sine_um and sine_hz >= 0.5 / period_s:
         raise ValueError(f"sine_hz: {sine_hz:g} Hz; allowed: less than {0.5 / period_s:g} Hz, half the rate")
     angle = 2 * math.pi * sine_hz * period_s
@@ -36,7 +40,7 @@ def discretise(step_um: float, sine_um: float, sine_hz: float, period_s: float) 
 def step(coefficients, state):
     """Return the disturbance [µm] for the period that begins, and advance the sine.
 
-    While `disturbance_wait` is above 0 it counts down, and the disturbance is `disturbance_um` alone.
+    While `disturbance_wait` is above 0, a call counts it down by one and returns `disturbance_um` alone.
     """
     if state.disturbance_wait > 0:
         state.disturbance_wait -= 1

@@ -59,7 +59,10 @@ STATE = [
 
 
 def roots_of_factors(factors: Iterable[Sequence[float]]) -> tuple[npt.NDArray[np.complex128], float]:
-    """Return the roots of a product of factors of degree 0 to 2 (highest power first), and its leading coefficient."""
+    """Return the roots (n,) of a product of polynomials of degree 0 to 2, and the product's leading coefficient.
+
+    Each of `factors` has its coefficients with the highest power first.
+    """
     roots: list[complex] = []
     leading = 1.0
     for factor in factors:
@@ -136,9 +139,10 @@ def add_sensor_output(modal: ModalSystem, bandwidth_hz: float | None) -> ModalSy
 
 
 def discretise(modal: ModalSystem, period_s: float) -> dict[str, object]:
-    """Return the kernel's coefficients by field of a system in s with two outputs, for an input held over each period.
+    """Return the values of COEFFICIENTS by name for `modal`, a system in s, with its input held over each period.
 
-    Raises ValueError for more than MAX_MODES modes, and where a coefficient overflows at this period.
+    Its two outputs are the true and the sensed position. Raises ValueError for more than MAX_MODES modes, and where a
+    coefficient overflows at this period.
     """
     with np.errstate(over="ignore", invalid="ignore"):
         discrete = modal.zero_order_hold(period_s)
@@ -179,7 +183,8 @@ def settle(coefficients: np.record, state: np.record, input_um: float) -> None:
 def observe(coefficients, state):
     """Return true and sensed position [µm] at this instant, with the input of the period that ends here.
 
-    Calls change no mode. Four modes are summed at a time, as in `hysteresis`; the weights beyond the last mode are 0.
+    The modes in `state` stay; only the partial sums change. Four modes are summed at a time, as in `hysteresis`; the
+    weights beyond the last mode are 0.
     """
     real, imag = state.modes_real, state.modes_imag
     t_real, t_imag, s_real, s_imag = (

@@ -17,7 +17,11 @@ STATE = [("fault_wait", "i8"), ("fault_reading_v", "f8")]
 
 @jit
 def change_reading(coefficients, state, reading_v):
-    """Return the reading [V] that the controller gets: before the fault `reading_v`, then the last one, or 0 V."""
+    """Return the reading [V] that the controller gets in place of `reading_v`.
+
+    Until the fault begins, and with a lost drive, it is `reading_v`; then the last reading before the fault if the
+    sensor is stuck, 0 V if it is lost.
+    """
     if state.fault_wait > 0:
         state.fault_reading_v = reading_v
         return reading_v
@@ -30,7 +34,10 @@ def change_reading(coefficients, state, reading_v):
 
 @jit
 def change_drive(coefficients, state, drive_v):
-    """Return the voltage [V] at the actuator in the period that begins, 0 V after a lost drive; count the periods."""
+    """Return the voltage [V] at the actuator in the period that begins: `drive_v`, 0 V once the drive is lost.
+
+    Each call counts `fault_wait`, the periods until the fault begins, down by one.
+    """
     if state.fault_wait > 0:
         state.fault_wait -= 1
         return drive_v

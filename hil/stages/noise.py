@@ -45,7 +45,7 @@ def next_word(word):
 
 @jit
 def draw_normal(word):
-    """Return a random number of mean 0 and variance 1, and the generator's next state, a uint64."""
+    """Return a random number of mean 0 and variance 1, and the generator's state after the state `word`, a uint64."""
     lanes = _ZERO
     for _ in range(3):
         word = next_word(word)

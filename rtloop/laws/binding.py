@@ -30,7 +30,7 @@ RETURNS_NOTHING = "No conversion from none to float64"
 def bind_functions(laws: Sequence[LawReference]) -> npt.NDArray[Any]:
     """Return the FUNCTIONS records of these laws, in their order, compiled or loaded from the cache.
 
-    Raises ValueError for a law that cannot be compiled or calls a forbidden function.
+    Raises ValueError for a law that cannot be compiled or calls a forbidden function, and as `law_class` does.
     """
     return np.concatenate([np.zeros(0, FUNCTIONS), *map(_bind_law, laws)])
 
@@ -66,7 +66,7 @@ def function_signatures(law: type[Law], law_records: LawRecords) -> dict[str, An
 
 
 def function_names(law: type[Law]) -> list[str]:
-    """Return the names of the functions that a law defines, among `output`, `update` and `enter`."""
+    """Return "output", "update" and, if the law defines it, "enter"."""
     return [name for name in ("output", "update", "enter") if getattr(law, name) is not None]
 
 

@@ -100,7 +100,10 @@ class Law(ABC):
 
     @classmethod
     def records(cls, axes: int = 0) -> LawRecords:
-        """Return the types of the law's coefficients and state; `axes` is used if the class leaves the number open."""
+        """Return the types of the law's coefficients and state, with their allowed values, for a law of `axes` axes.
+
+        0 stands for the number of the class. Raises TypeError as `record_type` does.
+        """
         return LawRecords(
             cls.kind, axes or cls.axes, record_type(cls.coefficients), record_type(cls.state), cls.allowed_coefficients,
             cls.allowed_state,
@@ -170,7 +173,9 @@ class Feedforward(Law):
 
 
 def record_type(fields: Fields | np.dtype[Any]) -> np.dtype[Any]:
-    """Return a dtype unchanged; for a dict, a record padded to whole cache lines, largest fields first.
+    """Return a dtype unchanged; for a dict of names and types, a record padded to whole cache lines.
+
+    The record's fields are in the order of their number of elements, largest first.
 
     Raises TypeError for anything else, and for a type other than float, int, or (type, length) or (type, shape).
     """
@@ -233,7 +238,7 @@ def build_record(law: Law) -> Any:
 
 
 def _build_location(law: Law) -> str:
-    """Return file, line and name of a law's `build`, for a message."""
+    """Return the beginning of a message about a law's `build`: "controller" or "feedforward", file and line."""
     code = type(law).build.__code__
     part = "feedforward" if isinstance(law, Feedforward) else "controller"
     return f"{part}: {Path(code.co_filename).name}, line {code.co_firstlineno}: build"

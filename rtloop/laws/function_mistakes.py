@@ -107,7 +107,10 @@ def _wrong_fields(function: ast.FunctionDef, parameters: Mapping[str, _Parameter
 def _unknown_names(
     function: ast.FunctionDef, parameters: Collection[str], names: Mapping[str, Any]
 ) -> Iterator[Mistake]:
-    """Yield a mistake for each name that is undefined or may wait."""
+    """Yield a mistake for each name that is undefined, and for each builtin function that may wait.
+
+    Defined are the function's `parameters` and own variables, the `names` of its module, and Python's builtins.
+    """
     nodes = [node for node in ast.walk(function) if isinstance(node, ast.Name)]
     local_names = {*parameters, *(node.id for node in nodes if not isinstance(node.ctx, ast.Load))}
     for node in nodes:
@@ -121,9 +124,9 @@ def _unknown_names(
 
 
 def _wrong_returns(function: ast.FunctionDef, law: type[Law]) -> Iterator[Mistake]:
-    """Yield a mistake for a missing `return` with a value, and for a value where none is expected.
+    """Yield a mistake for a function that must return a number and has no `return` with a value, and vice versa.
 
-    `output` returns one, except of a coupled controller; `update` of a feedforward does; all others return nothing.
+    `output` must, except of a coupled controller, and `update` of a feedforward; all others return nothing.
     """
     nodes = list(ast.walk(function))
     values = [node for node in nodes if isinstance(node, ast.Return) and node.value is not None]

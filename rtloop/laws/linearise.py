@@ -122,7 +122,11 @@ class _Tick:
         self._signals = control_dtype(law.count)
 
     def __call__(self, states: Real, errors_um: Real) -> Real:
-        """Run one tick from `states` (n,) at rest and `errors_um` (m,); return next states, then commands (n + m,)."""
+        """Run one tick and return the next states, then the commands (n + m,).
+
+        The tick begins with the values `states` (n,) of all fields of type float, in the order of the record; other
+        states are 0. The reference is 0, the positions are −`errors_um` (m,).
+        """
         self._state.view(np.uint8)[:] = 0
         offset = 0
         for name in self._fields:

@@ -37,9 +37,9 @@ def find_mistakes(text: str, names: Mapping[str, Any]) -> Iterator[Mistake]:
 
 
 def missing_law(text: str, names: Mapping[str, Any]) -> Mistake | None:
-    """Return why the first class that resembles a law is none: a function or the base is missing.
+    """Return the mistake for which the first class that resembles a law is none: a function or the base is missing.
 
-    None if no class resembles one.
+    `names` are the names that the text defines when it runs. None if no class resembles a law.
     """
     for node, law in _classes(text, names):
         functions = {item.name: item.lineno for item in node.body if isinstance(item, ast.FunctionDef)}
@@ -53,7 +53,7 @@ def missing_law(text: str, names: Mapping[str, Any]) -> Mistake | None:
 
 
 def _classes(text: str, names: Mapping[str, Any]) -> Iterator[tuple[ast.ClassDef, Any]]:
-    """Yield each class of a text with the object that its name stands for."""
+    """Yield each class at the top level of a text with the object of its name in `names`, None if it is absent."""
     for node in ast.parse(text).body:
         if isinstance(node, ast.ClassDef):
             yield node, names.get(node.name)

@@ -38,7 +38,10 @@ class LawOptions(Options):
         self._law = law
 
     def __reduce_ex__(self, protocol: Any) -> Any:
-        """Pickle the law and the values of a user law: another process first has to run the text with its model."""
+        """Pickle the options of a user law as `LawReference` and values, those of other laws as usual.
+
+        Another process must first run the law's text, which defines the class of the options.
+        """
         if self._law is None or not self._law.text:
             return super().__reduce_ex__(protocol)
         return self._law.restore_options, (self.model_dump(exclude_unset=True),)

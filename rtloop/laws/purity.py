@@ -26,7 +26,10 @@ _LIBRARY = _MATHEMATICS | {
 
 
 def foreign_calls(kernel: Any, signature: Any, libm: bool = False) -> dict[str, str]:
-    """Return the forbidden calls of a compiled kernel, from name to reason; `libm` allows the mathematical library."""
+    """Return the reason for each forbidden call of a kernel compiled for `signature`, by the called function's name.
+
+    {} if there is none; `libm` allows the mathematical library.
+    """
     overload = kernel.overloads[signature.args]
     text = overload.library.get_llvm_str()
     bodies = {match.group(1): match.group(0) for match in _DEFINED.finditer(text)}

@@ -56,7 +56,7 @@ class LawReference:
     def restore_options(self, values: dict[str, Any]) -> LawOptions:
         """Return the law's options with `values`, bound to this law.
 
-        Raises ValueError for values that are not allowed.
+        Raises ValueError for values that are not allowed, and as `law_class` does.
         """
         options = law_class(self).options_model.model_validate(values)
         options.bind(self)
@@ -64,9 +64,9 @@ class LawReference:
 
 
 def kinds() -> dict[str, str]:
-    """Return "module:class" of every known kind, built-in and installed, in the order of the kinds.
+    """Return "module:class" of every law, shipped and installed, by its kind, sorted by kind.
 
-    A third party cannot replace a built-in kind.
+    An installed law cannot replace a shipped one.
     """
     from importlib.metadata import entry_points  # Only a law that is not shipped needs it.
 
@@ -130,7 +130,8 @@ def law_from_text(text: str, file: str, kind: str | None = None) -> LawReference
 def law_class(law: LawReference) -> type[Law]:
     """Return the class of a law; its text is run once in a process, one that fails at each call.
 
-    Raises ValueError if the text cannot be run or has a mistake, KeyError if it does not define this kind.
+    Raises ValueError if the text cannot be run or has a mistake, KeyError if it does not define this kind, or for a law
+    without a text that is not shipped.
     """
     if law.text:
         announce(law.kind, law.file)

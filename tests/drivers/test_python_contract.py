@@ -92,7 +92,10 @@ def test_an_output_outside_its_range_is_refused_with_a_message(volts):
 def test_a_wrong_number_of_inputs_is_refused_with_a_message():
     driver, calls = opened(MUTANTS["ForgetsAnInput"]())
     assert calls.read()[0] == -1
-    assert str(driver.error) == "driver 'loopback': read and observe gave 3 numbers with the age; its facts need 4"
+    assert str(driver.error) == (
+        "driver 'loopback': read and observe gave 3 numbers, the age included; allowed: 4, one for each input and "
+        "observed signal of its facts, and the age"
+    )
 
 
 def test_an_output_that_cannot_be_parked_is_an_error():

@@ -41,7 +41,11 @@ def try_limited(source: str, function: Callable[..., Any], *arguments: Any) -> N
 
 
 def _run_for_source(source: str, run: Callable[..., Any], function: Callable[..., Any], *arguments: Any) -> Any:
-    """Call `run`; its ConfigError, and AbandonedJob caused by a law, become ConfigError of `source`."""
+    """Return `run(function, *arguments)`; its ConfigError, and AbandonedJob caused by a law, become ConfigError of
+    `source`.
+
+    Other errors, also AbandonedJob without a law, pass through.
+    """
     try:
         return run(function, *arguments)
     except ConfigError as error:

@@ -98,8 +98,8 @@ class Worker:
     def _failure(self, error: BaseException) -> tuple[str, Any]:
         """Return the answer for an error: "faults" (source, faults), "driver" or "error" with the message.
 
-        An error foreign to rtloop counts as the law's if a law was announced. Raises `error` again if it is neither,
-        unless it is arithmetic.
+        An error of another class is a fault of the law if a law was announced. Without a law, an ArithmeticError is a
+        fault of the configuration, and any other error is raised again.
         """
         match error:
             case ConfigError():

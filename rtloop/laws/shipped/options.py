@@ -42,7 +42,10 @@ class PrandtlIshlinskiiOptions(FeedforwardOptions):
         return self
 
     def actuator(self) -> PlayModel:
-        """Return the identified forward model, with its dead band; the inverse's inverse if only that is set."""
+        """Return the identified forward model, with its dead band.
+
+        If the options have an inverse in its place, return the forward model that this inverse compensates.
+        """
         if self.thresholds_v:
             return PlayModel(np.array(self.thresholds_v), np.array(self.weights_um_per_v))
         return self.models()[0]

@@ -95,7 +95,10 @@ def advance(c, s, told):
 
 @jit_inline
 def _next_pair(c, s, i, error_um, shortfall_um):
-    """Return states i and i + LANES after a tick, without `coupling`."""
+    """Return states i and i + LANES after a tick, without the part of the matrix `coupling`; the states stay.
+
+    `shortfall_um` is tracking_share · (v_applied − v).
+    """
     j = i + LANES
     first = s.controller[i] + c.tracking[i] * shortfall_um
     second = s.controller[j] + c.tracking[j] * shortfall_um
@@ -186,7 +189,7 @@ class TransferController(Controller):
 
 
 def _reorder(values: npt.NDArray[np.float64], places: npt.NDArray[np.int64]) -> npt.NDArray[np.float64]:
-    """Return a vector (MAX_ORDER,) with each value at its place and 0 elsewhere."""
+    """Return a vector (MAX_ORDER,) with values[i] at index places[i] and 0 elsewhere."""
     vector = np.zeros(MAX_ORDER)
     vector[places] = values
     return vector
