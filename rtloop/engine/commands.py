@@ -239,7 +239,7 @@ def _load_axis(law, a, staged):
 
 @jit_rare
 def publish_event(loop, kind, axis, origin, identity, values):
-    """Publish an event of this tick with its first values, at most MESSAGE_VALUES; the other values are 0."""
+    """Publish an event of this tick; its values are `values`, at most MESSAGE_VALUES, and then zeros."""
     ring, position = event_ring(loop), np.uint64(loop.events)
     event = ring.slots[claim(ring, position)]
     event.tick = loop.tick

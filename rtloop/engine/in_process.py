@@ -40,11 +40,12 @@ class LoopsInProcess:
         self._law: _LawAtRest | None = None
 
     def run(self, plan: Plan, driver: Driver, ticks: int, consume: Callable[[int, Real], None]) -> int:
-        """Run `ticks` of a plan on a driver, which is not open and is closed at the end; return the ticks that ran.
+        """Run `ticks` of a plan on a driver, which is not open yet; return the number of ticks that ran.
 
-        `consume` is called with the number of the first tick and the records, (n, columns) in the order of
-        `plan.columns`; they are overwritten afterwards. Raises ValueError for a law that cannot be compiled and for a
-        channel that the driver lacks, DriverError if the driver cannot be opened.
+        `consume` is called for each full ring of ticks, and at the end, with the number of the first tick and the
+        records, (n, columns) in the order of `plan.columns`; they are overwritten afterwards. At the end the driver is
+        closed, but not after an error. Raises ValueError for a law that cannot be compiled and for a channel that the
+        driver lacks, DriverError if the driver cannot be opened or closed, and what `consume` raises.
         """
         block = self._empty_block(plan.sizes._replace(rate_hz=SMALLEST_RING_RATE_HZ))
         ring, facts, pointers = block.ring("ticks"), driver.facts, driver.open()
@@ -84,7 +85,7 @@ class LoopsInProcess:
 
 
 def run_in_process(plan: Plan, driver: Driver, ticks: int) -> Real:
-    """Run `ticks` of a plan on a driver, which is not open and is closed at the end.
+    """Run `ticks` of a plan on a driver, which is not open yet and is closed at the end, unless an error is raised.
 
     Returns all recorded columns (ticks, columns) in the order of `plan.columns`; fewer rows if the loop ends earlier.
     Raises the errors of `LoopsInProcess.run`.
@@ -92,7 +93,7 @@ def run_in_process(plan: Plan, driver: Driver, ticks: int) -> Real:
     records = np.empty((ticks, len(plan.columns)))
 
     def store(first: int, rows: Real) -> None:
-        """Copy the rows of some ticks."""
+        """Copy `rows`, the records of ticks from number `first` on, to `records`."""
         records[first : first + len(rows)] = rows
 
     return records[: LoopsInProcess().run(plan, driver, ticks, store)]

@@ -53,7 +53,8 @@ def report(kind: str, **facts: Any) -> None:
 def main() -> int:
     """Run the plan that comes on stdin; return the exit code of the command line. Ignores SIGINT and SIGTERM.
 
-    Without a plan it returns 0. The driver is closed before the state in the shared block becomes FINISHED or FAILED.
+    Without a plan it returns 0. DriverError and RtloopError are reported on stdout; errors of other classes pass
+    through. In any case the driver is closed before the state in the shared block becomes FINISHED or FAILED.
     """
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, signal.SIG_IGN)

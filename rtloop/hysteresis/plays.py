@@ -73,7 +73,10 @@ def loading_curve(model: PlayModel, drive: npt.ArrayLike) -> Real:
 
 
 def _reversals(u: Real) -> npt.NDArray[np.intp]:
-    """Return indices of the samples after which the drive changes direction; of a constant stretch, the last sample."""
+    """Return the indices of the samples after which the drive `u` changes direction.
+
+    Of several equal samples in succession, it is the last one.
+    """
     steps = np.flatnonzero(np.diff(u))
     directions = np.sign(np.diff(u)[steps])
     return steps[1:][directions[1:] != directions[:-1]]

@@ -57,10 +57,10 @@ TURN = 2.0 * math.pi
 
 @jit_checked
 def reference_sample(generator, tick, period_s, table, inputs):
-    """Return the reference of one axis at `tick`, in µm (V for mode raw), and set `generator.feed_um`.
+    """Return the reference of one axis at `tick`, in µm (V for mode raw).
 
-    `table` (n,) has the samples of all tables, `inputs` readings in V. `generator.feed_um` is the addition to the
-    command in µm. An index outside `table` or `inputs` raises IndexError.
+    Generator.TABLE also sets `generator.feed_um`, the addition to the command in µm; all other kinds leave it. `table`
+    (n,) has the samples of all tables, `inputs` readings in V. An index outside `table` or `inputs` raises IndexError.
     """
     if tick < generator.held_until:
         return generator.held
@@ -88,7 +88,9 @@ def reference_sample(generator, tick, period_s, table, inputs):
 
 @jit_checked
 def _table_index(index, count, repeat):
-    """Return the index within a table of `count` samples: modulo `count` if `repeat`, else at most the last."""
+    """Return the index, within a table of `count` samples, of sample `index`: modulo `count` if `repeat`, else at most
+    count − 1.
+    """
     if repeat:
         return index % count
     return index if index < count else count - 1

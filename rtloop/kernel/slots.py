@@ -74,7 +74,8 @@ def controller_output(law, a, coefficients, control_address):
     """Compute the output of the controller whose first axis is `a`. Returns (succeeded, command in µm).
 
     `control_address` is `law.controls` for a controller of one axis, `law.together` for a coupled one, which writes its
-    commands there. A law that raised is recorded in the axis's state: (False, NaN).
+    commands there; the number returned is then meaningless. A law that raised is recorded in the axis's state: (False,
+    NaN).
     """
     status = _call_controller(law, a, law_functions(law, coefficients.controller_law).output, control_address)
     if status in (OK, NONE):

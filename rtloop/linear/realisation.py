@@ -38,7 +38,7 @@ class System(NamedTuple):
         return self.d + self.states(complex_points) @ self.c
 
     def states(self, complex_points: npt.ArrayLike) -> Complex:
-        """Return (xI − A)⁻¹ b at complex points (k,), shape (k, n)."""
+        """Return (xI − A)⁻¹ b at complex points (k,), shape (k, n). Raises LinAlgError at an eigenvalue of A."""
         points = np.atleast_1d(np.asarray(complex_points, dtype=complex))
         pencil = points[:, None, None] * np.eye(self.b.size) - self.a
         inputs = np.broadcast_to(self.b[:, None].astype(complex), (points.size, self.b.size, 1))

@@ -36,7 +36,7 @@ def load_acquire(compiler: Any, array: Any, index: Any) -> Any:
         return None
 
     def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        """Emit the LLVM code of a call and return its value; numba defines the parameters."""
+        """Emit the LLVM code of the load and return its value; numba defines the parameters."""
         pointer = _element_pointer(compiler, context, builder, signature.args[0], arguments[0], arguments[1])
         return builder.load_atomic(pointer, "acquire", ALIGNMENT)
 
@@ -51,7 +51,7 @@ def store_release(compiler: Any, array: Any, index: Any, value: Any) -> Any:
         return None
 
     def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        """Emit the LLVM code of a call and return its value; numba defines the parameters."""
+        """Emit the LLVM code of the store and return numba's None; numba defines the parameters."""
         pointer = _element_pointer(compiler, context, builder, signature.args[0], arguments[0], arguments[1])
         builder.store_atomic(arguments[2], pointer, "release", ALIGNMENT)
         return context.get_dummy_value()
@@ -71,7 +71,7 @@ def compare_exchange(compiler: Any, array: Any, index: Any, expected: Any, repla
         return None
 
     def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        """Emit the LLVM code of a call and return its value; numba defines the parameters."""
+        """Emit the LLVM code of the exchange and return whether it succeeded; numba defines the parameters."""
         pointer = _element_pointer(compiler, context, builder, signature.args[0], arguments[0], arguments[1])
         return builder.extract_value(builder.cmpxchg(pointer, arguments[2], arguments[3], "seq_cst"), 1)
 
@@ -83,7 +83,7 @@ def fence_acquire(compiler: Any) -> Any:
     """Keep every later load and store behind all earlier loads."""
 
     def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        """Emit the LLVM code of a call and return its value; numba defines the parameters."""
+        """Emit the LLVM code of the fence and return numba's None; numba defines the parameters."""
         builder.fence("acquire")
         return context.get_dummy_value()
 
@@ -95,7 +95,7 @@ def fence_release(compiler: Any) -> Any:
     """Keep every earlier load and store in front of all later stores."""
 
     def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        """Emit the LLVM code of a call and return its value; numba defines the parameters."""
+        """Emit the LLVM code of the fence and return numba's None; numba defines the parameters."""
         builder.fence("release")
         return context.get_dummy_value()
 

@@ -182,7 +182,8 @@ def python_entry(signature: str) -> Callable[[Callable[..., Any]], Entry]:
 def native_address(kernel: Any, signature: Any) -> int:
     """Compile a kernel, of `jit_strict` or another decorator, for one signature; return its address for `call_law`.
 
-    Raises numba's TypingError, or another error of numba's, for a function that cannot be compiled.
+    If UNCOMPILED, `kernel` is a Python function, and the number by which it is registered is returned. Raises numba's
+    TypingError, or another error of numba's, for a function that cannot be compiled.
     """
     if UNCOMPILED:
         return register_function(kernel)

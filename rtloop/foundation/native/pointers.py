@@ -69,7 +69,7 @@ def address_pointer(compiler: Any, address: Any) -> Any:
     types = compiler.types
 
     def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        """Emit the LLVM code of a call and return its value; numba defines the parameters."""
+        """Emit the LLVM code of the conversion and return its value; numba defines the parameters."""
         return builder.inttoptr(arguments[0], context.get_value_type(types.voidptr))
 
     return types.voidptr(types.intp), codegen

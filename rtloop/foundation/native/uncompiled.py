@@ -44,7 +44,7 @@ def is_uncompiled_allowed() -> bool:
 
 
 def register_function(function: Callable[..., Any]) -> int:
-    """Assign the next number to `function`, by which `call` and `call_law` find it; return the number."""
+    """Assign the next number, from 1, to `function`, by which `call` and `call_law` find it; return the number."""
     number = next(_numbers)
     _functions[number] = function
     return number
