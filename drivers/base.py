@@ -130,7 +130,8 @@ class Driver(ABC):
     def close(self) -> None:
         """Set every output to its safe value and release the hardware.
 
-        Before `open`, and when it is called again, it does nothing. Raises DriverError if the outputs cannot be set.
+        Before `open`, and when it is called again, it does nothing. Raises DriverError, after the release, if the
+        outputs cannot be set.
         """
 
 

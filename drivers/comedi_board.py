@@ -63,7 +63,7 @@ class Board:
     """An open board, used through libcomedi."""
 
     def __init__(self, library: str, device: str) -> None:
-        """Open a device.
+        """Load libcomedi from `library`, a name or path, and open the board's file `device`.
 
         Raises MissingLibrary if the library is missing or incomplete, DriverError if the device fails.
         """

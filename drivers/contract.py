@@ -244,7 +244,7 @@ class DriverContract:
 
 
 def _error_suffix(driver: Driver) -> str:
-    """Return ": " and the error that a Python driver's `read` or `write` raised; "" without one."""
+    """Return ": ", type and message of the driver's `error`, such as a PythonDriver has after a failure; "" without."""
     error = getattr(driver, "error", None)
     return "" if error is None else f": {type(error).__name__}: {error}"
 

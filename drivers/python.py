@@ -43,7 +43,10 @@ class PythonDriver(Driver):
 
     @abstractmethod
     def stop(self) -> None:
-        """Release the hardware; `close` has written the safe values just before. It may be called again."""
+        """Release the hardware; `close` has written the safe values just before, unless that write failed.
+
+        A repeated call must do nothing.
+        """
 
     def observe(self) -> Sequence[float]:
         """Return the values of the observed signals, in the order of the facts; by default none."""

@@ -91,9 +91,10 @@ class CanDriver(PythonDriver):
     def read(self) -> Sequence[float]:
         """Process the received frames and return the newest sample, the volts of each input channel.
 
-        While the last drive frame is not answered, the previous sample is held: `status` is 1, and after more than
-        `hold_ticks` such ticks `sample_age_us` is infinite. The first call discards older frames, sends the safe values
-        and waits up to RETRY_S for the answer. Raises DriverError if another controller drives the node.
+        Sets `sample_age_us`, the time since the drive frame of this sample was sent, plus the node's own, and `status`:
+        0, or STATUS_HELD while the last drive frame is not answered and the previous sample is held. After more than
+        `hold_ticks` such ticks the age is infinite. The first call discards older frames, sends the safe values and
+        waits up to RETRY_S for the answer. Raises DriverError if another controller drives the node.
         """
         if self._stream.sent == 0:  # Much time may pass between `open` and the first tick.
             while self._receive(0.0) is not None:

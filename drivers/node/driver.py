@@ -68,12 +68,15 @@ class NodeDriver(Driver):
         return number or max(len(self.wiring), 1)
 
     def _max_rate_hz(self, inputs: int, outputs: int) -> float:
-        """Return the rate at which the frames of a tick fill the line; infinity for a line without a known rate."""
+        """Return the tick rate at which the frames of a tick fill the line: infinity, unless a subclass knows the line.
+
+        `inputs` and `outputs` are the numbers of analogue channels.
+        """
         return float("inf")
 
     @property
     def error(self) -> DriverError | None:
-        """The reason for which the exchange has ended; None without one."""
+        """Error with the reason for which the exchange has ended; None while it goes on, and for a closed driver."""
         failure = 0 if self._card is None else int(self._card["failure"][0])
         return DriverError(f"{self._options.label}: {failure_text(failure)}") if failure else None
 
@@ -207,7 +210,9 @@ class NodeDriver(Driver):
         return None
 
     def _require_fit(self, welcome: Welcome) -> None:
-        """Raise DriverError, naming the option, for a node with other channels or ranges, or too slow for the rate."""
+        """Raise DriverError, naming the option, for a node with other channels, ranges or safe values than the options,
+        or one that does not allow the loop's rate.
+        """
         options = self._options
         for name, count, expected in (
             ("inputs", len(welcome.inputs), self._count(options.inputs)),
@@ -244,7 +249,7 @@ class NodeDriver(Driver):
             )
 
     def _require_rate(self, link: Link, welcome: Welcome) -> None:
-        """Raise DriverError if the line is too slow for the rate, as far as that is measured before a run."""
+        """Do nothing: a subclass whose line may be too slow for the rate measures it, and raises DriverError."""
 
     def _begin_session(self, link: Link, welcome: Welcome) -> int:
         """Send an OPEN every RETRY_S until the node is ready; return the sequence that it has answered.
@@ -326,7 +331,11 @@ class SerialDriver(NodeDriver):
     """Exchanges by which `open` measures the line."""
 
     def _max_rate_hz(self, inputs: int, outputs: int) -> float:
-        """Return the rate at which the longer frames of a tick fill a line of `baud`; infinity without `baud`."""
+        """Return the tick rate at which the frames of a tick fill a line of `baud` bit/s; infinity without `baud`.
+
+        Of the two directions, the one with more bytes in a tick counts. `inputs` and `outputs` are the numbers of
+        analogue channels.
+        """
         baud = self._options.baud if isinstance(self._options, SerialOptions) else None
         to_node = frames.drive_bytes(outputs) * (2 if self._options.waits else 1)
         longest = max(to_node, frames.sample_bytes(inputs)) + 2  # COBS adds a byte and the byte 0
@@ -357,7 +366,7 @@ class SerialDriver(NodeDriver):
 
 
 def _digital_channels(prefix: str, count: int) -> list[Channel]:
-    """Return the channels `prefix`0, 1, … of digital inputs or outputs, 0 or HIGH_V."""
+    """Return the channels `prefix`0, 1, … of digital inputs or outputs, with the range 0 … HIGH_V and safe at 0."""
     return [Channel(f"{prefix}{i}", 0.0, HIGH_V) for i in range(count)]
 
 

@@ -51,8 +51,8 @@ OBSERVED_COUNT = len(COUNTS)
 def node_read(context, values):
     """Fill `values` with the newest sample's volts, its age in µs, and the counts of OBSERVED.
 
-    Returns GOOD; HELD while the last request is not answered, and from `hold_ticks` such ticks on with an infinite age;
-    FAILED, with the reason in `failure`, once the exchange has ended.
+    Returns GOOD; HELD while the last request is not answered: the values are the previous sample's, and after more than
+    `hold_ticks` such ticks the age is infinite; FAILED, with the reason in `failure`, once the exchange has ended.
     """
     card = carray(context, 1, CARD)[0]
     if card.running == 0:
@@ -81,9 +81,10 @@ def node_read(context, values):
 
 @cfunc(SIGNATURE)
 def node_write(context, values):
-    """Send the codes nearest to the volts of every output, clipped to the node's ranges. Returns GOOD.
+    """Send the codes nearest to the volts of every output, clipped to the node's ranges.
 
-    NaN in any output prevents the sending: FAILED.
+    Returns GOOD, also for a frame that the system does not take; FAILED for NaN in any output: nothing is sent, and the
+    exchange has ended.
     """
     card = carray(context, 1, CARD)[0]
     volts = carray(values, card.outputs + card.digital_outputs)
@@ -145,7 +146,8 @@ def checksum(card, address, length):
 def _open_again(card):
     """Begin the session once more, as much time may have passed since the driver was opened; wait for the answer.
 
-    The outputs are at their safe values, and the codes of an OPEN are not applied. Sets `failure` without an answer.
+    The outputs are at their safe values, and the codes of an OPEN are not applied. Sets `failure` without an answer,
+    and all counts to 0.
     """
     while receive_frame(card) > GONE:
         pass  # Frames from before the first tick are old.
@@ -184,7 +186,10 @@ def _receive_newest(card):
 
 @jit_rare
 def _receive_one(card):
-    """Receive a frame if one has come, and process or count it; return whether one had come."""
+    """Receive a frame if one has come, and process or count it; return whether one had come.
+
+    Sets `failure` if a frame says that the exchange has ended, such as a refusal, and for a serial line that has ended.
+    """
     length = receive_frame(card)
     if length == GONE:
         card.failure = LINE_GONE
@@ -225,7 +230,7 @@ def _take_sample(card):
     """Copy the sample received if it is newer than all earlier ones; else count it as reordered, duplicated, invalid.
 
     Requests that a newer sample skips count as lost, until their answers come late. A code outside its channel's range
-    makes the sample invalid.
+    makes the sample invalid. A newer sample of a node that is not ready is not copied, and sets `failure` in a run.
     """
     frame = carray(address_pointer(card.received), 1, SAMPLE)[0]
     received = carray(address_pointer(card.received + SAMPLE_HEAD), card.inputs, np.int32)

@@ -25,5 +25,5 @@ TEXTS = {
 
 
 def failure_text(number: int) -> str:
-    """Return the sentence of a failure; its number for one that is not known."""
+    """Return the sentence for failure `number`; for an unknown one, a sentence with the number."""
     return TEXTS.get(number, f"the node refused a drive for reason {number}")

@@ -134,12 +134,12 @@ def _frame(format_number: int, sequence: int, session: int, content: bytes) -> b
 
 
 def hello(sequence: int, session: int) -> bytes:
-    """Return the bytes of a HELLO."""
+    """Return the bytes of a HELLO, with which the loop, which speaks VERSION, asks a node for its description."""
     return _frame(HELLO, sequence, session, _HELLO.pack(VERSION, 0))
 
 
 def welcome(sequence: int, facts: Welcome) -> bytes:
-    """Return the WELCOME that answers the HELLO `sequence`."""
+    """Return the bytes of a WELCOME, the node's description that answers the HELLO `sequence`."""
     content = _WELCOME.pack(
         facts.version, len(facts.inputs), len(facts.outputs), facts.digital_inputs, facts.digital_outputs, 0,
         facts.boot, facts.hold_us, facts.period_us, facts.is_driven,
@@ -149,21 +149,21 @@ def welcome(sequence: int, facts: Welcome) -> bytes:
 
 
 def drive(content: Drive) -> bytes:
-    """Return the bytes of a DRIVE."""
+    """Return the bytes of a DRIVE, with which the loop sends flags and the codes of the outputs to the node."""
     sequence, session, flags, digital, hold_us, codes = content
     packed = _DRIVE.pack(flags, len(codes), digital, hold_us, 0) + _pack_codes(codes)
     return _frame(DRIVE_FORMAT, sequence, session, packed)
 
 
 def sample(content: Sample) -> bytes:
-    """Return the bytes of a SAMPLE."""
+    """Return the bytes of a SAMPLE, with which the node answers a DRIVE by the codes of its inputs."""
     sequence, session, boot, flags, digital, age_ns, applied, codes = content
     packed = _SAMPLE.pack(boot, flags, len(codes), digital, age_ns, applied) + _pack_codes(codes)
     return _frame(SAMPLE_FORMAT, sequence, session, packed)
 
 
 def refusal(content: Refusal) -> bytes:
-    """Return the bytes of a REFUSAL."""
+    """Return the bytes of a REFUSAL, with which the node answers a frame that it does not obey."""
     sequence, session, boot, reason, version = content
     return _frame(REFUSAL_FORMAT, sequence, session, _REFUSAL.pack(boot, reason, version, 0))
 

@@ -59,7 +59,7 @@ class UdpLink(Link):
     """
 
     def __init__(self, options: UdpOptions) -> None:
-        """Resolve the node's name and open a socket.
+        """Resolve the node's name and open both sockets; nothing is sent.
 
         Raises DriverError for a name without an address, and if the system refuses.
         """
@@ -100,7 +100,8 @@ class UdpLink(Link):
                 self._socket.recv(LARGEST_DATAGRAM)  # What strangers sent before the socket was connected.
 
     def send(self, frame: bytes) -> None:
-        """Send a frame as one datagram; a full queue loses it, as does an earlier one that the node's system refused.
+        """Send a frame as one datagram. It is lost if the system's queue is full, and if the node's system has just
+        reported that nobody received an earlier one.
 
         Raises OSError for an address without a route.
         """
@@ -157,7 +158,10 @@ class SerialLink(Link):
         self._reader = FrameReader()
 
     def send(self, frame: bytes) -> None:
-        """Send a frame in COBS's code; bytes that the line does not take are lost, and with them the frame."""
+        """Send a frame in COBS's code; bytes that the line does not take are lost, and with them the frame.
+
+        Raises OSError if the line is gone.
+        """
         with contextlib.suppress(BlockingIOError):
             os.write(self.fd, encode(frame))
 

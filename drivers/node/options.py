@@ -68,7 +68,7 @@ class NodeOptions(RigOptions):
 
     @property
     def label(self) -> str:
-        """Text that names the node in messages."""
+        """Text that names the node in messages; each subclass defines it."""
         raise NotImplementedError
 
 

@@ -97,7 +97,7 @@ class TerminalPort(Port):
             ) from None
 
     def receive(self, timeout_s: float) -> tuple[bytes, Hashable] | None:
-        """Return the next frame, with the sender None; None if none comes within `timeout_s`."""
+        """Return the next frame, with the sender None; None if none is complete after a wait of at most `timeout_s`."""
         if (frame := self._reader.next_frame()) is not None:
             return frame, None
         if not select.select([self._fd], [], [], timeout_s)[0]:

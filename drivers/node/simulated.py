@@ -136,16 +136,16 @@ class SimulatedNode:
         return frames.FLAGS if content.hold_us == 0 or (content.flags & KINDS).bit_count() > 1 else 0
 
     def _is_due(self, content: Drive) -> bool:
-        """Whether a DRIVE comes after the newest one; without a session, each one that is not refused is due."""
+        """Whether a DRIVE comes after the newest one, or repeats it with the flag OPEN; True without a session."""
         if not self._session:
             return True
         step = (content.sequence - self._newest) % MODULUS
         return 0 < step < HALF or (step == 0 and bool(content.flags & frames.OPEN))
 
     def _accept(self, content: Drive, sender: Hashable, now_us: float) -> bytes | None:
-        """Convert the inputs, then obey the flags of a DRIVE; return the bytes of the sample if it asks for one.
+        """Convert the inputs, begin a session if a DRIVE says OPEN, and obey its flags.
 
-        Else return None.
+        Returns the bytes of the sample if the DRIVE asks for one, else None.
         """
         codes, digital = self._read_inputs(), self.digital & ((1 << self._digital_counts[0]) - 1)
         if content.flags & frames.OPEN:

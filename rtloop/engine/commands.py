@@ -49,9 +49,9 @@ class QueueFull(RtloopError):
 
 
 def send(block: SharedBlock, command: np.ndarray, urgent: bool = False) -> int:
-    """Put one MESSAGE record (1,) into the queue and return its position; single producer. Raises QueueFull.
+    """Put one MESSAGE record (1,) into the queue and return its position; only one process may call this.
 
-    `urgent` commands may use the slots reserved for them.
+    Raises QueueFull if COMMAND_SLOTS commands wait for the loop; for `urgent` ones, if all slots are in use.
     """
     head, tail = block.load(Word.COMMANDS_HEAD), block.load(Word.COMMANDS_TAIL)
     slots = block["commands"]

@@ -107,7 +107,9 @@ def virtual_clock(plan: Plan, facts: Facts, block: SharedBlock, pointers: Pointe
     if not pacing.simulated_lateness_us:
         return VirtualClock(clock, (context,))
     if plan.driver_kind != SimDriver.kind:
-        raise ValueError(f"simulated lateness with driver {plan.driver_kind!r}; allowed: {SimDriver.kind!r}")
+        raise ValueError(
+            f"loop.simulated_lateness_us is set, but the driver is {plan.driver_kind!r}; allowed: {SimDriver.kind!r}"
+        )
     table_ns = np.rint(np.array(pacing.simulated_lateness_us) * NS_PER_US).astype(np.int64)
     held_v, late = np.full(len(facts.outputs), np.nan), np.zeros(1, CONTEXT)
     late["wait"], late["wait_context"] = clock.wait, clock.context

@@ -53,7 +53,10 @@ class ModalSystem:
         return ModalSystem(np.exp(self.poles * period_s), self.residues * hold_factors, self.direct)
 
     def realise(self) -> StateSpace:
-        """Return a real block-diagonal realisation: 1×1 blocks for real poles, scaled rotations 2×2 for pairs."""
+        """Return a real block-diagonal realisation: 1×1 blocks for real poles, scaled rotations 2×2 for pairs.
+
+        The blocks are in the order of `poles`; a pair stands where its pole with positive imaginary part is.
+        """
         order = self.poles.size
         a, b = np.zeros((order, order)), np.zeros(order)
         c = np.zeros((self.direct.size, order))
@@ -114,7 +117,10 @@ def modal_sum(zeros: npt.ArrayLike, poles: npt.ArrayLike, gain: float) -> ModalS
 
 
 def quadratic_roots(b: float, c: float) -> list[complex]:
-    """Return both roots of s² + b s + c; a smaller real root as c / larger, because their difference would cancel."""
+    """Return both roots of s² + b s + c: of a pair, the upper one first; of real ones, that of larger magnitude.
+
+    The smaller real root is c / larger, because their difference would cancel.
+    """
     half, discriminant = -b / 2, b * b / 4 - c
     if discriminant < 0:
         imag = math.sqrt(-discriminant)

@@ -348,11 +348,11 @@ def _is_sole_writer(folder: os.stat_result, uid: int) -> bool:
 
 
 def _is_own(status: os.stat_result) -> bool:
-    """Whether the owner is this user or root."""
+    """Whether the owner is this user or root; True on a system without HAS_OWNERS."""
     return not HAS_OWNERS or status.st_uid in (0, os.geteuid())
 
 
 def _foreign_owner_text(status: os.stat_result) -> str:
-    """Say why a file is refused whose owner is neither the user nor root, for `UntrustedPath`."""
+    """Return the reason of `UntrustedPath` for a file or link whose owner is neither this user nor root."""
     link = "a link that " if stat.S_ISLNK(status.st_mode) else ""
     return f"{link}belongs to user {status.st_uid}, not to this user or root"

@@ -84,7 +84,7 @@ def axis_trip(coefficients, state, adc_v, conditions, among):
 
 @jit
 def _check(trip, among, flag, is_tripped, value, limit):
-    """Return `trip` with the cause `flag` added if `is_tripped` and `among` has it.
+    """Return `trip`, a result of `axis_trip` so far, with the cause `flag` added if `is_tripped` and `among` has it.
 
     The first cause added sets the value and the limit.
     """

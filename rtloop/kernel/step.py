@@ -210,7 +210,7 @@ def _record_trip(law, adc_v, conditions, causes):
 
 @jit
 def _trip_on_law_failure(loop):
-    """Trip the loop, because a function of a law failed in this tick."""
+    """Trip the loop, because a law failed in this tick: set TRIP_LAW and mode OFF in `loop`, the LOOP_STATE record."""
     loop.new_trip |= TRIP_LAW & ~loop.trip
     loop.trip |= TRIP_LAW
     loop.mode = OFF

@@ -251,7 +251,8 @@ class Bench:
     def enter(self, position_um: Any, error_um: Any, command_um: Any) -> Any:
         """Enter a controller as the loop does, from a state of zeros; return the commands of its first tick.
 
-        All (axes,), in µm; a feedforward does nothing and returns 0.
+        The arguments are (axes,), the commands a number or, for several axes, a tuple, all in µm. A feedforward does
+        nothing and returns 0.
         """
         if self._law.count == 0:
             return 0.0

@@ -133,8 +133,8 @@ class Controller(Law):
     def linear(self) -> Any:
         """Return the transfer from error to command, for margins and bumpless entry.
 
-        It is a `rtloop.linear.sampled.SampledController`. None makes `rtloop.laws.linearise` compute it by running the
-        functions around rest.
+        It is a `rtloop.linear.sampled.SampledController`, of a coupled controller a SampledCoupledSystem. None, the
+        default, makes `rtloop.laws.linearise` compute it by running the functions around rest.
         """
         return None
 

@@ -9,7 +9,9 @@ _DEFINED = re.compile(r'^define [^@]*@"?([^"(]+)"?\(.*?^\}', re.MULTILINE | re.D
 _CALLED = re.compile(r'\b(?:call|invoke)\b[^@\n]*@"?([^"(]+)"?\(')
 _CALLED_BY_ADDRESS = re.compile(r'\b(?:call|invoke)\b[^@"\n]*?(?:%"?[\w.$-]+"?\(|inttoptr \()')
 ADDRESS = "a function by its address"
-LIBM = "differs between processors in its last bits, so that a replay might differ"
+LIBM = (
+    "differs between processors in its last bits, so that a replay might differ (`libm = True` in the class allows it)"
+)
 MEMORY = "allocates memory for a list, an array or a text, and may therefore wait"
 UNKNOWN = "is outside the law and may wait"
 _MATHEMATICS = {

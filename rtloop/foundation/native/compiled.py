@@ -83,7 +83,8 @@ def _make_kernel(function: Callable[..., Any], **options: Any) -> Any:
 def jit(function: Callable[..., Any]) -> Any:
     """Compile a kernel on first use, inlined into its compiled callers; `.py_func` is the uncompiled function.
 
-    Indices are not checked, which would cost a tenth of the law's time; the caller checks counts once.
+    Returns a Kernel, or the function itself if UNCOMPILED. Indices are not checked, which would cost a tenth of the
+    law's time; the caller checks counts once.
     """
     return _make_kernel(function, cache=True, error_model="numpy", forceinline=True)
 

@@ -73,7 +73,10 @@ def load_word(address: int) -> np.uint64:
 
 
 def carray(pointer: int, shape: Any, dtype: Any = np.float64) -> Any:
-    """Return an array over the memory at address `pointer`; the fields of its records are attributes."""
+    """Return an array over the memory at address `pointer`, not a copy; the fields of its records are attributes.
+
+    For a size of 0 it is a new array, and the address is not used.
+    """
     record_type = np.dtype(dtype)
     size = int(np.prod(shape)) * record_type.itemsize
     if size == 0:
@@ -91,7 +94,8 @@ def call(function: int, context: int, values: int) -> Any:
 def call_law(function: int, result: int, raised_address: int, coefficients: int, state: int, law_input: Any) -> int:
     """Call a registered function of a law, like `pointers.call_law`; return OK or RAISED.
 
-    A result is written to the float64 at `result`; an exception goes to `raised_exceptions`.
+    A result other than None is written to the float64 at `result`; an exception goes to `raised_exceptions`, and
+    `raised_address` is not used.
     """
     try:
         value = _functions[int(function)](int(coefficients), int(state), law_input)

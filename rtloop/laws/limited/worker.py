@@ -160,7 +160,7 @@ def _error_text(error: BaseException) -> str:
 
 
 def _suggestion(error: BaseException) -> str:
-    """Return a hint with an attribute of similar name; empty if there is none."""
+    """Return "; did you mean NAME?" for an AttributeError if the object has an attribute of similar name, else ""."""
     if not isinstance(error, AttributeError) or not error.name:
         return ""
     names = [name for name in dir(error.obj) if not name.startswith("_")]

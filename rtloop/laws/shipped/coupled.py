@@ -44,7 +44,7 @@ STATE = cache_line_record([("x", np.float64, (MAX_ORDER,)), ("scratch", np.float
 
 @jit
 def commands(c, s, told):
-    """Set the commands v = C x + D e in µm, from states x and errors e; C and D include the decoupling."""
+    """Set told.command_um to v = C x + D e, (axes,), from states x and errors e; C and D include the decoupling."""
     for i in range(c.count):
         told.command_um[i] = _command(c, s, told, i)
 

@@ -115,7 +115,10 @@ class Repetitive(Controller):
 
     @staticmethod
     def update(c: Any, s: Any, told: Any) -> None:
-        """Add the error of a period ago, integrate, and store the sum; 0 is stored if the command was limited."""
+        """Add the smoothed sum of a period ago to the error, and advance the integral by the result.
+
+        The result is stored for the next period; 0 is stored if the command was limited.
+        """
         place, recalled_um = s.at + c.ahead, 0.0
         for j in range(c.count):
             recalled_um += c.weights[j] * s.past_um[(place - j) % c.places]
