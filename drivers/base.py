@@ -121,8 +121,8 @@ class Driver(ABC):
     def measure_exchanges(self, count: int) -> Exchanges | None:
         """Measure `count` exchanges at the tick rate with the outputs at their safe values.
 
-        The driver must be closed before; it opens itself and is closed afterwards. The default does nothing and returns
-        None, for hardware that is read without an answer to wait for. Raises DriverError like `open`.
+        The driver must be closed before; it opens itself and is closed afterwards. The default returns None without a
+        measurement, for hardware that is read without an answer to wait for. Raises DriverError like `open`.
         """
         return None
 

@@ -144,7 +144,7 @@ class DriverContract:
     def test_open_says_where_the_outputs_are(self) -> None:
         """`outputs_v` gives the volts at the outputs after `open`, or None for outputs that `open` has not moved.
 
-        `open` leaves each output as it was or makes it safe. Parking ramps from the values of `outputs_v`: a wrong one
+        `open` leaves an output unchanged or makes it safe. Parking ramps from the values of `outputs_v`: a wrong one
         becomes a step. For a card with a watchdog, which may be in a ramp, the outputs themselves are not compared.
         """
         driver = self.driver()

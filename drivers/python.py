@@ -45,7 +45,7 @@ class PythonDriver(Driver):
     def stop(self) -> None:
         """Release the hardware; `close` has written the safe values just before, unless that write failed.
 
-        A repeated call must do nothing.
+        A repeated call must have no effect.
         """
 
     def observe(self) -> Sequence[float]:

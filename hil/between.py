@@ -33,7 +33,7 @@ class RecordedMotion(NamedTuple):
 
 
 def fractions_of_period(coefficients: np.record, period_s: float, points: int) -> npt.NDArray[np.float64]:
-    """Return the factors that move each mode of an axis from a tick to `points` instants of the period after it.
+    """Return the factors that move each mode of an axis from a tick to `points` instants of the next period.
 
     Instant i lies i/points of `period_s` after the tick. The array (modes, PARTS, points) has the real and imaginary
     part of λᶠ, the factor of the mode's state, then those of (λᶠ − 1)/(λ − 1), the factor of its constant input.
@@ -53,9 +53,9 @@ def positions_between_ticks(
 ) -> npt.NDArray[np.float64]:
     """Return the true positions of axis number `axis` in µm, (ticks, points), each row from its tick on.
 
-    `coefficients` and `state` (axes,) are the rig's records before the first tick; neither changes. `factors` are those
-    of `fractions_of_period`. Displacements after the last tick are not recorded, and are taken as unchanged; in the
-    periods without a tick they are taken from the period before the next tick. Raises ValueError for a motion of
+    `coefficients` and `state` (axes,) are the rig's records before the first tick; neither changes. `factors` is a
+    result of `fractions_of_period`. Displacements after the last tick are not recorded, and are taken as unchanged; in
+    the periods without a tick they are taken from the period before the next tick. Raises ValueError for a motion of
     another number of axes or counts, and for factors of other dynamics.
     """
     displacements_um, missed = np.ascontiguousarray(motion.hysteresis_um), np.ascontiguousarray(motion.missed)
@@ -105,7 +105,7 @@ def _fill_positions(
 def _input_um(coefficients, state, displacements_um, axis):
     """Return the input (µm) of the dynamics of axis `axis` in a period, and advance its disturbance by a period.
 
-    `displacements_um` (axes,) are those of all axes; the coupled ones count with their coupling.
+    `displacements_um` (axes,) holds the displacement of each axis; other axes count by their coupling.
     """
     total_um = displacements_um[axis]
     for j in range(coefficients.coupled_count):
@@ -117,7 +117,7 @@ def _input_um(coefficients, state, displacements_um, axis):
 def _fill_period(coefficients, state, factors, input_um, positions_um):
     """Fill `positions_um` (points,) with the true positions in a period of constant `input_um`; `state` stays.
 
-    The modes in `state` are those at the period's tick; `factors` are those of `fractions_of_period`.
+    `state` has the modes at the period's tick; `factors` is a result of `fractions_of_period`.
     """
     for j in range(positions_um.shape[0]):
         positions_um[j] = coefficients.true_direct * input_um

@@ -99,9 +99,10 @@ class RigNode:
             self._target_v[:], self._following, self._newest = SAFE_V, False, 0
 
     def _apply_drive_frame(self, message: can.Message) -> bool:
-        """Take the frame's volts as target, at once or by ramp until it is reached, and answer.
+        """Take the frame's volts as target and answer; the outputs jump there if they follow, else they ramp there.
 
-        Returns False, without an answer, for a malformed frame or one not newer than the last; sequence 0 begins anew.
+        Returns False, without an answer, for a malformed frame or one not newer than the last. Sequence 0 is always
+        accepted, and its volts are reached by a ramp.
         """
         drive, highest = self._exchange.drive, self._exchange.highest_sequence
         if not drive.fits(message):

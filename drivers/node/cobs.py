@@ -43,7 +43,7 @@ class FrameReader:
         self._bytes, self.broken, self._skips = bytearray(), 0, False
 
     def feed(self, data: bytes) -> None:
-        """Add received bytes.
+        """Add received bytes, which `next_frame` decodes.
 
         If more than LONGEST_CODE bytes have no byte 0, `next_frame` discards them and all up to the next byte 0.
         """

@@ -76,7 +76,7 @@ class NodeDriver(Driver):
 
     @property
     def error(self) -> DriverError | None:
-        """Error with the reason for which the exchange has ended; None while it goes on, and for a closed driver."""
+        """Error with the reason for which the exchange has ended; None before its end, and for a closed driver."""
         failure = 0 if self._card is None else int(self._card["failure"][0])
         return DriverError(f"{self._options.label}: {failure_text(failure)}") if failure else None
 
@@ -249,7 +249,7 @@ class NodeDriver(Driver):
             )
 
     def _require_rate(self, link: Link, welcome: Welcome) -> None:
-        """Do nothing: a subclass whose line may be too slow for the rate measures it, and raises DriverError."""
+        """Accept any line; a subclass whose line may be too slow for the rate measures it, and raises DriverError."""
 
     def _begin_session(self, link: Link, welcome: Welcome) -> int:
         """Send an OPEN every RETRY_S until the node is ready; return the sequence that it has answered.
@@ -289,8 +289,8 @@ class NodeDriver(Driver):
     def _park(self, link: Link, sequence: int) -> None:
         """Send a PARK every CONFIRM_S until the node says that all outputs are safe, or refuses: the session has ended.
 
-        `sequence` is that of the last frame sent. Raises DriverError if the node does not answer within `wait_s`, or if
-        its ramp takes longer than LONGEST_PARKING_S, and OSError if the line fails.
+        `sequence` is the number of the last frame sent. Raises DriverError if the node does not answer within `wait_s`,
+        or if its ramp takes longer than LONGEST_PARKING_S, and OSError if the line fails.
         """
         start_s, heard_s = time.monotonic(), time.monotonic()
         codes = tuple(self._arrays["safe"].tolist())

@@ -83,8 +83,8 @@ def node_read(context, values):
 def node_write(context, values):
     """Send the codes nearest to the volts of every output, clipped to the node's ranges.
 
-    Returns GOOD, also for a frame that the system does not take; FAILED for NaN in any output: nothing is sent, and the
-    exchange has ended.
+    Returns GOOD, also for a frame that the system does not take; FAILED for NaN in any output: no frame is sent, and
+    the exchange has ended.
     """
     card = carray(context, 1, CARD)[0]
     volts = carray(values, card.outputs + card.digital_outputs)

@@ -59,7 +59,7 @@ class UdpLink(Link):
     """
 
     def __init__(self, options: UdpOptions) -> None:
-        """Resolve the node's name and open both sockets; nothing is sent.
+        """Resolve the node's name, open both sockets, and connect the first one to the node.
 
         Raises DriverError for a name without an address, and if the system refuses.
         """
@@ -100,9 +100,9 @@ class UdpLink(Link):
                 self._socket.recv(LARGEST_DATAGRAM)  # What strangers sent before the socket was connected.
 
     def send(self, frame: bytes) -> None:
-        """Send a frame as one datagram. It is lost if the system's queue is full, and if the node's system has just
-        reported that nobody received an earlier one.
+        """Send a frame as one datagram; it is lost if the system's queue is full.
 
+        It is also lost if the node's system has just refused an earlier one, because no program receives at the port.
         Raises OSError for an address without a route.
         """
         with contextlib.suppress(BlockingIOError, ConnectionRefusedError):

@@ -81,7 +81,7 @@ class SimulatedNode:
         self._set_outputs()
 
     def _begin_ramp(self, now_us: float) -> None:
-        """Set the digital outputs to 0 and begin the ramp of the others to their safe codes; in a ramp, do nothing."""
+        """Set the digital outputs to 0 and begin the ramp of the others to their safe codes, unless a ramp runs."""
         if not self.is_ramping:
             self.digital = self._applied = 0
             self.is_ramping, self._step_us = not self._is_safe, now_us + RAMP_STEP_US

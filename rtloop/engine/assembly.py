@@ -53,9 +53,9 @@ class Assembly:
     def __init__(
         self, plan: Plan, block: SharedBlock, facts: Facts, pointers: Pointers, clock: Clock, law: LawMemory
     ) -> None:
-        """Fill in the context from the plan; nothing is opened or run.
+        """Fill in the context from the plan, and write the plan's table and the drives at rest to `block`.
 
-        Raises ValueError for a channel that the driver lacks.
+        No tick is run. Raises ValueError for a channel that the driver lacks.
         """
         self._loops = np.zeros(1, LOOP).view(np.recarray)
         self.loop = self._loops[0]

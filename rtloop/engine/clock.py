@@ -114,7 +114,8 @@ def clock_context(rate_hz: float) -> np.recarray:
 def paced_clock(context: np.recarray, spin_us: float) -> Clock:
     """Return the clock of real time, which spins for the last `spin_us` µs before each deadline.
 
-    Before use, set `context.start_ns` to the first deadline, in ns of CLOCK_MONOTONIC.
+    `context`, of `clock_context`, gets this setting and must outlive the clock. Before use, set `context.start_ns` to
+    the first deadline, in ns of CLOCK_MONOTONIC.
     """
     context.spin_ns = round(spin_us * 1000)
     return Clock(paced_wait.address, paced_now.address, context.ctypes.data)
@@ -123,7 +124,8 @@ def paced_clock(context: np.recarray, spin_us: float) -> Clock:
 def unpaced_clock(context: np.recarray, head: np.ndarray, words: np.ndarray, cursor_word: int, slack: int) -> Clock:
     """Return the clock of virtual time, whose ticks are at most `slack` ahead of the reader at `words[cursor_word]`.
 
-    `head` (1,) has the number of ticks published.
+    `head` (1,) has the number of ticks published. `context`, of `clock_context`, gets these addresses; all arrays must
+    outlive the clock.
     """
     context.head_address, context.words_address = head.ctypes.data, words.ctypes.data
     context.cursor_word, context.slack_ticks = cursor_word, slack

@@ -208,7 +208,10 @@ def _execute_tick(loop):
 
 @jit
 def _elapsed_ns(loop):
-    """Return the ns since the start; NaN in virtual time, whose clock has no `now`."""
+    """Return the ns since the start, also written to the first value at `loop.timing`.
+
+    NaN, without a write, in virtual time, whose clock has no `now`.
+    """
     if loop.now == 0:
         return np.nan
     call(loop.now, loop.clock_context, loop.timing)

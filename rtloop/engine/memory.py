@@ -200,7 +200,8 @@ class SharedBlock:
     def claim(self) -> None:
         """Mark the calling process as the driving process for as long as it lives, and store its number in LOOP_PID.
 
-        The kernel drops the claim with the first descriptor of the file that the process closes: keep the block.
+        Waits while another process has the claim. The kernel drops the claim with the first descriptor of the file that
+        the process closes: keep the block.
         """
         self.store(Word.LOOP_PID, os.getpid())
         fcntl.lockf(self.fd, fcntl.LOCK_EX, 1)

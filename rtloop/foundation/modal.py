@@ -117,9 +117,9 @@ def modal_sum(zeros: npt.ArrayLike, poles: npt.ArrayLike, gain: float) -> ModalS
 
 
 def quadratic_roots(b: float, c: float) -> list[complex]:
-    """Return both roots of s² + b s + c: of a pair, the upper one first; of real ones, that of larger magnitude.
+    """Return both roots of s² + b s + c: first the upper root of a pair, or the real root of larger magnitude.
 
-    The smaller real root is c / larger, because their difference would cancel.
+    The smaller real root is c / larger, because a difference would cancel.
     """
     half, discriminant = -b / 2, b * b / 4 - c
     if discriminant < 0:

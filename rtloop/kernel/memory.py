@@ -66,7 +66,10 @@ class Layout:
     laws: tuple[LawRecords, ...]
 
     def slot_bytes(self, slot: Slot) -> tuple[int, int]:
-        """Return the sizes of a slot for coefficients and for state, in bytes."""
+        """Return the sizes of a slot for coefficients and for state, in bytes.
+
+        Each is the size of the largest record among the laws that fill this slot, 0 if there is none.
+        """
         slot_laws = [law for law in self.laws if law.slot == slot]
         return (
             max((law.coefficients.itemsize for law in slot_laws), default=0),

@@ -78,7 +78,7 @@ class Law(ABC):
             cls.kind = cls.__name__.lower()
 
     def __init__(self, options: Any, period_s: float, model: Any) -> None:
-        """Store options, period and model.
+        """Store options, period and model; number the names in `inputs` and in `outputs`, each from 0, in `channels`.
 
         `model` is the axis's configured plant from command to position, or None; for a coupled controller a tuple with
         one entry for each axis.
@@ -177,7 +177,7 @@ def record_type(fields: Fields | np.dtype[Any]) -> np.dtype[Any]:
 
     The record's fields are in the order of their number of elements, largest first.
 
-    Raises TypeError for anything else, and for a type other than float, int, or (type, length) or (type, shape).
+    Raises TypeError for other arguments, and for a type other than float, int, or (type, length) or (type, shape).
     """
     if isinstance(fields, np.dtype):
         return fields

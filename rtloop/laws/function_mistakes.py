@@ -126,7 +126,7 @@ def _unknown_names(
 def _wrong_returns(function: ast.FunctionDef, law: type[Law]) -> Iterator[Mistake]:
     """Yield a mistake for a function that must return a number and has no `return` with a value, and vice versa.
 
-    `output` must, except of a coupled controller, and `update` of a feedforward; all others return nothing.
+    `output` must, except of a coupled controller, and `update` of a feedforward; no other function may.
     """
     nodes = list(ast.walk(function))
     values = [node for node in nodes if isinstance(node, ast.Return) and node.value is not None]

@@ -38,7 +38,7 @@ class LawOptions(Options):
         self._law = law
 
     def __reduce_ex__(self, protocol: Any) -> Any:
-        """Pickle the options of a user law as `LawReference` and values, those of other laws as usual.
+        """Pickle the options of a user law as `LawReference` and values, other options as usual.
 
         Another process must first run the law's text, which defines the class of the options.
         """

@@ -177,7 +177,7 @@ def _module(text: str, file: str) -> ModuleType:
 
 
 def _law_classes(module: ModuleType) -> dict[str, type[Law]]:
-    """Return the laws that a module itself defines, by kind."""
+    """Return the laws that a module itself defines, without abstract classes, by kind."""
     classes = [law for law in vars(module).values() if isinstance(law, type) and law.__module__ == module.__name__]
     return {law.kind: law for law in classes if issubclass(law, Law) and not inspect.isabstract(law)}
 

@@ -136,7 +136,7 @@ def update_model(c, s, drive_v):
 def enter_at_drive(c, s, drive_v):
     """Set the dead band's direction, −1 … 1, to the place of `drive_v` (V) within the band; the plays do not move.
 
-    Another mode of the loop may have left the drive anywhere in the band. Without a dead band, do nothing.
+    Another mode of the loop may have left the drive anywhere in the band. Without a dead band, the state stays.
     """
     if c.dead_band_v > 0.0:
         s.dead_band_direction = (drive_v - s.model_plays_v[0]) / c.dead_band_v
