@@ -371,7 +371,10 @@ def _digital_channels(prefix: str, count: int) -> list[Channel]:
 
 
 def _receive_for(link: Link, duration_s: float) -> Any:
-    """Yield header and bytes of each whole frame that comes within `duration_s`."""
+    """Yield header and bytes of each valid frame that comes within `duration_s`.
+
+    Raises OSError if the line is broken.
+    """
     deadline_s = time.monotonic() + duration_s
     while (remaining_s := deadline_s - time.monotonic()) > 0:
         data = link.receive(remaining_s)

@@ -88,7 +88,7 @@ class Assembly:
         return Outcome(run_ticks(self._loops.ctypes.data, until_tick))
 
     def _add_array(self, name: str, array: np.ndarray[Any, Any]) -> None:
-        """Store an array and put its address into the field `name` of the context."""
+        """Store `array` under `name`, which keeps it alive, and write its address to the context's field `name`."""
         self._arrays[name] = array
         self._loops[name] = array.ctypes.data
 

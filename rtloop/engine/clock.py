@@ -104,7 +104,7 @@ def unpaced_wait(context, timing):
 
 
 def clock_context(rate_hz: float) -> np.recarray:
-    """Return a new CONTEXT record, shape (1,), with the period of `rate_hz` set and the start at 0."""
+    """Return a new context of a clock, one CONTEXT record (1,), with the period of `rate_hz` and the start at 0."""
     context = np.zeros(1, CONTEXT).view(np.recarray)
     context.timespec_address = context.ctypes.data + CONTEXT.fields["timespec"][1]  # type: ignore[index]
     context.period_ns = SECOND_NS / rate_hz

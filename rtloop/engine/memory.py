@@ -279,7 +279,7 @@ def _array_specification(sizes: Sizes) -> dict[str, tuple[np.dtype[Any], tuple[i
 
 
 def _restore_tuples(descr: Any) -> Any:
-    """Convert a numpy dtype description from JSON: its lists become tuples again."""
+    """Return a numpy dtype description from JSON with tuples in place of its inner lists; a text is unchanged."""
     if isinstance(descr, str):
         return descr
     return [tuple(tuple(part) if isinstance(part, list) else part for part in field) for field in descr]

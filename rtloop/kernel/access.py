@@ -37,7 +37,7 @@ class Law(NamedTuple):
 
 @jit
 def unpack_law(law):
-    """Return the fields of a LAW record that kernels use, as a `Law`."""
+    """Return the fields of the loop's LAW record that kernels use, addresses, sizes and number of axes, as a `Law`."""
     return Law(
         law.coefficients, law.coefficients_bytes, law.axes, law.axes_bytes, law.loop, law.controls, law.together,
         law.functions, law.result, law.raised, law.trip, law.controller_coefficients,

@@ -102,7 +102,7 @@ class Law(ABC):
     def records(cls, axes: int = 0) -> LawRecords:
         """Return the types of the law's coefficients and state, with their allowed values, for a law of `axes` axes.
 
-        0 stands for the number of the class. Raises TypeError as `record_type` does.
+        With `axes` 0 the class's own number of axes counts. Raises TypeError as `record_type` does.
         """
         return LawRecords(
             cls.kind, axes or cls.axes, record_type(cls.coefficients), record_type(cls.state), cls.allowed_coefficients,

@@ -31,7 +31,9 @@ edited often."""
 
 
 def source_digest() -> str:
-    """Return 24 hexadecimal digits of a digest of all sources of kernels, the compiler's version and the processor."""
+    """Return 24 hexadecimal digits of a digest of all sources in KERNELS, without modules of options, and of the
+    versions of compiler and Python and the processor.
+    """
     digest = hashlib.sha256()
     for place in KERNELS:
         source = PACKAGE / place

@@ -39,7 +39,7 @@ class Kernel:
         return numba.njit(cache=self._cached, **self.options)(self.py_func)
 
     def __call__(self, *arguments: Any) -> Any:
-        """Call the kernel, uncompiled within `allow_uncompiled`."""
+        """Call the kernel and return its result; within `allow_uncompiled`, run its Python function."""
         return (self.py_func if is_uncompiled_allowed() else self._dispatcher)(*arguments)
 
     def __getattr__(self, name: str) -> Any:
@@ -62,7 +62,7 @@ class KernelSymbol:
         self.__name__, self._resolve_type, self._uncompiled = name, resolve_type, uncompiled
 
     def __call__(self, *arguments: Any) -> Any:
-        """Call the Python equivalent. Raises NotImplementedError if there is none."""
+        """Call the Python equivalent and return its result. Raises NotImplementedError if there is none."""
         if self._uncompiled is None:
             raise NotImplementedError(f"{self.__name__} runs in compiled kernels only")
         return self._uncompiled(*arguments)

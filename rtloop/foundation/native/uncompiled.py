@@ -58,7 +58,7 @@ class UncompiledFunction:
         self._function, self.address = function, register_function(function)
 
     def __call__(self, *arguments: int) -> Any:
-        """Call the function with addresses."""
+        """Call the function with integers, such as addresses, and return its result."""
         return self._function(*arguments)
 
 

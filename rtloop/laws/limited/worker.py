@@ -151,7 +151,7 @@ def _line_text(error: BaseException, file: str) -> str:
 
 
 def _error_text(error: BaseException) -> str:
-    """Return type and message of an error on one line, even if its `__str__` raises."""
+    """Return type and message of an error on one line, even if its `__str__` raises, with the hint of `_suggestion`."""
     try:
         message = " ".join(str(error).split()) + _suggestion(error)
     except BaseException:
