@@ -10,7 +10,7 @@ RESTARTED, NOT_READY, LINK, SILENT, NOT_A_NUMBER, LINE_GONE = 101, 102, 103, 104
 TEXTS = {
     VERSION_REFUSED: "the node speaks another version of the protocol",
     BUSY: "another controller drives this node; stop the other controller",
-    UNKNOWN: "the node has no session with this loop, so its outputs do not follow",
+    UNKNOWN: "the node has no session with this loop, so its outputs do not follow; start the loop again",
     WATCHDOG: "no drive reached the node for longer than watchdog_ms, and its watchdog has parked its outputs",
     SIZE: "the node has another number of outputs; compare driver.outputs",
     RANGE: "the node refused a drive outside its range",

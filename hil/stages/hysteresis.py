@@ -43,7 +43,10 @@ STATE = [("plays_v", "f8", (MAX_PLAYS,)), ("sums_um", "f8", (4,))]
 
 @jit_inline
 def play_output(drive_v, threshold_v, held_v):
-    """Return the play operator's next output [V]: `held_v` unless the drive pushes one of the two sides of the gap."""
+    """Return the play operator's next output [V] after `held_v`: max(u − r, min(u + r, held)) for drive u, threshold r.
+
+    A NaN drive leaves `held_v`.
+    """
     low_v, high_v = drive_v - threshold_v, drive_v + threshold_v
     lowered_v = high_v if high_v < held_v else held_v
     return low_v if low_v > lowered_v else lowered_v

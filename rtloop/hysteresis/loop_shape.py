@@ -32,7 +32,8 @@ def loop_shape(drive: Real, output: Real) -> LoopShape:
     """Return the shape of the last whole loop in `drive` and `output`, each (samples,).
 
     Both branches are averaged in bins of the drive to reduce the effect of noise. If fewer than two branches cover 98 %
-    of the drive's range, the last two branches count. With fewer than two turning points, `height` is NaN.
+    of the drive's range, the last two branches count. With fewer than two turning points, `height` is NaN and `width`
+    the range of the whole output.
     """
     span = float(np.ptp(drive))
     turns = turning_points(drive, 0.5 * span)

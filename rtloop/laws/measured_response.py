@@ -32,8 +32,9 @@ def measure_response(
 ) -> Complex:
     """Return the response (frequencies, axes, axes) from errors, its columns, to commands, its rows.
 
-    `tick` runs one tick with errors (axes,) and returns the commands (axes,), all in µm; `restart` returns to rest.
-    Raises ValueError for frequencies beyond 0 … half of the rate, and for a response that does not settle.
+    `tick` runs one tick with errors (axes,) and returns the commands (axes,), all in µm; `restart` returns to rest. The
+    error of one axis at a time is a sine of `amplitude_um`. Raises ValueError for frequencies beyond 0 … half of the
+    rate, and for a response that does not settle.
     """
     frequencies = np.atleast_1d(np.asarray(frequencies_hz, float))
     highest_hz = 0.5 / period_s

@@ -134,7 +134,7 @@ class Transfer:
 def require_order(order: int) -> None:
     """Raise ValueError for an order above MAX_ORDER, whose roots would take seconds."""
     if order > MAX_ORDER:
-        raise ValueError(f"order {order}; allowed: up to {MAX_ORDER}")
+        raise ValueError(f"transfer function: order {order}; allowed: up to {MAX_ORDER}")
 
 
 def factored_response(zeros: Complex, poles: Complex, gain: float, complex_points: npt.ArrayLike) -> Complex:

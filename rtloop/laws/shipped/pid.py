@@ -71,6 +71,6 @@ class Pid(Controller):
 
     @staticmethod
     def enter(c: Any, s: Any, told: Any) -> None:
-        """Set the derivative as after a constant position, and the integral so that the command continues."""
+        """Set, in a state of zeros, the integral so that the command continues; the position was constant before."""
         s.last_um = told.position_um
         s.integral_um = told.command_um - c.kp * told.error_um

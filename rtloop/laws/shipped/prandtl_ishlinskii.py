@@ -45,7 +45,10 @@ STATE = cache_line_record(
 
 @jit_inline
 def play_output(value, threshold, last):
-    """Return the play operator of half-width `threshold` ≥ 0 after state `last`; comparisons define NaN and −0."""
+    """Return the output of the play operator of half-width `threshold` ≥ 0 for `value` after the output `last`.
+
+    By comparisons, so that NaN leaves `last`, and −0 is the same on every machine.
+    """
     low = value - threshold
     high = value + threshold
     raised = low if low > last else last
