@@ -30,8 +30,9 @@ def examine(
     """Examine recordings on workers; with `folder`, their rows are stored there, and stored ones are not repeated.
 
     Returns {recordings, pending, stored, counts, duration_s, rate_per_s, verdicts}: `verdicts` has the rows by path,
-    `stored` is the number of rows from earlier calls, `pending` the number of recordings without a row after a stop. A
-    stop lets the recordings end that run; `on_progress` receives the number of rows.
+    `stored` is the number of rows from earlier calls, `pending` the number of recordings without a row after a stop.
+    After a request to stop, the recordings that were submitted end and no other one starts. `on_progress` receives the
+    number of rows.
 
     Raises UnavailableError if the scheduler is gone, a worker has another version or another process uses the folder,
     OutputError if a row cannot be stored.
@@ -61,8 +62,8 @@ class Archive:
     def run(self, on_progress: Callable[[int], None], is_stop_requested: Callable[[], bool]) -> None:
         """Examine the recordings; `on_progress` receives the number that have a verdict.
 
-        A stop lets the recordings end that run. Raises UnavailableError if the scheduler is gone or a worker has
-        another version, OutputError if a verdict cannot be stored.
+        After a request to stop, the recordings that were submitted end and no other one starts. Raises UnavailableError
+        if the scheduler is gone or a worker has another version, OutputError if a verdict cannot be stored.
         """
         tasks = [Task((recording,)) for recording in self._table.missing()]
         stored = len(self._table.rows)
@@ -70,7 +71,7 @@ class Archive:
         Dispatcher(self._workers, self).run(tasks, lambda done: on_progress(stored + done), is_stop_requested)
 
     def submit(self, items: tuple[ArchivedRecording, ...]) -> Future[Row]:
-        """Examine a recording in a worker."""
+        """Start the examination of one recording in a worker; return the future of its row."""
         return self._workers.submit(self._examination.function, items[0].paths, __version__)
 
     def store(self, items: tuple[ArchivedRecording, ...], result: Row) -> None:
@@ -78,5 +79,5 @@ class Archive:
         self._table.add(items[0], result)
 
     def set_aside(self, item: ArchivedRecording) -> None:
-        """Store that the workers of a recording died. Raises OutputError if the system refuses."""
-        self._table.add(item, {"verdict": CRASHED, "reason": "the worker died each time"})
+        """Store that each worker that examined a recording died. Raises OutputError if the system refuses."""
+        self._table.add(item, {"verdict": CRASHED, "reason": "each worker process that examined it died"})

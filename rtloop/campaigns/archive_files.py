@@ -31,9 +31,9 @@ class ArchivedRecording(NamedTuple):
 def find_recordings(patterns: Iterable[Path]) -> list[ArchivedRecording]:
     """Return the recordings that patterns, files and folders name, by path, each once.
 
-    In a pattern, ** stands for any number of folders; a folder stands for all recordings below it. A folder below that
-    cannot be read is returned like a recording. Raises RecordingError for a file that cannot be opened, and for a
-    pattern or a folder without a recording.
+    In a pattern, ** stands for any number of folders; a folder stands for all recordings below it. A subfolder that
+    cannot be read is returned like a recording. An unfinished file beside its recovered one is left out. Raises
+    RecordingError for a file that cannot be opened, and for a pattern or a folder without a match.
     """
     paths = {os.path.abspath(path) for pattern in patterns for path in _expand(pattern)}
     return [_read_status(run) for run in sorted(_group_runs(sorted(paths)))]
@@ -67,7 +67,10 @@ def _expand(pattern: Path) -> Iterator[str]:
 
 
 def _files_below(folder: Path, suffixes: tuple[str, ...] = (FINISHED_SUFFIX, UNFINISHED_SUFFIX)) -> Iterator[str]:
-    """Yield the files below a folder whose names end in `suffixes`, and the folders that cannot be read."""
+    """Yield the files below a folder whose names end in `suffixes`, then the folders that cannot be read.
+
+    An unfinished file whose recovered file exists is left out.
+    """
     unreadable: list[str] = []
     for parent, _, names in os.walk(folder, onerror=lambda error: unreadable.append(error.filename)):
         paths = (os.path.join(parent, name) for name in names if name.endswith(suffixes))
@@ -81,9 +84,9 @@ def _is_recovered(path: str) -> bool:
 
 
 def _group_runs(paths: Sequence[str]) -> Iterator[tuple[str, ...]]:
-    """Yield the files of each run, in their order.
+    """Yield the files of each run, in the order of the sorted `paths`; a file of no rotated run is a run of its own.
 
-    Files are of one run if their names say so, and if `open_run` accepts them together.
+    Files are of one run if their names differ in the number alone, and if `open_run` accepts them together.
     """
     candidates: defaultdict[str, list[str]] = defaultdict(list)
     for path in paths:

@@ -35,6 +35,11 @@ class VerdictTable:
     def __init__(
         self, recordings: Sequence[ArchivedRecording], columns: Sequence[str], folder: Path | None, file_name: str
     ) -> None:
+        """Make and lock `folder`, and read the rows of unchanged recordings there; without a folder there are none.
+
+        `columns` are the names of the columns of the examination. A stored row whose verdict may change without the
+        file, one of REPEATED, is left out.
+        """
         self._recordings, self._columns = recordings, columns
         self.rows: dict[str, Row] = {}
         self.path = None if folder is None else folder / file_name
@@ -60,7 +65,8 @@ class VerdictTable:
     def _open(self, path: Path) -> None:
         """Read the stored rows, and write them to a new file that replaces the old one. Raises OutputError.
 
-        The new file has one line for each path, and no line that was cut off.
+        The new file has one line for each path, no line that was cut off, and no verdict of REPEATED. Rows of unchanged
+        recordings, by this version of rtloop, are stored in `rows`.
         """
         with output_errors(path):
             stored = {name: row for name, row in _read_rows(path).items() if row["verdict"] not in REPEATED}
@@ -84,7 +90,7 @@ class VerdictTable:
         return [recording for recording in self._recordings if recording.paths[0] not in self.rows]
 
     def add(self, recording: ArchivedRecording, values: Row) -> None:
-        """Add the row of a recording, with None for columns that `values` lacks. Raises OutputError."""
+        """Add the row of a recording, to the file first, with None for columns that `values` lacks. Raises OutputError."""
         row = {**self._empty(recording), **values}
         if self.path is not None:
             with output_errors(self.path):
@@ -92,11 +98,11 @@ class VerdictTable:
         self.rows[recording.paths[0]] = row
 
     def _empty(self, recording: ArchivedRecording) -> Row:
-        """Return the row of a recording without a verdict."""
+        """Return the row of a recording without a verdict: None in all columns of the examination, reason ""."""
         return {**_facts(recording), "verdict": None, **dict.fromkeys(self._columns), "reason": ""}
 
     def ordered_rows(self) -> list[Row]:
-        """Return the rows in the order of the recordings."""
+        """Return the rows in the order of the recordings, of which some may have no row yet."""
         return [self.rows[recording.paths[0]] for recording in self._recordings if recording.paths[0] in self.rows]
 
     def counts(self) -> dict[str, int]:
@@ -112,7 +118,7 @@ class VerdictTable:
 
 
 def _facts(recording: ArchivedRecording) -> Row:
-    """Return the values of a recording that a stored row must have to count."""
+    """Return the values that a stored row of a recording must have to count: path, files, size, mtime_ns, rtloop."""
     return {
         "path": recording.paths[0],
         "files": len(recording.paths),

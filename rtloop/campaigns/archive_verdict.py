@@ -70,7 +70,8 @@ INFO = Examination(summarise_files, ("ticks", "duration_s", "lost", "trips"), RE
 def _examine(paths: Sequence[str], version: str, judge: Callable[[list[Path]], Row]) -> Row:
     """Return the row that `judge` makes of a recording; any error becomes a verdict.
 
-    Raises UnavailableError if this worker's version of rtloop is not `version`.
+    The paths of the files are taken out of its reason. Raises UnavailableError if this worker's version of rtloop is
+    not `version`.
     """
     if version != __version__:
         raise UnavailableError(
@@ -91,12 +92,12 @@ def _examine(paths: Sequence[str], version: str, judge: Callable[[list[Path]], R
 
 
 def _row(verdict: str, reason: str = "", **values: Any) -> Row:
-    """Return a row without the recording's name."""
+    """Return the row {verdict, **values, reason}; `values` are columns of the examination."""
     return {"verdict": verdict, **values, "reason": reason}
 
 
 def _replay(paths: list[Path]) -> Row:
-    """Replay a recording in one process. Raises RecordingError if it cannot be read."""
+    """Return the row of a recording from its replay in this process. Raises RecordingError if it cannot be read."""
     if _is_unfinished(paths):
         return _row(UNFINISHED, _unfinished_reason(paths[0]))
     recording = load(paths)
@@ -115,7 +116,11 @@ def _replay(paths: list[Path]) -> Row:
 
 
 def _judge_report(report: ReplayReport, missing: Sequence[str], is_cut_off: bool) -> Row:
-    """Return the row of a replay; `missing` are the messages about missing files of the run."""
+    """Return the row of a replay: differs, damaged, identical or not verified, the first of these that applies.
+
+    `missing` are the messages about missing files of the run, which do not count as damage; `is_cut_off` says that the
+    recording has no recorded end, which does.
+    """
     if difference := report.first_difference:
         values = f"recorded {difference['recorded']!r}, replayed {difference['replayed']!r}"
         return _row(DIFFERS, values, tick=difference["tick"], column=difference["signal"])
@@ -128,7 +133,10 @@ def _judge_report(report: ReplayReport, missing: Sequence[str], is_cut_off: bool
 
 
 def _summarise(paths: list[Path]) -> Row:
-    """Summarise a recording. Raises RecordingError if it cannot be read."""
+    """Return the row of a recording with its figures: unfinished, damaged or readable.
+
+    Raises RecordingError if it cannot be read.
+    """
     summary, missing = summarise(paths), _missing_files(paths)
     figures = _figures(summary)
     if _is_unfinished(paths):
@@ -140,7 +148,7 @@ def _summarise(paths: list[Path]) -> Row:
 
 
 def _figures(summary: Summary) -> Row:
-    """Return the figures of a summary by column."""
+    """Return the figures of a summary: {ticks, duration_s, lost, trips}, a trip as {tick, causes, reason}."""
     trips = [asdict(trip) for trip in summary.trips]
     figures = (summary.ticks_logged, summary.duration_s, summary.ticks_lost, trips)
     return dict(zip(INFO.columns, figures, strict=True))
@@ -152,18 +160,18 @@ def _is_unfinished(paths: Sequence[Path]) -> bool:
 
 
 def _unfinished_reason(path: Path) -> str:
-    """Say why a file is unfinished. Raises RecordingError if its lock cannot be tested."""
+    """Return the reason why a file is unfinished. Raises RecordingError if its lock cannot be tested."""
     if is_being_written(path):
         return "a recorder is writing this file"
     return "left from an unfinished run; `rtloop recover` completes it"
 
 
 def _missing_files(paths: Sequence[Path]) -> list[str]:
-    """Return a message for each missing file of a rotated run."""
+    """Return a message for each missing file of a rotated run; [] if none is missing."""
     with open_run(paths) as readers:
         return missing_parts(readers)
 
 
 def _reasons(messages: Sequence[str]) -> str:
-    """Return the first messages, each once, as one text."""
+    """Return the first MAX_REASONS different messages as one text, "" for none."""
     return "; ".join(list(dict.fromkeys(messages))[:MAX_REASONS])

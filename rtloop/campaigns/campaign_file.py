@@ -115,9 +115,10 @@ class Campaign:
 
 
 def load_campaign(path: Path, rigs: int | None = None, configuration: Path | None = None) -> Campaign:
-    """Return the campaign of a file; `rigs` replaces the number of sampled rigs, `configuration` the file's path of it.
+    """Return the campaign of the CAMPAIGN.toml at `path`, with the name "CAMPAIGN-CONFIGURATION".
 
-    Its name is the file's with the configuration's. The limits of a specification follow the configuration.
+    `rigs` replaces the number of sampled rigs, `configuration` the path of the configuration; its axis's specification,
+    and so its limits, count then.
 
     Raises InputFileError for an unreadable file, ConfigError with all faults of the file or of its configuration, and
     for a recording without lateness, RecordingError for a file that is no recording.
@@ -149,7 +150,8 @@ def load_campaign(path: Path, rigs: int | None = None, configuration: Path | Non
 def _limits(options: CampaignOptions, path: Path, configuration: Configuration) -> dict[str, float]:
     """Return the largest value of each limited figure: from the file, and for steps from the specification.
 
-    The specification is the campaign's, else the axis's. Raises InputFileError, ConfigError for its faults.
+    The specification is the campaign's, else the axis's; without one, the file's limits alone count. Raises
+    InputFileError, ConfigError for its faults.
     """
     axis = next(axis for axis in configuration.axes if options.axis in ("", axis.name))
     specification = path.parent / options.specification if options.specification else None

@@ -40,7 +40,8 @@ class CaseResult:
 
     `values` are read back from the rig that ran. `trips` has the causes of a trip for each experiment, "" without one;
     `missed` names every limit that is exceeded and every trip; `ratio` is the largest figure in parts of its limit,
-    infinite after a trip. `refusal` says why a rig cannot run; it then has no figures, and `values` are those drawn.
+    infinite after a trip, 0 without limits. `refusal` says why a rig cannot run, "" if it ran; a rig that cannot run
+    has no figures and the ratio NaN, and its `values` are those drawn.
     """
 
     rig: int
@@ -79,7 +80,10 @@ class CaseRunner:
         return self._builder.rate_hz
 
     def sample_values(self, rig: int) -> dict[str, Any]:
-        """Return the values of a rig's uncertain keys and the seed of its noise; the configured ones for NOMINAL."""
+        """Return the values of a rig's uncertain keys and the seed of its noise; the configured ones for NOMINAL.
+
+        Raises ValueError for a rig beyond the campaign's number of rigs.
+        """
         options = self.options
         if rig == NOMINAL:
             return {key: self._builder.nominal_value(key) for key in dict.fromkeys((SEED_KEY, *self.keys))}
@@ -94,7 +98,8 @@ class CaseRunner:
     def quantile_value(self, key: str, share: float) -> Any:
         """Return the value of a key at a `share`, in (0, 1), of its distribution.
 
-        Raises ValueError for a relative distribution of a key that has no number.
+        Raises ValueError for a relative distribution of a key that has no number, and for limits of a normal
+        distribution that it does not reach.
         """
         distribution = self.options.uncertain[key]
         value = distribution.quantile(share)
@@ -106,7 +111,11 @@ class CaseRunner:
         return nominal * value
 
     def run(self, rig: int, values: Mapping[str, Any] | None = None) -> CaseResult:
-        """Run all experiments of a rig; `values` by key replace the drawn ones. Returns figures and verdict."""
+        """Run all experiments of a rig; return its figures and verdict, with a `refusal` for a rig that cannot run.
+
+        `values` by key replace all drawn ones, the noise's seed included. Raises RuntimeError if the rig that runs has
+        another value.
+        """
         drawn = self.sample_values(rig) if values is None else dict(values)
         try:
             loop = self._builder.loop(drawn)
@@ -126,8 +135,10 @@ class CaseRunner:
         return self._builder.text(values, experiment, heading)
 
     def _run_experiment(self, loop: Loop, drawn: Mapping[str, Any], experiment: Experiment) -> _Outcome:
-        """Run one experiment on a rig. Raises ValueError for an impossible rig, and where ticks were so late that the
-        motion between them is unknown, RuntimeError for a value that was not applied.
+        """Run one experiment on a rig; return its outcome, with infinite figures if the loop ended early.
+
+        Raises ValueError for an impossible rig, and where ticks were so late that the motion between them is unknown;
+        RuntimeError if the rig that runs has another value than the one `drawn`.
         """
         driver = self._builder.driver(loop, drawn, experiment)
         values = {key: option_value(loop.configuration, driver.options, key) for key in drawn}
@@ -150,7 +161,10 @@ class CaseRunner:
         return _Outcome(experiment.measure(motion), ", ".join(trip_causes(flags)), values)
 
     def _run_loop(self, plan: Plan, driver: SimDriver, ticks: int) -> dict[str, Real]:
-        """Run a plan; return the recorded columns, (ticks,), that figures and verdict need."""
+        """Run a plan for `ticks`; return by name the recorded columns that figures and verdict need.
+
+        Each is (n,): n is `ticks`, or less if a law raised an error, which ends the loop early.
+        """
         names = (
             "flags",
             "periods_missed",
@@ -169,12 +183,13 @@ class CaseRunner:
         return dict(zip(names, columns[:, :done], strict=True))
 
     def _key_fault(self, key: str) -> str:
-        """Return the fault of an uncertain key that is unknown, set by an experiment, or without effect.
+        """Return the fault of an uncertain key that is unknown, fixed, set by an experiment, or without effect.
 
-        Returns "" for a key without a fault.
+        A value at which the rig cannot run is a fault, too; tried are the quartiles, or each entry of a choice. Returns
+        "" for a key without a fault.
         """
         if key.startswith(FIXED_KEYS):
-            return f"{key}: this key cannot be uncertain"
+            return f"{key}: this key cannot be uncertain, as other settings depend on it; remove it from [uncertain]"
         disturbing = [experiment.label for experiment in self.options.experiment if experiment.disturbance is not None]
         if disturbing and "disturbance" in key.split("."):
             return f"{key}: experiment {disturbing[0]!r} sets the disturbance; remove the key or the experiment"
@@ -188,10 +203,13 @@ class CaseRunner:
             return text if text.startswith(key) else f"{key}: {text}"
         if len(rigs) > 1:
             return ""
-        return f"{key}: rigs with {values[1]!r} and {values[2]!r} are equal in all that runs; remove the key"
+        return f"{key}: it has no effect: rigs with {values[1]!r} and {values[2]!r} run alike; remove the key"
 
     def _experiment_fault(self, experiment: Experiment) -> str:
-        """Return the fault of an experiment that the loop's rate does not allow, or that is too short for a figure."""
+        """Return the fault of an experiment that the loop's rate does not allow, or that is too short for a figure.
+
+        Returns "" for an experiment without a fault.
+        """
         try:
             loop = self._builder.loop({})
             plan, ticks = experiment_plan(loop.plan, self._builder.axis, experiment, 0)
@@ -217,7 +235,7 @@ def _require_equal(computed_um: Real, recorded_um: Real) -> None:
     """
     if not np.array_equal(computed_um, recorded_um, equal_nan=True):
         raise ValueError(
-            "the actuator moved in periods without a tick, and no record has this motion; "
+            "the actuator moved in periods without a tick, so that its true position there is unknown; "
             "set driver.latency_ticks to 0, and leave out creep and a loss of drive, or make the ticks less late"
         )
 
@@ -225,9 +243,10 @@ def _require_equal(computed_um: Real, recorded_um: Real) -> None:
 def _judge(
     figures: Mapping[str, float], trips: Mapping[str, str], limits: Mapping[str, float]
 ) -> tuple[tuple[str, ...], float]:
-    """Return the missed limits and the trips, and the largest figure in parts of its limit, infinite after a trip.
+    """Return the names of missed limits with the trips as texts, and the largest ratio of a figure to its limit.
 
-    Of a limit of 0, which has no parts, 1 + the figure counts.
+    The ratio is infinite after a trip, and 0 without limits. Of a figure above a limit of 0 or less, 1 + the figure
+    counts; of one within it, 0.
     """
     missed = [name for name, limit in limits.items() if not figures[name] <= limit]
     missed += [f"{label} tripped: {trip}" for label, trip in trips.items() if trip]

@@ -53,8 +53,9 @@ class Comparison:
 def compare_campaigns(first: Path, second: Path) -> Comparison:
     """Return the comparison of the results in two folders, over the sampled rigs that both have and neither refused.
 
-    Raises ConfigError for folders whose rigs differ in a value, or that share no rig; InputFileError for a folder
-    without results.
+    Of Saltelli's design, the independent rows alone count. Raises ConfigError for folders whose keys, experiments or
+    limits differ, whose rigs differ in a value, or that share no rig; InputFileError for a folder without results or
+    with damaged ones, MissingExtra without pyarrow.
     """
     manifests = [read_manifest(folder) for folder in (first, second)]
     columns = [_columns(folder) for folder in (first, second)]
@@ -69,12 +70,14 @@ def compare_campaigns(first: Path, second: Path) -> Comparison:
     different = [key for key in keys if not np.array_equal(paired[0][key], paired[1][key])]
     if different or set(manifests[0]["keys"]) != set(manifests[1]["keys"]):
         unequal = different or sorted(set(manifests[0]["keys"]) ^ set(manifests[1]["keys"]))
-        raise ConfigError(source, [f"{', '.join(unequal)}: the rigs differ; allowed: the same rigs in both"])
+        raise ConfigError(
+            source, [f"{', '.join(unequal)}: the rigs differ; run both campaigns with the same seed, sampling and keys"]
+        )
     passed = [table["status"] == PASSED for table in paired]
     only_first, only_second = (int(np.count_nonzero(a & ~b)) for a, b in (passed, passed[::-1]))
     for part in ("experiments", "limits"):
         if manifests[0][part] != manifests[1][part]:
-            raise ConfigError(source, [f"{part}: they differ; allowed: equal ones, which CAMPAIGN.toml can set"])
+            raise ConfigError(source, [f"{part}: differ; allowed: equal ones in both; set them in CAMPAIGN.toml"])
     figures = manifests[0]["figures"]
     return Comparison(
         (manifests[0]["campaign"], manifests[1]["campaign"]),
@@ -88,7 +91,10 @@ def compare_campaigns(first: Path, second: Path) -> Comparison:
 
 
 def mcnemar(only_first: int, only_second: int) -> float:
-    """Return the two-sided p-value of McNemar's exact test for two counts of rigs that pass in one campaign alone."""
+    """Return the two-sided p-value of McNemar's exact test for two counts of rigs that pass in one campaign alone.
+
+    It is 1 if both counts are 0.
+    """
     from scipy.stats import binomtest
 
     total = only_first + only_second
@@ -98,7 +104,7 @@ def mcnemar(only_first: int, only_second: int) -> float:
 def paired_difference(first: Real, second: Real, seed: int = 0) -> FigureDifference:
     """Return the median of `second` − `first` (n,) over the pairs that are finite, with its bootstrap interval.
 
-    The interval is NaN for less than two pairs.
+    `seed` is that of the bootstrap. The interval is NaN for less than two pairs, the median for none.
     """
     from scipy.stats import bootstrap
 
@@ -116,7 +122,7 @@ def paired_difference(first: Real, second: Real, seed: int = 0) -> FigureDiffere
 
 
 def _columns(folder: Path) -> dict[str, Any]:
-    """Return the columns of all sampled rigs in a folder that could run, by name."""
+    """Return the columns of all sampled rigs in a folder that could run and are independent, by name."""
     columns = read_columns(folder)
     counted = independent_rigs(columns, read_manifest(folder))
     return {name: values[counted] for name, values in columns.items()}

@@ -44,10 +44,11 @@ class Coordinator:
     def run(
         self, units: list[Unit], on_progress: Callable[[Progress], None], is_stop_requested: Callable[[], bool]
     ) -> bool:
-        """Run the units; return whether all rigs have results now. A stop lets the units end that run.
+        """Run the rigs of `units` without a result; return whether all of them have results now.
 
-        Raises the error of a unit, such as OtherVersion; UnavailableError if the scheduler is gone; OutputError if the
-        store cannot be written. Results that came before are stored.
+        After a request to stop, the tasks that were submitted end and no other one starts. Raises the error of a task,
+        such as OtherVersion; UnavailableError if the scheduler is gone; LoopFault if the nominal rig kills its workers;
+        OutputError if the store cannot be read or written. Results that came before are stored.
         """
         missing = [(unit, self._store.missing(unit)) for unit in units]
         tasks = (
@@ -63,7 +64,7 @@ class Coordinator:
         return stored + done == total
 
     def submit(self, items: tuple[UnitRig, ...]) -> Future[list[CaseResult]]:
-        """Run rigs of one unit in a worker."""
+        """Start rigs of one unit in a worker; return the future of their results, in the order of `items`."""
         return self._workers.submit(run_unit, self._campaign, [item.rig for item in items], self._facts)
 
     def store(self, items: tuple[UnitRig, ...], result: Sequence[CaseResult]) -> None:
@@ -71,13 +72,13 @@ class Coordinator:
         self._store.add(items[0].unit, result)
 
     def set_aside(self, item: UnitRig) -> None:
-        """Store that the workers of a rig died. Raises OutputError if the system refuses.
+        """Store that each worker that ran a rig died, and add the rig to `crashed`.
 
-        Raises LoopFault for the nominal rig: then workers cannot run at all.
+        Raises LoopFault for the nominal rig: then workers cannot run at all. Raises OutputError if the system refuses.
         """
         if item.rig == NOMINAL:
             raise LoopFault(
-                "the nominal rig ended each worker that ran it; a script must call rtloop.campaign below "
+                "each worker process that ran the nominal rig died; a script must call rtloop.campaign below "
                 '`if __name__ == "__main__":`, and the configuration must run with `rtloop run --unpaced`'
             )
         self.crashed.append(item.rig)

@@ -21,7 +21,10 @@ POLL_S = 0.5
 
 
 class Task(NamedTuple):
-    """Items that a worker handles, one after the other. With `alone`, no other task runs beside it."""
+    """Items that one worker handles, one after the other. With `alone`, no further task starts until it has ended.
+
+    `deaths` counts the workers that died while they ran it alone.
+    """
 
     items: tuple[Any, ...]
     alone: bool = False
@@ -32,7 +35,7 @@ class Job(Protocol):
     """Work on items: its start in a worker, and the storage of its results."""
 
     def submit(self, items: tuple[Any, ...]) -> Future[Any]:
-        """Start the work on the items of a task in a worker."""
+        """Start the work on the items of a task in a worker; return the future of its result, which `store` takes."""
         ...
 
     def store(self, items: tuple[Any, ...], result: Any) -> None:
@@ -40,7 +43,10 @@ class Job(Protocol):
         ...
 
     def set_aside(self, item: Any) -> None:
-        """Store that the workers of an item died. Raises OutputError if the system refuses."""
+        """Store that an item has no result, as each worker that ran it died.
+
+        Raises OutputError if the system refuses.
+        """
         ...
 
 
@@ -57,8 +63,9 @@ class Dispatcher:
     ) -> int:
         """Run the tasks; return the number of items that are stored or set aside, which `on_progress` receives too.
 
-        A stop lets the tasks end that run. Raises the error of a task, UnavailableError if the scheduler is gone, and
-        the errors of the job. Results that came before are stored.
+        `on_progress` is called after each end of tasks. After a request to stop, submitted tasks end and are stored,
+        and no other one starts. Raises the error of a task, UnavailableError if the scheduler is gone, and the errors
+        of the job. Results that came before are stored.
         """
         waiting, done = iter(tasks), 0
         while self._fill(waiting, is_stop_requested()):
@@ -69,7 +76,11 @@ class Dispatcher:
         return done
 
     def _fill(self, tasks: Iterator[Task], is_stopping: bool) -> int:
-        """Submit tasks up to the limit; return the number of tasks that run."""
+        """Submit the next tasks; return the number of submitted tasks that have not ended, 0 at the end.
+
+        Each worker gets up to WAITING_FOR_EACH. Items whose worker died go first, alone, once no other task runs. While
+        `is_stopping`, none is submitted. Replaces dead workers; raises any other error of `Job.submit`.
+        """
         while not is_stopping and len(self._running) < WAITING_FOR_EACH * self._workers.count:
             if any(task.alone for task in self._running.values()) or (self._suspects and self._running):
                 break
@@ -104,9 +115,10 @@ class Dispatcher:
         return done
 
     def _store_result(self, future: Future[Any], died: list[Task]) -> int:
-        """Store the result of a task; return its number of items. A task whose worker died is appended to `died`.
+        """Store the result of the task of `future`, which ended; return its number of items.
 
-        Raises any other error of the task.
+        If the worker died, append the task to `died` and return 0. Raises any other error of the task, and the errors
+        of the job.
         """
         task = self._running.pop(future)
         try:
@@ -121,9 +133,9 @@ class Dispatcher:
         return len(task.items)
 
     def _repeat(self, task: Task) -> int:
-        """Run the items of a task again, each alone; set an item aside that killed its worker TRIES_ALONE times alone.
+        """Queue the items of a task whose worker died, to run again each alone; return the number of items set aside.
 
-        Returns the number of items that were set aside.
+        An item is set aside in place of queueing once TRIES_ALONE workers died while they ran it alone.
         """
         if not task.alone:
             self._suspects.extend(Task((item,), alone=True) for item in task.items)

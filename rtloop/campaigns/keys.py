@@ -53,7 +53,10 @@ def _set_value(tables: dict[str, Any], key: str, value: Any) -> None:
 
 
 def _step(node: Any, part: str, key: str) -> Any:
-    """Return the entry `part` of a table or list on the path `key`. Raises ValueError where there is none."""
+    """Return the entry `part` of a table, which must have it, or of a list, by name or number, on the path `key`.
+
+    Raises ValueError for a list without it, and for a node that is neither a table nor a list.
+    """
     if isinstance(node, dict):
         return node[part]
     if isinstance(node, list):
@@ -95,7 +98,10 @@ def option_value(configuration: Configuration, driver_options: Options, key: str
 
 
 def _attribute(options: Any, path: str, key: str) -> Any:
-    """Return the value at `path` below an options object. Raises ValueError for a part that does not exist."""
+    """Return the value at the dotted `path` below an options object; `key` is the whole key, for messages.
+
+    Raises ValueError for a part that does not exist.
+    """
     value = options
     for part in path.split("."):
         if isinstance(value, tuple) and part.isdecimal() and int(part) < len(value):
@@ -110,7 +116,7 @@ def _attribute(options: Any, path: str, key: str) -> Any:
 
 
 def _choices_text(value: Any) -> str:
-    """Return the parts that a value has as text; "" where it has none."""
+    """Return the end of a message, "; allowed: …", with the parts that a value has; "" where it can have none."""
     names = list(type(value).model_fields) if isinstance(value, Options) else []
     names = list(value) if isinstance(value, Mapping) else names
     if isinstance(value, tuple):

@@ -55,7 +55,8 @@ class RankedKeys(NamedTuple):
 def render_campaign(folder: Path, summary: CampaignSummary, link: Link) -> str:
     """Return the report of the results in `folder` as one HTML page.
 
-    Raises InputFileError for a folder without results, MissingExtra without pyarrow or matplotlib.
+    `summary` is that of the folder; `link` returns a file's path relative to the folder of the page. Raises
+    InputFileError for a folder without results or with damaged ones, MissingExtra without pyarrow or matplotlib.
     """
     section = _campaign_section(folder, summary, link)
     return _render(f"{summary.name}: campaign", [section], None)
@@ -66,7 +67,7 @@ def render_comparison(
 ) -> str:
     """Return the comparison of two campaigns, followed by the report of each, as one HTML page.
 
-    Raises as `render_campaign` does.
+    `summaries` are in the order of `folders`; `link`, and the errors, are as in `render_campaign`.
     """
     sections = [_campaign_section(folder, summary, link) for folder, summary in zip(folders, summaries, strict=True)]
     compared = {"result": comparison, "picture": _pairs_picture(folders)}
@@ -74,7 +75,10 @@ def render_comparison(
 
 
 def _render(title: str, sections: Sequence[Mapping[str, Any]], comparison: Mapping[str, Any] | None) -> str:
-    """Return the page of some campaigns, and of their comparison or None."""
+    """Return the HTML page of campaigns, given by `sections` as `_campaign_section` returns them.
+
+    `comparison` has the result of a comparison and its picture: {result, picture}; None without a comparison.
+    """
     return render_page(
         __package__,
         title=title,
@@ -90,7 +94,10 @@ def _render(title: str, sections: Sequence[Mapping[str, Any]], comparison: Mappi
 
 
 def value_text(value: Any) -> str:
-    """Return a value of a key or figure as text, a number that is not whole with four significant digits."""
+    """Return a value of a key or figure as text: a float with four significant digits, "–" for None and NaN.
+
+    An infinite number is "∞" or "−∞", a truth value "true" or "false"; whole numbers and texts stay as they are.
+    """
     if isinstance(value, np.generic):
         value = value.item()
     if value is None or (isinstance(value, float) and np.isnan(value)):
@@ -105,13 +112,16 @@ def value_text(value: Any) -> str:
 
 
 def percent_text(share: float) -> str:
-    """Return a share in percent with four significant digits; with more where it would be rounded to the whole."""
+    """Return a share, 0 … 1, in percent with four significant digits, without "%".
+
+    A share below 1 gets as many digits as it needs not to read as 100.
+    """
     texts = [f"{100 * share:#.{digits}g}" for digits in range(4, 17)]
     return f"{100 * share:g}" if share in (0, 1) else next((t for t in texts if t[:3] != "100"), texts[-1])
 
 
 def yield_text(estimate: Yield) -> str:
-    """Return the yield of rigs with its interval as a sentence."""
+    """Return the yield of rigs with its interval as a sentence; the sentence that there is none without a rig."""
     if not estimate.rigs:
         return "No rig could run, so that there is no yield."
     return (
@@ -121,7 +131,10 @@ def yield_text(estimate: Yield) -> str:
 
 
 def _estimate_text(sampling: str, estimate: Yield, rigs: int) -> str:
-    """Return in words the quantity that the yield estimates, and the meaning of its interval."""
+    """Return sentences on the quantity that the yield estimates and on its interval, by the rule of `sampling`.
+
+    `rigs` is the number of all sampled rigs, of which `estimate` counts only some for "saltelli".
+    """
     text = (
         "The yield estimates the share of rigs that pass among all rigs that are drawn from these distributions and "
         "can run. The interval is that of Clopper and Pearson (1934)"
@@ -137,7 +150,7 @@ def _estimate_text(sampling: str, estimate: Yield, rigs: int) -> str:
 
 
 def _campaign_section(folder: Path, summary: CampaignSummary, link: Link) -> dict[str, Any]:
-    """Return all values of the template for one campaign, its pictures included."""
+    """Return the values of the template for one campaign by name, its pictures included; raises as `render_campaign`."""
     manifest, columns = read_manifest(folder), read_columns(folder)
     sampled = _select(columns, columns["rig"] != NOMINAL)
     runnable = _select(sampled, sampled["status"] != REFUSED)
@@ -174,7 +187,7 @@ def _campaign_section(folder: Path, summary: CampaignSummary, link: Link) -> dic
 
 
 def _nominal_text(nominal: Mapping[str, Any]) -> str:
-    """Return the verdict of the nominal rig as a sentence, "" without its result."""
+    """Return the verdict of the nominal rig, its row by column, with the reasons as a sentence; "" for {}."""
     if not nominal:
         return ""
     reasons = f": {nominal['missed']}" if nominal["status"] in (FAILED, REFUSED) else ""
@@ -182,7 +195,7 @@ def _nominal_text(nominal: Mapping[str, Any]) -> str:
 
 
 def _address(path: str) -> str:
-    """Return the address of a relative path; every byte that has a meaning in addresses is quoted."""
+    """Return the URL of a relative path: all bytes but letters, digits and "/_.-~" are percent-encoded."""
     return quote(os.fsencode(path))
 
 
@@ -198,7 +211,10 @@ def _figure_values(columns: Columns, name: str, limit: float, nominal: Mapping[s
 
 
 def _range_text(values: Any) -> str:
-    """Return the least, the largest and the median of numbers (rigs,), or all different values of other ones."""
+    """Return the least, the largest and the median of numbers (rigs,) as text, or all different values of other ones.
+
+    Returns "–" without a value.
+    """
     if not len(values):
         return "–"
     if not _is_numeric(values):
@@ -208,7 +224,7 @@ def _range_text(values: Any) -> str:
 
 
 def abbreviate_keys(keys: Sequence[str]) -> dict[str, str]:
-    """Return for each key its last parts, as few of them as tell all keys apart."""
+    """Return a short name by key: its last parts between dots, of each key as many, as few as tell all keys apart."""
     for count in range(1, max((key.count(".") for key in keys), default=0) + 2):
         names = {key: ".".join(key.split(".")[-count:]) for key in keys}
         if len(set(names.values())) == len(keys):
@@ -221,6 +237,7 @@ def rank_keys(keys: Sequence[str], columns: Columns, summary: CampaignSummary) -
 
     The measure is the total sensitivity index where it exists, else the largest difference between the distributions of
     a key among passed and among failed rigs (Hornberger and Spear 1981, by the distance of Kolmogorov and Smirnov).
+    Without an index, and if all rigs pass or none does, the keys keep their order.
     """
     totals = {key: index.total for key, index in summary.sensitivity.get("passed", {}).items()}
     passed = columns["status"] == PASSED
@@ -251,7 +268,10 @@ def _is_numeric(values: Any) -> bool:
 
 
 def _key_numbers(values: Any) -> tuple[Real, tuple[str, ...]]:
-    """Return values (rigs,) of a key as numbers, and the texts for which the numbers 0, 1 … stand; () for numbers."""
+    """Return values (rigs,) of a key as floats, and the texts for which the numbers 0, 1 … stand.
+
+    The texts are sorted; there are none, (), if the values are numbers.
+    """
     if _is_numeric(values):
         return values.astype(float), ()
     texts, numbers = np.unique([value_text(value) for value in values], return_inverse=True)
@@ -261,7 +281,11 @@ def _key_numbers(values: Any) -> tuple[Real, tuple[str, ...]]:
 def _rigs_picture(
     ranked: Sequence[str], names: Mapping[str, str], columns: Columns, summary: CampaignSummary
 ) -> dict[str, bytes] | None:
-    """Return the picture of rigs over the first two keys, of a single key over the rig's number; None without rigs."""
+    """Return the picture, as PNG bytes by theme, of rigs over the first two `ranked` keys; None without rigs.
+
+    A single key is drawn over the rig's number. `names` has the short name of each key; `columns` are of the rigs that
+    could run.
+    """
     if not len(columns["rig"]):
         return None
     axes = []
@@ -279,7 +303,10 @@ def _rigs_picture(
 def _recordings_picture(
     folder: Path, rig: int, figures: Sequence[str], link: Link
 ) -> tuple[dict[str, bytes] | None, list[tuple[str, str]], list[str]]:
-    """Return the picture of a rig's recordings or None, name and address of each, and the faults of unreadable ones."""
+    """Return the picture of a rig's recordings or None, (file name, URL) of each, and the faults of unreadable ones.
+
+    The recordings are those in folder "worst" of the experiments that `figures`, "EXPERIMENT.FIGURE", name.
+    """
     labels = dict.fromkeys(figure.partition(SEPARATOR)[0] for figure in figures)
     runs = {label: run_files(folder / "worst" / f"rig-{rig:09d}-{label}.mcap", ".mcap") for label in labels}
     motions, faults = {}, []
@@ -294,7 +321,10 @@ def _recordings_picture(
 
 
 def _pairs_picture(folders: Sequence[Path]) -> dict[str, bytes] | None:
-    """Return the picture of figures with a limit in both campaigns, rig by rig; None without such a figure."""
+    """Return the picture of each figure with a limit in both campaigns, rig by rig; None without such a figure.
+
+    Drawn are sampled rigs that could run in both of the two `folders`.
+    """
     manifests = [read_manifest(folder) for folder in folders]
     tables = [read_columns(folder) for folder in folders]
     tables = [_select(table, (table["rig"] != NOMINAL) & (table["status"] != REFUSED)) for table in tables]

@@ -1,6 +1,6 @@
 """Pictures of a campaign, as PNG bytes by theme: figures, rigs over two keys, sensitivity indices, recordings, pairs.
 
-Every function raises MissingExtra without matplotlib.
+The themes are "light" and "dark". Every function that returns pictures raises MissingExtra without matplotlib.
 """
 
 from __future__ import annotations
@@ -69,17 +69,17 @@ class RecordedMotion(NamedTuple):
 
 
 def draw_histogram(figure_values: FigureValues) -> dict[str, bytes]:
-    """Draw the histogram of a figure's finite values, with its limit and the nominal rig's value."""
+    """Return PNG bytes by theme: the histogram of a figure's finite values, its limit and the nominal rig's value."""
     return draw_pictures(_draw_histogram, figure_values, (5.6, 3.3))
 
 
 def draw_rigs(plane: RigPlane) -> dict[str, bytes]:
-    """Draw the first DRAWN_RIGS rigs over two keys: a dot for a rig that passed, a cross for one that failed."""
+    """Return PNG bytes by theme: the first DRAWN_RIGS rigs over two keys, a dot if passed, a cross if failed."""
     return draw_pictures(_draw_rigs, plane, (7.0, 4.8))
 
 
 def draw_sensitivity(indices: Mapping[str, Mapping[str, SensitivityIndex]]) -> dict[str, bytes]:
-    """Draw bars of both indices of each key, with their intervals, in a panel for each quantity.
+    """Return PNG bytes by theme: bars of both indices of each key, with their intervals, a panel for each quantity.
 
     `indices` are by quantity and by key.
     """
@@ -88,13 +88,19 @@ def draw_sensitivity(indices: Mapping[str, Mapping[str, SensitivityIndex]]) -> d
 
 
 def draw_motions(motions: Mapping[str, RecordedMotion]) -> dict[str, bytes]:
-    """Draw reference and true position of a rig in a panel for each experiment; `motions` are by its name."""
+    """Return PNG bytes by theme: reference and true position of a rig, a panel for each experiment.
+
+    `motions` are by the experiment's name.
+    """
     rows = -(-len(motions) // COLUMNS)
     return draw_pictures(_draw_motions, motions, (11.0, 0.7 + 2.5 * rows))
 
 
 def read_motion(recording: Recording) -> RecordedMotion:
-    """Read the motion of the axis that moves farthest. Raises RecordingError for a recording without a tick."""
+    """Read the motion of the axis whose true position moves farthest.
+
+    Raises RecordingError for a recording without a tick, and for one without true positions.
+    """
     names = [(f"{axis}_reference_um", f"{axis}_true_position_um") for axis in recording.header["axes"]]
     bands = read_bands(recording, [name for pair in names for name in pair], 0.0, np.inf, POINTS)
     reference, position = max(names, key=lambda pair: np.ptp([bands[pair[1]].low, bands[pair[1]].high]))
@@ -103,13 +109,16 @@ def read_motion(recording: Recording) -> RecordedMotion:
 
 
 def draw_pairs(pairs: Sequence[tuple[FigureValues, FigureValues]]) -> dict[str, bytes]:
-    """Draw figures of two campaigns against each other, a dot for each rig: the first campaign's to the right."""
+    """Return PNG bytes by theme: figures of two campaigns, a panel for each pair, a dot for each rig.
+
+    The first campaign's value of a rig is on the x axis, the second's on the y axis.
+    """
     rows = -(-len(pairs) // COLUMNS)
     return draw_pictures(_draw_pairs, pairs, (11.0, 0.4 + 3.6 * rows))
 
 
 def _panels(figure: Any, count: int) -> list[Any]:
-    """Return `count` panels of a figure in rows of COLUMNS."""
+    """Add `count` panels to a figure of matplotlib, in rows of COLUMNS; return them."""
     grid = figure.add_gridspec(-(-count // COLUMNS), min(count, COLUMNS))
     return [figure.add_subplot(grid[divmod(number, COLUMNS)]) for number in range(count)]
 
@@ -155,9 +164,10 @@ def _scale_axis(panel: Any, name: str, values: Real) -> bool:
 
 
 def _bin_edges(values: Real, limit: float, drawn: Real, is_logarithmic: bool) -> Real:
-    """Return the edges of bins over finite values (n,), n ≥ 1, on an axis that shows `drawn`, numbers (m,).
+    """Return the edges, rising, of bins over finite values (n,), n ≥ 1, on an axis that shows `drawn`, numbers (m,).
 
-    A finite limit lies on an edge, or on the place where one would be.
+    The bins are equally wide, on a logarithmic axis in the logarithm. A finite limit lies on an edge, or on the place
+    where one would be.
     """
     if is_logarithmic:
         return 10 ** _bin_edges(np.log10(values), np.log10(limit), np.log10(drawn), False)
@@ -170,7 +180,10 @@ def _bin_edges(values: Real, limit: float, drawn: Real, is_logarithmic: bool) ->
 
 
 def _draw_histogram(figure: Any, curves: FigureValues, ink: Palette) -> None:
-    """Draw a figure's histogram, with values beyond the limit in another colour and marked one by one if few."""
+    """Draw the histogram of `curves` on a figure of matplotlib, in the colours `ink`.
+
+    Values beyond the limit have another colour, and a mark each if they are at most MARKED_RIGS.
+    """
     panel, values = figure.subplots(), curves.values[np.isfinite(curves.values)]
     beyond = values[values > curves.limit]
     if values.size:
@@ -207,7 +220,7 @@ def histogram_title(curves: FigureValues) -> str:
 
 
 def _draw_rigs(figure: Any, plane: RigPlane, ink: Palette) -> None:
-    """Draw rigs over two keys, and the nominal rig as a star."""
+    """Draw the first DRAWN_RIGS rigs over two keys on a figure of matplotlib, and the nominal rig as a star."""
     panel, passed = figure.subplots(), plane.passed[:DRAWN_RIGS]
     styles: dict[str, Any] = {
         "passed": {"s": 20, "marker": "o", "color": ink.measured, "alpha": 0.8, "linewidths": 0},

@@ -17,7 +17,8 @@ from rtloop.supervision.supervisor import Processes, Supervisor
 def record_rig(runner: CaseRunner, rig: int, folder: Path) -> list[Path]:
     """Run all experiments of a rig in virtual time, each recorded in `folder`; a recording that exists is kept.
 
-    Returns the paths of the recordings. Raises ConfigError for a rig that cannot run, OutputError.
+    Returns the paths of the recordings, in the order of the experiments. Raises ConfigError for a rig that cannot run,
+    OutputError for a file that cannot be written.
     """
     return record_values(runner, runner.sample_values(rig), f"rig-{rig:09d}", folder)
 
@@ -33,7 +34,7 @@ def record_values(runner: CaseRunner, values: Mapping[str, Any], name: str, fold
 
 
 def _record(runner: CaseRunner, values: Mapping[str, Any], experiment: Experiment, path: Path) -> Path:
-    """Record one experiment of a rig to `path`; return the path."""
+    """Record one experiment of a rig to `path`, unless that exists; return the path."""
     if path.exists():
         return path
     source = f"{runner.campaign.name}, {path.stem}"

@@ -59,17 +59,22 @@ class RigBuilder:
         return self._nominal.plan.pacing.rate_hz
 
     def nominal_value(self, key: str) -> Any:
-        """Return the value of a key without a change. Raises ValueError for a key that no option has."""
+        """Return the value of a key in the configuration, defaults included. Raises ValueError for a key that no option
+        has.
+        """
         return option_value(self._nominal.configuration, self._nominal.configuration.driver_options, key)
 
     def loop(self, values: Mapping[str, Any]) -> Loop:
-        """Return the loop of a rig with `values` by key. Raises ConfigError, ValueError for values that cannot run."""
+        """Return the loop of a rig with `values` by key; the nominal one if all uncertain keys are the driver's.
+
+        Values that are None are left out. Raises ConfigError, ValueError for values that cannot run.
+        """
         return (
             self._nominal if self._varies_rig_only else self._build_loop(replace_values(self._tables, _present(values)))
         )
 
     def driver(self, loop: Loop, values: Mapping[str, Any], experiment: Experiment) -> SimDriver:
-        """Return the driver, not opened, of a rig with `values` in one experiment.
+        """Return the driver, not opened, of a rig with `values` in one experiment; keys of the driver alone count.
 
         Raises ValueError for options that no rig fits.
         """
@@ -92,7 +97,10 @@ class RigBuilder:
         return write_section("", tables, [heading])
 
     def fingerprint(self, values: Mapping[str, Any]) -> bytes:
-        """Return bytes that are equal for two sets of values with equal records and plans in every experiment."""
+        """Return bytes that are equal for two sets of values with equal records and plans in every experiment.
+
+        Raises as `loop` and `driver`.
+        """
         loop = self.loop(values)
         parts = [pickle.dumps(replace(loop.plan, driver_options={}, name=""))]
         for experiment in self._campaign.options.experiment:
@@ -110,7 +118,10 @@ class RigBuilder:
         return Loop(configuration, replace(prepare(configuration, paced=False).plan, mode=Mode.CLOSED_LOOP))
 
     def _add_disturbance(self, tables: dict[str, Any], experiment: Experiment) -> dict[str, Any]:
-        """Return tables whose driver has the disturbance of an experiment on the axis that it moves."""
+        """Return tables whose driver has the disturbance of an experiment on the axis that it moves.
+
+        `tables` stay as they are, and are returned themselves for an experiment without a disturbance.
+        """
         if experiment.disturbance is None:
             return tables
         driver = dict(tables["driver"])
@@ -152,7 +163,7 @@ def _tables_at_rest(campaign: Campaign) -> dict[str, Any]:
 
 
 def experiment_plan(plan: Plan, axis: str, experiment: Experiment, seed: int) -> tuple[Plan, int]:
-    """Return a plan whose axis plays the reference of an experiment, and its number of ticks.
+    """Return a copy of a plan whose axis plays the reference of an experiment, and its number of ticks.
 
     `seed` is the rig's seed, with which the lateness of its ticks is drawn. Raises ValueError for a duration or
     frequency that the rate does not allow.

@@ -78,7 +78,7 @@ class ExperimentOptions(Options):
         raise NotImplementedError
 
     def measure(self, motion: Motion) -> tuple[float, ...]:
-        """Return the figures; infinity where a motion misses its reference altogether."""
+        """Return the figures in the order of `figures`; infinity where a motion misses its reference altogether."""
         raise NotImplementedError
 
 
@@ -122,7 +122,7 @@ class StepsExperiment(ExperimentOptions):
         return ("overshoot_percent", "settling_ms", "static_error_percent")
 
     def measure(self, motion: Motion) -> tuple[float, ...]:
-        """Return the worst figure of all steps."""
+        """Return the largest overshoot, settling time and static error of all steps; inf if a step is not reached."""
         position_um, level_um, steps = motion.position_um.ravel(), 0.0, []
         dwell = POINTS * round(self.dwell_s * motion.rate_hz)
         for number, next_um in enumerate(self.cycles * self.levels_um, start=1):
@@ -170,10 +170,13 @@ class WaveExperiment(ExperimentOptions):
         return ("error_rms_um", "error_peak_um")
 
     def measure(self, motion: Motion) -> tuple[float, ...]:
-        """Return the figures of the error after `settle_periods`."""
+        """Return root mean square and largest magnitude of the error after `settle_periods`, in µm.
+
+        Both are infinite if a position is not finite. Raises ValueError if no tick is left.
+        """
         error_um = motion.error_um[motion.tick(self.settle_periods / self.frequency_hz) :]
         if not error_um.size:
-            raise ValueError("no tick is left after settle_periods")
+            raise ValueError(f"settle_periods: {self.settle_periods:g}; no tick is left after them; raise periods")
         if not np.all(np.isfinite(error_um)):
             return (math.inf,) * len(self.figures)
         return float(np.sqrt(np.mean(error_um**2))), float(np.max(np.abs(error_um)))
@@ -228,7 +231,10 @@ class DisturbanceExperiment(ExperimentOptions):
         return ("error_peak_um", "error_rms_um", "settling_ms")
 
     def measure(self, motion: Motion) -> tuple[float, ...]:
-        """Return the figures of the error from `start_s` on."""
+        """Return largest magnitude and root mean square of the error from `start_s` on in µm, and the settling time.
+
+        The time is infinite if the error is outside the band at the end; all are if a position is not finite.
+        """
         error_um = np.abs(motion.error_um[motion.tick(self.start_s) :]).ravel()
         if not np.all(np.isfinite(error_um)):
             return (math.inf,) * len(self.figures)

@@ -25,13 +25,17 @@ def campaign(
     jobs: int | None = None,
     scheduler: Any = None,
 ) -> Any:
-    """Run a campaign and return its results, a row for each rig: a DataFrame of pandas, or columns by name without it.
+    """Run a campaign and return its results, a row for each rig and one for the nominal rig, which has number 0.
+
+    They are a DataFrame of pandas, or without pandas columns by name.
 
     `file` is a CAMPAIGN.toml, `configuration` replaces its configuration, `rigs` its number of rigs. Results that `out`
     (campaigns/NAME by default) has already are not run again. `jobs` worker processes run the rigs, or the workers of
     `scheduler`, an address or a `dask.distributed.Client`. A script that calls this function must do so below
-    `if __name__ == "__main__":`, because worker processes import it. Raises ConfigError, InputFileError, OutputError,
-    MissingExtra, UnavailableError.
+    `if __name__ == "__main__":`, because worker processes import it. Raises ConfigError, InputFileError and
+    RecordingError for the files that it reads, OutputError, MissingExtra without pyarrow or dask, UnavailableError for
+    a folder in use and a scheduler that cannot be used, OtherVersion for workers with other packages, LoopFault if the
+    nominal rig kills its workers.
     """
     loaded = load_campaign(Path(file), rigs, None if configuration is None else Path(configuration))
     folder = default_folder(loaded) if out is None else Path(out)
@@ -56,7 +60,8 @@ def run_campaign(
 ) -> bool:
     """Run the rigs of a campaign that have no result in `folder`, then record the worst ones in its folder `worst`.
 
-    Returns whether all rigs have results; a stop lets the rigs end that run. Raises as `Coordinator.run`.
+    Returns whether all rigs have results; no worst one is recorded before. After a request to stop, the rigs that were
+    submitted end and no other one starts. Raises as `CaseRunner`, `Store`, `Coordinator.run` and `record_rig`.
     """
     runner = CaseRunner(campaign)
     with open_store(folder, campaign, runner.sample_values(NOMINAL)) as store:
@@ -70,5 +75,5 @@ def run_campaign(
 
 
 def default_folder(campaign: Campaign) -> Path:
-    """Return the folder of a campaign's results where none is chosen."""
+    """Return the folder of a campaign's results where none is chosen: campaigns/NAME."""
     return Path("campaigns") / campaign.name

@@ -29,7 +29,7 @@ def stream_word(*names: object) -> int:
 
 
 def noise_seed(seed: int, rig: int) -> int:
-    """Return the seed of the noise of rig number `rig`."""
+    """Return the seed of the noise of rig number `rig`, 0 … 2⁶³ − 1."""
     return stream_word(seed, rig, "noise") >> 1
 
 
@@ -82,7 +82,10 @@ def _unit(word: int) -> float:
 
 
 def _hypercube(key: str, first: int, count: int, total: int, seed: int) -> Real:
-    """Return numbers (count,) of which all `total` lie in different parts of `total` equal parts of (0, 1)."""
+    """Return one key's numbers in (0, 1), (count,), of the samples from `first` on.
+
+    Each of all `total` samples lies in another one of `total` equal parts of (0, 1).
+    """
     order = _order(stream_word(seed, key), total)
     places = np.array([_unit(stream_word(seed, number, key)) for number in range(first, first + count)])
     return np.minimum((order[first : first + count] + places) / total, 1 - 2.0**-BITS)
@@ -90,12 +93,12 @@ def _hypercube(key: str, first: int, count: int, total: int, seed: int) -> Real:
 
 @lru_cache(64)
 def _order(word: int, total: int) -> npt.NDArray[np.int64]:
-    """Return a random order of 0 … `total` − 1, which depends on `word` alone."""
+    """Return a random order of 0 … `total` − 1 for the seed `word`; it is cached: do not change the array."""
     return np.random.Generator(np.random.PCG64(word)).permutation(total)
 
 
 def _sobol(keys: Sequence[str], first: int, count: int, seed: int) -> Real:
-    """Return points of Sobol's sequence, a dimension for each key, shifted by a random number for each key.
+    """Return points `first` … of Sobol's sequence, (count, keys) in (0, 1), shifted by a random number for each key.
 
     The shift, an exclusive or of the bits, keeps the sequence's uniformity; each number is uniform.
     """

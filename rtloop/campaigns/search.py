@@ -71,7 +71,9 @@ def evaluate_on(workers: Workers, campaign: Campaign) -> Evaluate:
         except (Exception, CancelledError) as raised:
             error = workers.explain(raised)
             if isinstance(error, WorkerDied):
-                raise LoopFault("a rig ended its worker; a campaign run names the rig") from None
+                raise LoopFault(
+                    "a rig killed its worker process; `rtloop campaign run` names such rigs and goes on without them"
+                ) from None
             raise error from None
 
     return evaluate
@@ -82,8 +84,9 @@ def find_worst(
 ) -> SearchResult:
     """Return the rig with the largest `figure` among about `rigs` tried ones; without a name, the largest ratio.
 
-    The search ends early once the figure reaches `target`. Rigs that are refused count as harmless. Raises ConfigError
-    for an unknown figure, for keys without numbers, and for the ratio of a campaign without limits.
+    Whole generations run, at least one; the search ends early once the figure reaches `target`. Rigs that are refused
+    count as harmless. Raises ConfigError for an unknown figure, for keys without numbers, and for the ratio of a
+    campaign without limits; and as `evaluate` does.
     """
     from scipy.optimize import differential_evolution
 
@@ -92,7 +95,7 @@ def find_worst(
     count = 0
 
     def run_generation(_: Any, candidates: Any) -> list[float]:
-        """Run the rigs at some shares of their distributions; return the negative figures."""
+        """Run the rigs at some shares of their distributions; return the negative figures. Stores the worst rig."""
         nonlocal count
         numbered = []
         for shares in candidates:
@@ -130,7 +133,8 @@ def find_boundary(runner: CaseRunner, key: str, evaluate: Evaluate, tolerance: f
     """Return the range of `key` around its nominal value in which rigs pass, all other keys at their nominal values.
 
     The noise is the nominal rig's. Bisection ends at `tolerance`, in the key's unit, or after BISECTIONS halvings.
-    Raises ConfigError for a key that is not uncertain or has no range of numbers.
+    Raises ConfigError for a key that is not uncertain, has no range of numbers or no configured value; and as
+    `evaluate` does.
     """
     distribution = runner.options.uncertain.get(key)
     if distribution is None or distribution.choice is not None:
@@ -139,7 +143,7 @@ def find_boundary(runner: CaseRunner, key: str, evaluate: Evaluate, tolerance: f
     nominal, count = runner.sample_values(NOMINAL), 0
 
     def failure(value: float) -> str:
-        """Return the missed limits of the rig with this value of the key; "" if it passes."""
+        """Return the missed limits or the refusal of the rig with this value of the key; "" if it passes."""
         nonlocal count
         count += 1
         (case,) = evaluate([(count, {**nominal, key: value})])
@@ -167,7 +171,10 @@ def find_boundary(runner: CaseRunner, key: str, evaluate: Evaluate, tolerance: f
 def _bisect(
     failure: Callable[[float], str], passing: float, failing: float, cause: str, tolerance: float
 ) -> tuple[float, str]:
-    """Return the last value that passes between a passing and a failing one, and the cause of the nearest failure."""
+    """Return the last value that passes between a passing and a failing one, and the cause of the nearest failure.
+
+    `failure` returns the cause at a value, "" if it passes; `cause` is that of `failing`.
+    """
     for _ in range(BISECTIONS):
         if abs(failing - passing) <= tolerance:
             break
@@ -186,7 +193,7 @@ def _check_search(runner: CaseRunner, figure: str) -> None:
     if figure and figure not in options.figures:
         raise ConfigError(name, [f"figure: {figure!r}; allowed: {', '.join(options.figures)}"])
     if not figure and not runner.campaign.limits:
-        raise ConfigError(name, ["limits: none; the search needs limits, or the name of a figure"])
+        raise ConfigError(name, ["limits: none; set [limits] in the campaign's file, or choose a figure with --figure"])
     words = [key for key, distribution in options.uncertain.items() if not distribution.is_numeric]
     if words:
         raise ConfigError(

@@ -69,7 +69,10 @@ class Store:
     """
 
     def __init__(self, folder: Path, campaign: Campaign, nominal: Mapping[str, Any]) -> None:
-        """Open or make the folder of a campaign; `nominal` has the values of its keys, for the columns' types."""
+        """Open or make the folder of a campaign; `nominal` has the values of its keys, for the columns' types.
+
+        Of two files of one unit, as a killed process leaves them, the shorter one is removed.
+        """
         self._arrow, self.folder, self._campaign = arrow(), folder, campaign
         self._schema = _schema(self._arrow, campaign, nominal)
         with output_errors(folder):
@@ -101,7 +104,10 @@ class Store:
             different = ", ".join(key for key in _MANIFEST_KEYS if stored[key] != manifest[key])
             raise ConfigError(
                 str(self.folder),
-                [f"holds campaign {stored['campaign']!r}, whose {different} differ; choose another folder with --out"],
+                [
+                    f"it has results of campaign {stored['campaign']!r}, which differs from this one in {different}; "
+                    "choose another folder with --out"
+                ],
             )
 
     def close(self) -> None:
@@ -109,13 +115,19 @@ class Store:
         close_descriptor(self._lock)
 
     def missing(self, unit: Unit) -> Sequence[int]:
-        """Return the rigs of a unit that have no result. A damaged file is renamed, and its rigs are missing."""
+        """Return the rigs of a unit that have no result. A damaged file is renamed, and its rigs are missing.
+
+        Raises OutputError for a file that cannot be read.
+        """
         if unit.first not in self._paths:
             return unit.rigs
         return sorted(set(unit.rigs) - {row["rig"] for row in self._rows(unit)})
 
     def add(self, unit: Unit, cases: Sequence[CaseResult]) -> None:
-        """Add results to a unit. Raises OutputError if the system refuses."""
+        """Write the file of a unit anew with `cases` added, which replace stored results of the same rigs.
+
+        Raises OutputError if the system refuses.
+        """
         rows = {row["rig"]: row for row in self._rows(unit)} | {case.rig: self._row(case) for case in cases}
         table = self._arrow.Table.from_pylist([rows[rig] for rig in sorted(rows)], self._schema)
         path, replaced = self.folder / RESULTS / _file_name(unit, max(rows)), self._paths.get(unit.first)
@@ -136,15 +148,16 @@ class Store:
         return self._bytes(stored_table) == self._bytes(case_table)
 
     def _bytes(self, table: pa.Table) -> bytes:
-        """Return a table as the content of a file."""
+        """Return a table as the content of a Parquet file."""
         content = io.BytesIO()
         self._arrow.parquet.write_table(table, content, compression="zstd")
         return content.getvalue()
 
     def _rows(self, unit: Unit) -> list[dict[str, Any]]:
-        """Return the stored rows of a unit, which may have had more or fewer rigs; a damaged file is renamed.
+        """Return the rows of the file that begins with the unit's first rig, which may have more or fewer rigs.
 
-        Raises OutputError for a file that cannot be read.
+        Returns [] without such a file, and for a damaged one or one with other columns, which is renamed. Raises
+        OutputError for a file that cannot be read or renamed.
         """
         path = self._paths.get(unit.first)
         if path is None:
@@ -162,7 +175,7 @@ class Store:
         return table.to_pylist()
 
     def _row(self, case: CaseResult) -> dict[str, Any]:
-        """Return a row of the table by column."""
+        """Return the row of a result by column, with None in columns for which it has no value."""
         verdict = {"rig": case.rig, "status": status(case), "ratio": case.ratio}
         missed = case.refusal or "; ".join(case.missed)
         trips = {f"{label}.trip": trip for label, trip in case.trips.items()}
@@ -192,7 +205,7 @@ class Store:
 
 
 def _manifest(campaign: Campaign) -> dict[str, Any]:
-    """Return the name and digest of a campaign, and the names and limits that a report needs."""
+    """Return the content of campaign.json: _MANIFEST_KEYS with the campaign's values, and the versions of packages."""
     return {
         "campaign": campaign.name,
         "digest": campaign.digest,
@@ -206,15 +219,18 @@ def _manifest(campaign: Campaign) -> dict[str, Any]:
 
 
 def read_manifest(folder: Path) -> dict[str, Any]:
-    """Return the manifest of a campaign's folder. Raises InputFileError where there is none that can be read."""
+    """Return the manifest of a campaign's folder, with _MANIFEST_KEYS at least.
+
+    Raises InputFileError where there is none that can be read.
+    """
     path = folder / MANIFEST
     try:
         with os.fdopen(open_own(path), "rb") as file:
             manifest = json.load(file)
     except OSError as error:
-        raise InputFileError(f"{path}: {error.strerror or error}; needs the folder of a campaign") from None
+        raise InputFileError(f"{path}: {error.strerror or error}; choose the folder of a campaign's results") from None
     except ValueError:
-        raise InputFileError(f"{path}: not valid JSON; needs the folder of a campaign") from None
+        raise InputFileError(f"{path}: not valid JSON; choose the folder of a campaign's results") from None
     if not isinstance(manifest, dict) or set(_MANIFEST_KEYS) - manifest.keys():
         raise InputFileError(f"{path}: not the manifest of a campaign; needs {', '.join(_MANIFEST_KEYS)}")
     return manifest
@@ -240,21 +256,21 @@ def read_tables(folder: Path) -> Iterator[pa.Table]:
 def read_columns(folder: Path) -> dict[str, Any]:
     """Return the columns of all results in a campaign's folder by name, (rigs,); equal texts are one object.
 
-    A missing text is "". Raises InputFileError for a folder without results and for a damaged file, MissingExtra
-    without pyarrow.
+    A missing text is "". Raises InputFileError for a folder without results, for a damaged file and for a rig with two
+    results, MissingExtra without pyarrow.
     """
     library = arrow()
     table = library.concat_tables(list(read_tables(folder)))
     rigs = table.column("rig").to_numpy()
     if np.unique(rigs).size != rigs.size:
         raise InputFileError(
-            f"{folder}: rigs are stored twice, as after a kill; run the campaign again, which mends it"
+            f"{folder}: rigs are stored twice, as after a kill; run the campaign again, which removes the second copy"
         )
     return {name: _values(library, table.column(name)) for name in table.column_names}
 
 
 def _values(library: Any, column: Any) -> Any:
-    """Return a column as an array."""
+    """Return a column as an array (rigs,), of objects for texts; `library` is pyarrow. A missing text is ""."""
     if not library.types.is_string(column.type):
         return column.to_numpy(zero_copy_only=False)
     encoded = column.fill_null("").combine_chunks().dictionary_encode()
@@ -262,13 +278,19 @@ def _values(library: Any, column: Any) -> Any:
 
 
 def _read_table(library: Any, path: Path) -> Any:
-    """Return the table of a file. Raises OSError for a file that cannot be read, ValueError for one that is damaged."""
+    """Return the Arrow table of a file; `library` is pyarrow.
+
+    Raises OSError for a file that cannot be read, ValueError for one that is damaged.
+    """
     with os.fdopen(open_own(path), "rb") as file:
         return library.parquet.read_table(io.BytesIO(file.read()), use_threads=False, pre_buffer=False)
 
 
 def _schema(library: Any, campaign: Campaign, nominal: Mapping[str, Any]) -> Any:
-    """Return the columns: rig, status, missed, ratio, values of keys, figures, causes of trips."""
+    """Return the Arrow schema of the columns: rig, status, missed, ratio, values of keys, figures, causes of trips.
+
+    `library` is pyarrow; `nominal` has a value of each key, for its column's type.
+    """
     columns = [("rig", library.int64()), ("status", library.string()), ("missed", library.string())]
     columns += [("ratio", library.float64()), (SEED_KEY, library.int64())]
     columns += [(key, _column_type(library, value)) for key, value in nominal.items() if key != SEED_KEY]
@@ -278,7 +300,7 @@ def _schema(library: Any, campaign: Campaign, nominal: Mapping[str, Any]) -> Any
 
 
 def _column_type(library: Any, value: Any) -> Any:
-    """Return the type of a column whose nominal value is `value`: numbers, unless it is a truth value or a text."""
+    """Return the Arrow type of a column whose nominal value is `value`: truth value, integer, text, or else a float."""
     if isinstance(value, bool):
         return library.bool_()
     if isinstance(value, int):
@@ -297,7 +319,7 @@ def _result_paths(folder: Path) -> list[Path]:
 
 
 def _first_rig(path: Path) -> int:
-    """Return the number of the first rig of a file of results."""
+    """Return the number of the first rig of a file of results, from its name; 0 for another name."""
     match = FILE_NAME.fullmatch(path.name)
     return int(match[1]) if match else 0
 

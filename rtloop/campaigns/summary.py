@@ -56,7 +56,11 @@ class WorstRig(NamedTuple):
 
 @dataclass(frozen=True)
 class CampaignSummary:
-    """Result of a campaign. Counts, yield and figures leave out the nominal rig; `nominal` has the row of rig 0."""
+    """Result of a campaign. Counts, yield and figures leave out the nominal rig.
+
+    `counts` has the number of rigs by status, `crashed` the numbers of rigs, `refused` their numbers with the reasons,
+    `nominal` the nominal rig's row by column, {} without a result.
+    """
 
     name: str
     counts: Mapping[str, int]
@@ -73,7 +77,10 @@ class CampaignSummary:
 
 
 def clopper_pearson(passed: int, rigs: int, confidence: float = CONFIDENCE) -> Yield:
-    """Return the yield of `passed` among `rigs`, with its interval. Raises ValueError for more passed than rigs."""
+    """Return the yield of `passed` among `rigs`, with its interval; without rigs, a share NaN between 0 and 1.
+
+    Raises ValueError for more passed than rigs.
+    """
     from scipy.special import betaincinv
 
     if not 0 <= passed <= rigs:
@@ -89,8 +96,8 @@ def clopper_pearson(passed: int, rigs: int, confidence: float = CONFIDENCE) -> Y
 def summarise_campaign(folder: Path, worst_count: int = 5) -> CampaignSummary:
     """Return the summary of the results in a folder, with the `worst_count` rigs of the largest ratio.
 
-    Refused rigs count neither as passed nor as failed; crashed ones count as failed. Raises InputFileError for a
-    folder without results, MissingExtra without pyarrow.
+    Refused rigs count neither as passed nor as failed; crashed ones count as failed in the yield. Raises InputFileError
+    for a folder without results or with damaged ones, MissingExtra without pyarrow.
     """
     manifest = read_manifest(folder)
     columns = read_columns(folder)
@@ -133,7 +140,10 @@ def _yield(columns: Mapping[str, Any], manifest: Mapping[str, Any]) -> Yield:
 
 
 def _sensitivity(columns: Mapping[str, Any], manifest: Mapping[str, Any]) -> dict[str, Mapping[str, SensitivityIndex]]:
-    """Return Sobol's indices of passing and of each figure, where the rigs follow Saltelli's design without a gap."""
+    """Return Sobol's indices by key of "passed" and of each figure, where rigs follow Saltelli's design without a gap.
+
+    Returns {} for other rigs.
+    """
     order = np.argsort(columns["rig"])
     rigs = columns["rig"][order][columns["rig"][order] != NOMINAL]
     if manifest["sampling"] != "saltelli" or not np.array_equal(rigs, np.arange(1, len(rigs) + 1)):
@@ -146,7 +156,7 @@ def _sensitivity(columns: Mapping[str, Any], manifest: Mapping[str, Any]) -> dic
 
 
 def _figures(columns: Mapping[str, Any], names: Sequence[str], limits: Mapping[str, float]) -> dict[str, FigureSummary]:
-    """Return the summary of each figure over all rigs that have it."""
+    """Return the summary of each figure by name, over all rigs that have it; a figure that no rig has is left out."""
     summaries = {}
     for name in names:
         values = columns[name][~np.isnan(columns[name])]
@@ -159,7 +169,10 @@ def _figures(columns: Mapping[str, Any], names: Sequence[str], limits: Mapping[s
 
 
 def _worst_rigs(columns: Mapping[str, Any], keys: Sequence[str], count: int) -> tuple[WorstRig, ...]:
-    """Return the rigs of the largest ratio that did not crash, the lower number first where ratios are equal."""
+    """Return the `count` rigs of the largest ratio that did not crash, the largest first; there may be fewer.
+
+    Where ratios are equal, the lower number is first.
+    """
     order = [i for i in np.lexsort((columns["rig"], -columns["ratio"])) if columns["status"][i] != CRASHED]
     return tuple(
         WorstRig(

@@ -55,7 +55,10 @@ class UncertainOptions(Options):
         return not any(isinstance(value, bool | str) for value in self.choice or ())
 
     def quantile(self, share: float) -> Any:
-        """Return the value below which `share`, in (0, 1), of all draws lie; the entry of `choice` at that share."""
+        """Return the value below which `share`, in (0, 1), of all draws lie; the entry of `choice` at that share.
+
+        A relative value is the factor alone. Raises ValueError for `limits` that `normal` does not reach.
+        """
         if self.uniform is not None:
             low, high = self.uniform
             return low + share * (high - low)
@@ -68,7 +71,7 @@ class UncertainOptions(Options):
         return values[min(int(share * len(values)), len(values) - 1)]
 
     def _normal_quantile(self, mean: float, deviation: float, share: float) -> float:
-        """Return the quantile of a normal distribution between the limits."""
+        """Return the quantile of a normal distribution between the limits. Raises ValueError if it does not reach them."""
         from statistics import NormalDist
 
         distribution = NormalDist(mean, deviation)

@@ -70,7 +70,7 @@ def split_into_units(campaign: Campaign, rate_hz: float) -> list[Unit]:
 
 
 def run_unit(campaign: Campaign, rigs: Sequence[int], expected: WorkerFacts) -> list[CaseResult]:
-    """Run rigs of a campaign in this process and return their results.
+    """Run rigs of a campaign, by number, in this process; return their results in the same order.
 
     Raises OtherVersion if this process has other versions than `expected`, ConfigError for a campaign that cannot run
     here.
@@ -83,14 +83,14 @@ def run_unit(campaign: Campaign, rigs: Sequence[int], expected: WorkerFacts) -> 
 def run_values(
     campaign: Campaign, rigs: Sequence[tuple[int, Mapping[str, Any]]], expected: WorkerFacts
 ) -> list[CaseResult]:
-    """Run rigs with the given values by key, each with a number, and return their results; raises as `run_unit`."""
+    """Run rigs, (number, values by key) each, and return their results in the same order; raises as `run_unit`."""
     _require_versions(expected)
     runner = _runner(_Hashed(campaign.digest, campaign))
     return [runner.run(number, values) for number, values in rigs]
 
 
 def _require_versions(expected: WorkerFacts) -> None:
-    """Raise OtherVersion if the versions of this process are not the expected ones."""
+    """Raise OtherVersion if the versions of this process are not the expected ones, of the same packages."""
     facts = WorkerFacts.of_this_process()
     differences = [
         f"{name} {version_here}, the coordinator {expected_version}"
@@ -116,5 +116,8 @@ class _Hashed:
 
 @lru_cache(RUNNERS_KEPT)
 def _runner(hashed: _Hashed) -> CaseRunner:
-    """Return the runner of a campaign, made at the first unit of it in this process."""
+    """Return the runner of a campaign, made at the first unit of it in this process; RUNNERS_KEPT are cached.
+
+    Raises ConfigError for a campaign that cannot run here.
+    """
     return CaseRunner(hashed.campaign)

@@ -39,7 +39,7 @@ class Workers(Protocol):
     """Kind, number and address of the workers, for messages."""
 
     def submit(self, function: Callable[..., Any], *arguments: Any) -> Future[Any]:
-        """Run a function of a module in a worker. `explain` converts an error of the future."""
+        """Start a function of a module in a worker; return the future of its result, whose errors `explain` converts."""
         ...
 
     def explain(self, error: BaseException) -> BaseException:
@@ -80,7 +80,7 @@ class ProcessWorkers:
         return self._executor.submit(function, *arguments)
 
     def explain(self, error: BaseException) -> BaseException:
-        """Return WorkerDied for a pool that is broken."""
+        """Return WorkerDied for a pool that is broken, any other error itself."""
         return WorkerDied() if isinstance(error, BrokenProcessPool) else error
 
     def recover(self) -> None:
@@ -104,7 +104,7 @@ def _follow_coordinator() -> None:
 
 
 def _end_after_coordinator() -> None:
-    """End this worker at once when its coordinator has died; the pool's workers would wait for it forever."""
+    """Wait until the coordinator has died, then end this worker at once; the pool's workers would wait forever."""
     if (coordinator := multiprocessing.parent_process()) is not None:
         coordinator.join()
         os._exit(1)
@@ -118,7 +118,10 @@ class DaskWorkers:
     """
 
     def __init__(self, scheduler: Any) -> None:
-        """Use a scheduler by its address, such as tcp://HOST:8786, or a `dask.distributed.Client`."""
+        """Use a scheduler by its address, such as tcp://HOST:8786, or a `dask.distributed.Client`.
+
+        With an address, a client is made, which `close` ends, and NOISY_LOGGERS are silenced.
+        """
         try:
             from distributed import Client
         except ImportError:
@@ -144,7 +147,7 @@ class DaskWorkers:
         self._executor = self._client.get_executor(pure=False)
 
     def _require_versions(self) -> None:
-        """Raise UnavailableError for the scheduler or a worker without rtloop, or with another version of it.
+        """Close, and raise UnavailableError, for a scheduler or worker without rtloop or with another version of it.
 
         The workers import at the same time the modules that a unit needs.
         """
@@ -174,7 +177,10 @@ class DaskWorkers:
         return self._executor.submit(function, *arguments)
 
     def explain(self, error: BaseException) -> BaseException:
-        """Return WorkerDied where a function killed its workers, UnavailableError where the scheduler is gone."""
+        """Return WorkerDied where a function killed its workers, UnavailableError where the scheduler is gone.
+
+        Returns any other error itself.
+        """
         from concurrent.futures import CancelledError
 
         from distributed import KilledWorker
@@ -195,7 +201,7 @@ class DaskWorkers:
 
 
 def _require_reachable(address: str) -> None:
-    """Raise UnavailableError for an address of another form, and for a host and port where no process listens."""
+    """Raise UnavailableError unless `address` is tcp://HOST:PORT or tls://HOST:PORT, and a process listens there."""
     form = re.fullmatch(r"(?:tcp|tls)://(\[[^\]]+\]|[^:/]+):(\d{1,5})", address)
     if form is None:
         raise UnavailableError(f"scheduler: {address}; allowed: tcp://HOST:PORT or tls://HOST:PORT")

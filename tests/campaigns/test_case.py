@@ -165,7 +165,7 @@ def test_a_rig_that_is_impossible_is_refused_by_name(tmp_path):
     ("uncertain", "named"),
     [
         ('"driver.plant.dynamics.resonance" = { uniform = [0.0, 1.0] }', "no key 'resonance'; allowed: form, gain"),
-        ('"recording.min_free_mib" = { uniform = [1.0, 2.0] }', "are equal in all that runs; remove the key"),
+        ('"recording.min_free_mib" = { uniform = [1.0, 2.0] }', "run alike; remove the key"),
         ('"driver.plant.hysteresis.weights_um_per_v.0" = { uniform = [1.0, 2.0] }', "weights_um_per_v"),
         ('"driver.kind" = { choice = ["sim", "shm"] }', "driver.kind: this key cannot be uncertain"),
         ('"driver.plant.disturbance.step_um" = { uniform = [1.0, 2.0] }', "experiment 'push' sets the disturbance"),

@@ -101,7 +101,7 @@ def test_the_results_of_another_campaign_are_refused(runner, folder, tmp_path):
             write_campaign(tmp_path, keys="rigs = 8\nunit_rigs = 4", experiments=STEPS.replace("10.0", "9.0"))
         )
     )
-    with pytest.raises(ConfigError, match="holds campaign 'stage-paper', whose experiments, digest differ"):
+    with pytest.raises(ConfigError, match="campaign 'stage-paper', which differs from this one in experiments, digest"):
         missing(other, folder)
 
 
@@ -184,5 +184,5 @@ def test_a_file_of_another_name_is_ignored_and_one_that_cannot_be_read_stays(run
 def test_the_results_of_another_version_are_refused(runner, folder, monkeypatch):
     store_rigs(runner, folder, UNIT, [1])
     monkeypatch.setattr("rtloop.campaigns.unit.__version__", "0.0.1")
-    with pytest.raises(ConfigError, match="whose versions differ"):
+    with pytest.raises(ConfigError, match="which differs from this one in versions"):
         missing(runner, folder)
