@@ -78,7 +78,9 @@ def import_data(
 
     All columns where none is selected. `table` is the file's content, if it was read already; `progress` receives the
     ticks so far. Returns {file, output, ticks, rate_hz, duration_s, time, signals, notes, about, in_other_files};
-    `signals` are {name, unit, from, least, largest}.
+    `signals` are {name, unit, from, least, largest}, `from` being the mapping as text; `about` has texts about the file
+    by topic, `in_other_files` names data that the file only points to.
+
     Raises UnreadableData if the file cannot be read, or a column, its unit or the time does not fit; MissingExtra if
     the format's package is missing; OutputError if the output exists or cannot be written. An incomplete output is
     removed.
@@ -154,7 +156,9 @@ def _select_signals(table: Table, path: Path, selection: ColumnSelection, time_b
             raise UnreadableData(f"{path}: {fault}; give column {column.name!r} another name with --map NAME=COLUMN")
     missing = {name: np.count_nonzero(~np.isfinite(values)) for name, values in columns.items()}
     if any(missing.values()):
-        notes.append("no numbers: " + ", ".join(f"{count} in {name}" for name, count in missing.items() if count))
+        notes.append(
+            "missing or infinite values: " + ", ".join(f"{count} in {name}" for name, count in missing.items() if count)
+        )
     return ImportedSignals(
         columns,
         {name: _header_text(column.description) for name, column in signals.items()},

@@ -164,7 +164,7 @@ def column_unit(table: Table, name: str) -> str | None:
 
 
 def name_without_unit(name: str) -> str:
-    """Return a column's name without the unit at its end."""
+    """Return a column's name without the unit at its end, or as it is if no known unit ends it."""
     return _split_unit(name)[0]
 
 
@@ -206,7 +206,10 @@ def axis_names(signals: list[str]) -> list[str]:
 
 
 def _split_unit(name: str) -> tuple[str, str | None]:
-    """Split `name [unit]`, `name (unit)`, `name / unit` or `name in unit`; (name, None) where no known unit ends it."""
+    """Return (name, unit) of `name [unit]`, `name (unit)`, `name / unit` or `name in unit`.
+
+    Returns (whole text, None) where no known unit ends it.
+    """
     match = _BRACKETED.fullmatch(name.strip())
     unit = next(filter(None, match.groups()[1:]), "") if match else ""
     return (match[1], unit) if match and is_unit(unit) else (name, None)

@@ -39,7 +39,8 @@ class TimeBase(NamedTuple):
 
 
 def find_time_base(table: Table, path: Path, time: str | None, rate_hz: float | None) -> TimeBase:
-    """Return the times by `rate_hz`, or else by the column `time` (a mapping), or by the file's own time column.
+    """Return the times by `rate_hz`, or else by the column of the mapping `time`, such as "Clock [ms]", or by the
+    file's own column of times.
 
     With `rate_hz`, the samples are counted from 0. Raises UnreadableData without a time column, for fewer than two
     samples, for a time that does not grow, is not finite or has an unknown unit, and for a rate outside the limits.
@@ -100,7 +101,10 @@ def _first_column_as_time(table: Table) -> str | None:
 
 
 def grows_evenly(values: Real) -> bool:
-    """Whether each value exceeds the one before, by steps that differ by less than a factor of GAP_PERIODS."""
+    """Whether each value exceeds the one before, by steps that differ by less than a factor of GAP_PERIODS.
+
+    False for fewer than three values.
+    """
     with np.errstate(invalid="ignore"):  # inf − inf, which does not grow
         steps = np.diff(values)
     return steps.size > 1 and bool(steps.min() > 0 and steps.max() < GAP_PERIODS * steps.min())
@@ -142,14 +146,14 @@ def _deadlines_ns(path: Path, name: str, times: Real, unit: str) -> tuple[Real, 
 
 
 def _rate_hz(deadlines: Real, period_ns: float) -> float:
-    """Return the rate by the mean period where all periods are even, else by `period_ns`, the median one."""
+    """Return the rate in Hz by the mean period where all periods are even, else by `period_ns`, the median one."""
     is_even = bool(np.all(np.abs(np.diff(deadlines) - period_ns) <= ROUNDED_NS))
     period_ns = float(deadlines[-1] - deadlines[0]) / (deadlines.size - 1) if is_even else period_ns
     return float(f"{1e9 / period_ns:.9g}")
 
 
 def _regularity(deadlines: Real) -> tuple[float, list[str]]:
-    """Return the median period in ns, and notes on jitter and missing samples."""
+    """Return the median period in ns, and notes on jitter and missing samples, [] for even samples."""
     intervals = np.diff(deadlines)
     period, notes = float(np.median(intervals)), []
     regular_intervals = intervals[intervals < GAP_PERIODS * period]

@@ -67,7 +67,7 @@ def _format_in_order(
 
 
 def _format_in_pyarrow(names: Sequence[str], rows: Real) -> bytes:
-    """Return the lines of rows (n, names)."""
+    """Return rows (n, names) as lines of CSV without a header, formatted by pyarrow."""
     import pyarrow
     import pyarrow.csv
 
@@ -79,7 +79,7 @@ def _format_in_pyarrow(names: Sequence[str], rows: Real) -> bytes:
 
 
 def _format_in_python(names: Sequence[str], rows: Real) -> bytes:
-    """Return the lines of rows (n, names)."""
+    """Return rows (n, names) as lines of CSV without a header, formatted by Python."""
     fields = [map(repr, _printed_values(name, rows[:, index]).tolist()) for index, name in enumerate(names)]
     return "".join(",".join(row) + "\n" for row in zip(*fields, strict=True)).encode("ascii")
 

@@ -53,7 +53,10 @@ class Unit(NamedTuple):
 
 
 def parse_unit(text: str) -> Unit:
-    """Return a unit's scale and powers. Raises UnknownUnit for an unknown symbol."""
+    """Return a unit's scale and powers, of a text such as "µm/V"; "" is the number 1.
+
+    Raises UnknownUnit for an unknown symbol.
+    """
     scale, powers = Fraction(1), Powers()
     for place, part in enumerate(text.strip().translate(_SYMBOL_VARIANTS).split("/")):
         sign = 1 if place == 0 else -1

@@ -183,7 +183,10 @@ def _dates(rows: Sequence[Sequence[str]], width: int) -> tuple[int, ...]:
 
 
 def _first_row(rows: Iterable[Sequence[str]], width: int, numbers: Sequence[int], decimal: str) -> int | None:
-    """Return the index of the first row with numbers in all columns `numbers`; None without one."""
+    """Return the index of the first row of `width` fields with numbers in all columns `numbers`; None without one.
+
+    Fields may be empty, but not all of them.
+    """
     for number, row in enumerate(rows):
         is_data_row = len(row) == width and all(is_number(row[column], decimal) for column in numbers)
         if is_data_row and any(row[column] for column in numbers):
@@ -192,7 +195,7 @@ def _first_row(rows: Iterable[Sequence[str]], width: int, numbers: Sequence[int]
 
 
 def _header(lines: Sequence[str], delimiter: str | None, width: int) -> tuple[tuple[str, ...], tuple[str, ...], bool]:
-    """Return names and units of all columns by the lines above the numbers, and whether there are names.
+    """Return names and units of all `width` columns by the lines above the numbers, and whether there are names.
 
     A column without a name is `column_1`, …; one without a unit has "".
     """

@@ -153,13 +153,16 @@ def _require_even_rows(path: Path, dialect: CsvDialect, without_last: np.ndarray
 
 
 def _uneven_row_message(line: int, columns: int, dialect: CsvDialect) -> str:
-    """Return the message for a line with another number of columns than the first."""
+    """Return the message for a line, counted from 1, with another number of columns than the first."""
     allowed = f"allowed: {len(dialect.names)}, as in the first line"
     return f"line {line} has {count_text(columns, 'column')}; {allowed}"
 
 
 def _column_numbers(path: Path, dialect: CsvDialect, values: Any) -> np.ndarray[Any, Any]:
-    """Return a column's numbers, float64; missing ones are NaN. Raises UnreadableData at the first text."""
+    """Return the numbers of a column, a series of pandas, as float64; missing ones are NaN.
+
+    Raises UnreadableData at the first text.
+    """
     import pandas
 
     if values.dtype.kind in "fiub":
@@ -179,7 +182,10 @@ def _column_numbers(path: Path, dialect: CsvDialect, values: Any) -> np.ndarray[
 
 
 def _dates_ns(path: Path, dialect: CsvDialect, values: Any) -> np.ndarray[Any, Any]:
-    """Return dates as ns since 1970, int64. Raises UnreadableData at the first field without a date."""
+    """Return the dates of a column, a series of texts, as ns since 1970, int64.
+
+    Raises UnreadableData at the first field without a date.
+    """
     import pandas
 
     dates = pandas.to_datetime(values.str.replace(",", "."), format="ISO8601", utc=True, errors="coerce")

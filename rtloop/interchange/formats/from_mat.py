@@ -157,7 +157,7 @@ def _raster_index(y: dict[str, Any]) -> int | None:
 
 
 def _description(value: dict[str, Any]) -> dict[str, str]:
-    """Return the file's description as an entry of `about`; empty without one."""
+    """Return {"description": text}, at most 200 characters, of a structure of ControlDesk; {} without one."""
     text = value.get("Description")
     text = next((entry for entry in text.values() if isinstance(entry, str)), "") if isinstance(text, dict) else text
     return {"description": text[:200]} if isinstance(text, str) and text else {}
@@ -166,7 +166,8 @@ def _description(value: dict[str, Any]) -> dict[str, str]:
 def _collect_arrays(columns: FileColumns, path: str, value: Any, depth: int, unit: str | None = None) -> None:
     """Collect every array of numbers below `value` into `columns`, by its path; names and units are beside it.
 
-    Objects that only MATLAB can read are listed as left out. Raises UnreadableData for structures that are nested too
+    `unit` is that of `value` if it is an array itself, `depth` the number of levels above it. Objects that only MATLAB
+    can read are listed as left out. Raises UnreadableData for structures that are nested too
     deeply.
     """
     if depth > MAX_DEPTH:
@@ -198,7 +199,10 @@ def _collect_arrays(columns: FileColumns, path: str, value: Any, depth: int, uni
 
 
 def _collect_signals(columns: FileColumns, path: str, signals: Any, depth: int) -> None:
-    """Collect Simulink's signals(k): values under their label; in three or more dimensions, the time is the last."""
+    """Collect Simulink's signals(k) into `columns`: values under their label, others like any structure.
+
+    In values of three or more dimensions, the time is the last one.
+    """
     for number, signal in enumerate(_as_list(signals), start=1):
         if isinstance(signal, dict) and "values" in signal:
             values = np.asarray(signal["values"])
@@ -228,5 +232,5 @@ def _as_text(value: Any) -> str:
 
 
 def _first_line(fault: Exception) -> str:
-    """Return the first line of an error's message."""
+    """Return the first line of an error's message, or its class's name without a message."""
     return (str(fault).strip().splitlines() or [type(fault).__name__])[0][:200]

@@ -53,10 +53,10 @@ class FileColumns:
             )
 
     def add_column(self, name: str, values: Any, unit: str | None = None) -> None:
-        """Add one column, or each column of a matrix, whose longer side is the time.
+        """Add one column as float64, or each column of a matrix, whose longer side is the time, as NAME_1, NAME_2, ….
 
-        Single values are ignored; text, larger matrices and arrays of more dimensions are listed in `left_out`. Raises
-        UnreadableData for more than MAX_COLUMNS columns.
+        A name that exists already gets a number in brackets. Single values are ignored; text, larger matrices and
+        arrays of more dimensions are listed in `left_out`. Raises UnreadableData for more than MAX_COLUMNS columns.
         """
         array = np.asarray(values)
         if array.dtype.kind not in "fiub":
@@ -81,6 +81,8 @@ class FileColumns:
 
     def grouped_tables(self) -> dict[str, Table]:
         """Return tables by group name: each has the columns of one length that share the nearest column of times.
+
+        Without a column of times of their length, they share none.
 
         A group's name is the folder that all its columns share, which their names then lack; without one, the folder of
         the times, or the number of rows.

@@ -95,7 +95,10 @@ def _collect_group(
 
 
 def _resolve_member(columns: FileColumns, group: Any, key: str, name: str) -> Any:
-    """Return the object of a group under `key`; None, left out as `name`, where it is not in the file."""
+    """Return the object of a group under `key`; None where it is not in the file, which is then listed as `name`.
+
+    It is listed in `columns.in_other_files` if a link leads into another file, else in `columns.left_out`.
+    """
     try:
         return _resolve_path(group, key, MAX_DEPTH)
     except _OtherFileLink:
@@ -154,7 +157,7 @@ class _OtherFileLink(Exception):
 
 
 def _read_dataset(columns: FileColumns, dataset: Any, name: str) -> None:
-    """Add a dataset of numbers with its unit, or the fields of a dataset of records, to `columns`."""
+    """Add a dataset of numbers with its unit, or the fields of a dataset of records without units, to `columns`."""
     unit = next((_as_text(dataset.attrs[key]) for key in UNIT_ATTRIBUTES if key in dataset.attrs), None)
     values = dataset[()]
     for field in dataset.dtype.names or ():
@@ -189,9 +192,10 @@ def matlab_variables(columns: FileColumns) -> dict[str, Any]:
 
 
 def _group_values(columns: FileColumns, file: Any, names: dict[str, str], group: Any, depth: int) -> dict[str, Any]:
-    """Return the members of a group by key, without those outside the file; `names` has the full name of each key.
+    """Return the values of a group's members by key, without those outside the file; see `_member_value`.
 
-    Raises UnreadableData for members nested too deeply.
+    `names` has the full name of each key; `depth` is the number of groups above. Raises UnreadableData for members
+    nested too deeply.
     """
     members = {key: _resolve_member(columns, group, key, name) for key, name in names.items()}
     return {
