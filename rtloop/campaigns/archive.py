@@ -29,8 +29,9 @@ def examine(
 ) -> dict[str, Any]:
     """Examine recordings on workers; with `folder`, their rows are stored there, and stored ones are not repeated.
 
-    Returns {recordings, pending, stored, counts, duration_s, rate_per_s, verdicts}: `verdicts` has the rows by path,
-    `stored` is the number of rows from earlier calls, `pending` the number of recordings without a row after a stop.
+    Returns {recordings, pending, stored, counts, duration_s, rate_per_s, verdicts}: `verdicts` is the list of rows, in
+    the order of `recordings`, `counts` the number of rows by verdict, `stored` the number of rows from earlier calls,
+    `pending` the number of recordings without a row after a stop.
     After a request to stop, the recordings that were submitted end and no other one starts. `on_progress` receives the
     number of rows.
 

@@ -48,8 +48,8 @@ class Examination(NamedTuple):
 def replay_files(paths: Sequence[str], version: str) -> Row:
     """Replay the files of a recording in this process. Returns {verdict, tick, column, reason}.
 
-    `tick` and `column` name the first difference; without one, they are left out. Raises UnavailableError if this
-    worker's version of rtloop is not `version`.
+    `tick` and `column` name the first difference; without one, they are left out. An error, as for an unreadable file,
+    becomes a verdict. Raises UnavailableError alone, if this worker's version of rtloop is not `version`.
     """
     return _examine(paths, version, _replay)
 
@@ -57,8 +57,8 @@ def replay_files(paths: Sequence[str], version: str) -> Row:
 def summarise_files(paths: Sequence[str], version: str) -> Row:
     """Summarise the files of a recording. Returns {verdict, ticks, duration_s, lost, trips, reason}.
 
-    `trips` are {tick, causes, reason}; the figures are left out for a recording that cannot be read. Raises
-    UnavailableError if this worker's version of rtloop is not `version`.
+    `trips` are {tick, causes, reason}; the figures are left out for a recording that cannot be read, as an error
+    becomes a verdict. Raises UnavailableError alone, if this worker's version of rtloop is not `version`.
     """
     return _examine(paths, version, _summarise)
 

@@ -97,7 +97,7 @@ class Campaign:
 
     @property
     def digest(self) -> str:
-        """SHA-256 of all that determines a rig's results, except for the number of rigs and of kept ones.
+        """SHA-256, in hexadecimal, of all that determines a rig's results, except for `rigs` and `keep_worst`.
 
         With Latin hypercubes the number of rigs counts, too.
         """

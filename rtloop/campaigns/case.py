@@ -176,7 +176,7 @@ class CaseRunner:
         columns = np.empty((len(names), ticks))
 
         def store(first: int, rows: Real) -> None:
-            """Copy the needed columns of some ticks."""
+            """Copy the needed columns of `rows`, (n, all columns): the ticks from `first` on."""
             columns[:, first : first + len(rows)] = rows[:, indices].T
 
         done = self._loops.run(plan, driver, ticks, store)

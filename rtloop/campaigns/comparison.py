@@ -129,5 +129,5 @@ def _columns(folder: Path) -> dict[str, Any]:
 
 
 def _yield(passed: Any) -> Yield:
-    """Return the yield of rigs, (n,) truth values."""
+    """Return the yield of rigs, with its interval; `passed` (n,) are truth values."""
     return clopper_pearson(int(np.count_nonzero(passed)), len(passed))

@@ -187,7 +187,10 @@ def _campaign_section(folder: Path, summary: CampaignSummary, link: Link) -> dic
 
 
 def _nominal_text(nominal: Mapping[str, Any]) -> str:
-    """Return the verdict of the nominal rig, its row by column, with the reasons as a sentence; "" for {}."""
+    """Return the verdict of the nominal rig as a sentence, with the reasons for a failure; "" without a result.
+
+    `nominal` is its row of results by column, {} without one.
+    """
     if not nominal:
         return ""
     reasons = f": {nominal['missed']}" if nominal["status"] in (FAILED, REFUSED) else ""

@@ -209,7 +209,7 @@ def _draw_histogram(figure: Any, curves: FigureValues, ink: Palette) -> None:
 
 
 def histogram_title(curves: FigureValues) -> str:
-    """Return the number of rigs in a figure's histogram, and in words the rigs and the nominal value that are not."""
+    """Return in words the number of rigs with a finite value, those with +∞, and a nominal value of +∞, if any."""
     finite, infinite = (int(np.count_nonzero(test(curves.values))) for test in (np.isfinite, np.isposinf))
     parts = [count_text(finite, "rig")]
     if infinite:
@@ -245,7 +245,10 @@ def _draw_rigs(figure: Any, plane: RigPlane, ink: Palette) -> None:
 
 
 def _draw_sensitivity(figure: Any, indices: Mapping[str, Mapping[str, SensitivityIndex]], ink: Palette) -> None:
-    """Draw two bars for each key: first index above, total index below, and their intervals as lines."""
+    """Draw two bars for each key: first index above, total index below, and their intervals as lines.
+
+    `figure` is matplotlib's, with a panel for each quantity; `indices` are by quantity and by key.
+    """
     panels = _panels(figure, len(indices))
     for number, (panel, (quantity, index_by_key)) in enumerate(zip(panels, indices.items(), strict=True)):
         values, places = np.array(list(index_by_key.values())), np.arange(len(index_by_key))
@@ -273,7 +276,7 @@ def _draw_sensitivity(figure: Any, indices: Mapping[str, Mapping[str, Sensitivit
 
 
 def _draw_motions(figure: Any, motions: Mapping[str, RecordedMotion], ink: Palette) -> None:
-    """Draw reference and true position of each motion, with a line at each fault."""
+    """Draw reference and true position of each motion, with a line at each fault, on a figure of matplotlib."""
     panels, entries, fault_entries = _panels(figure, len(motions)), {}, {}
     for number, (panel, (name, motion)) in enumerate(zip(panels, motions.items(), strict=True)):
         for label, band, style in (
@@ -298,7 +301,10 @@ def _motion_title(name: str, motion: RecordedMotion) -> str:
 
 
 def _draw_pairs(figure: Any, pairs: Sequence[tuple[FigureValues, FigureValues]], ink: Palette) -> None:
-    """Draw a panel for each figure: a dot for each rig, the line of equal values, and both limits."""
+    """Draw a panel for each pair, on a figure of matplotlib: a dot for each rig, the line of equal values, both limits.
+
+    At most DRAWN_RIGS rigs are drawn, of those with finite values in both campaigns.
+    """
     for panel, (first, second) in zip(_panels(figure, len(pairs)), pairs, strict=True):
         finite = np.isfinite(first.values) & np.isfinite(second.values)
         x, y = (side.values[finite][:DRAWN_RIGS] for side in (first, second))

@@ -213,6 +213,6 @@ def _reach(configuration: Configuration, axis: AxisOptions) -> Iterator[str]:
 
 
 def _delay(configuration: Configuration, axis: AxisOptions, check: AxisCheck) -> Iterator[str]:
-    """Yield a warning for a model that states no delay if the simulated rig has one, with which the loop is judged."""
+    """Yield a warning for a model that states no delay if rig or driver has one, with which the loop is then judged."""
     if axis.model is not None and axis.model.delay_ticks < driver_delay_ticks(configuration) <= check.delay_ticks:
         yield delay_difference(configuration, axis, axis.model.delay_ticks, check)

@@ -189,7 +189,7 @@ def check_axes(configuration: Configuration, findings: Findings) -> list[AxisChe
 
 
 def _checks_and_findings(configuration: Configuration) -> tuple[list[AxisCheck], Findings]:
-    """Return what `check_axes` returns, and its findings, from another process."""
+    """Return what `check_axes` returns, and its findings; called in the limited process, which shares no memory."""
     findings = Findings()
     return check_axes(configuration, findings), findings
 
@@ -225,9 +225,9 @@ def promised_loop(axis: AxisOptions, rate_hz: float, delay: int, plant: Transfer
 
 
 def _check_axis(configuration: Configuration, axes: Sequence[AxisOptions], findings: Findings) -> list[AxisCheck]:
-    """Check one axis that shares its controller with no other; `axes` has one entry, and the returned list too.
+    """Return the check of one axis that shares its controller with no other, and append faults to `findings`.
 
-    The check has no law if this is a transfer function that cannot be discretised.
+    `axes` has one entry, and the returned list too. The check has no law if this is a transfer function that cannot be discretised.
     """
     (axis,) = axes
     law = make_controller(axis, 1.0 / configuration.loop.rate_hz)
@@ -283,9 +283,9 @@ def _report_instability(loop: Loop, options: ControllerOptions, key: str, models
 
 
 def _check_shared(configuration: Configuration, axes: Sequence[AxisOptions], findings: Findings) -> list[AxisCheck]:
-    """Check axes that share the controller of the first one: each axis's loop broken alone, and all at once.
+    """Return a check of each of `axes`, which share the controller of the first one, and append faults to `findings`.
 
-    Raises TypeError for a law that is for one axis.
+    Each axis's loop is broken alone, and all at once. A check has no law if a shipped law is not linear. Raises TypeError for a law that is for one axis.
     """
     names, key = tuple(axis.name for axis in axes), f"axis.{axes[0].name}.controller"
     law = make_controller(axes[0], 1.0 / configuration.loop.rate_hz, [axis.model for axis in axes])

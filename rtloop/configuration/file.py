@@ -306,7 +306,10 @@ def _keys(schema: Any) -> set[str]:
 
 
 def _fault(detail: Any, prefix: str, raw: Any, known_keys: set[str], missing_beside: Sequence[str]) -> str:
-    """Return one fault as key, value and allowed values; `missing_beside` are required keys that its table lacks."""
+    """Return one error of pydantic, `detail`, as key, value and allowed values; other parameters as in `describe`.
+
+    `missing_beside` are required keys that the table of the faulty key lacks.
+    """
     path = [prefix] if prefix else []
     node = raw
     for part in detail["loc"]:
@@ -349,7 +352,7 @@ def _format_value(value: Any) -> str:
 
 
 def _shorten(fault: str) -> str:
-    """Return the first MAX_CHARACTERS of a fault."""
+    """Return the first MAX_CHARACTERS of a fault, with "…" if it is longer."""
     return fault if len(fault) <= MAX_CHARACTERS else f"{fault[:MAX_CHARACTERS]}…"
 
 

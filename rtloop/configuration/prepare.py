@@ -194,7 +194,10 @@ def _coefficients(
     findings: Findings,
     place: int,
 ) -> Records | None:
-    """Return the coefficients (1,) of an axis; None, with faults, where channel or options do not fit."""
+    """Return the coefficients (1,) of an axis; None, with faults in `findings`, where channel or options do not fit.
+
+    An axis that shares its `controller` is number `place`, from 0, of the controller's axes.
+    """
     channel, prefix = configuration.channels[axis.name], f"driver.channels.{axis.name}."
     output: Channel | None = None
     with findings.collect_faults(prefix + "input: "):

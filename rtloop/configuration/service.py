@@ -76,7 +76,7 @@ class ServiceOptions(Options):
                 f"socket_mode: {self.socket_mode}; allowed: a mode without access for others, such as 0660"
             )
         if self.recover is not None and self.recover.depolarise and self.depolarise is None:
-            raise ValueError("recover.depolarise: true; allowed: with the sine of [service.depolarise]")
+            raise ValueError("recover.depolarise: true; add the table [service.depolarise], whose sine it plays")
         return self
 
     @property
@@ -85,7 +85,7 @@ class ServiceOptions(Options):
         return self.depolarise is not None or self.tare_s > 0
 
     def faults_with_schedule(self) -> list[str]:
-        """Return why `rtloop serve` refuses these options in a configuration with a [[schedule]], a sentence each."""
+        """Return a sentence for each reason why `rtloop serve` refuses these options together with a [[schedule]]."""
         faults = []
         if self.prepares:
             faults.append("schedule: not allowed with service.tare_s or service.depolarise, which use the first ticks")

@@ -165,13 +165,16 @@ def _sensor_scale(configuration: Configuration, axis: AxisOptions) -> Iterator[s
 
 
 def _delay(configuration: Configuration, axis: AxisOptions, check: AxisCheck) -> Iterator[str]:
-    """Yield a line for a model with less delay than the simulated rig has; the margins are those with the model's."""
+    """Yield a line for a model that states less delay than the simulated rig or the driver has.
+
+    The margins are computed with the model's delay.
+    """
     if axis.model is not None and check.delay_ticks < driver_delay_ticks(configuration):
         yield delay_difference(configuration, axis, axis.model.delay_ticks, check)
 
 
 def delay_difference(configuration: Configuration, axis: AxisOptions, model_ticks: int, check: AxisCheck) -> str:
-    """Return the line that names the delays of model, driver and margins, in samples."""
+    """Return the line that names the delays in samples: `model_ticks` of the model, the driver's, the margins'."""
     delay_ticks, kind = driver_delay_ticks(configuration), configuration.driver_kind
     driver_text = (
         f"the simulated rig has driver.latency_ticks = {delay_ticks}"

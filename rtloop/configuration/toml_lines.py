@@ -40,7 +40,10 @@ def numbered(faults: Sequence[str], source: str) -> list[str]:
 
 
 def _quote_line(fault: re.Match[str], text: str) -> str:
-    """Return a fault of TOML syntax with line, column and text of the line where it, or its open bracket, begins."""
+    """Return a fault of TOML syntax with line, column and text of the line where it, or its open bracket, begins.
+
+    `fault` is a match of SYNTAX, `text` the whole file.
+    """
     lines = text.splitlines()
     written = [number for number, line in enumerate(lines, start=1) if line.strip()]
     number, column = (
@@ -98,7 +101,10 @@ def key_lines(text: str) -> dict[str, int]:
 
 
 def _numbered(fault: str, lines: dict[str, int]) -> str:
-    """Return a fault with the line of the longest known part of its path."""
+    """Return a fault with the line of the longest part of its path in `lines`, as `key_lines` returns them.
+
+    A fault without such a part is returned unchanged.
+    """
     path = match[0].rstrip(".") if (match := PATH.match(fault)) else ""
     while path:
         if path in lines:
@@ -108,7 +114,10 @@ def _numbered(fault: str, lines: dict[str, int]) -> str:
 
 
 def _resolve_path(table: str, current: dict[str, str]) -> str:
-    """Return a table's path with the present entries of the lists that contain it."""
+    """Return a table's path with the present entries of the lists of tables that contain it.
+
+    `current` has the path of the present entry by the path of its list.
+    """
     for plain in sorted(current, key=len, reverse=True):
         if table == plain or table.startswith(f"{plain}."):
             return current[plain] + table[len(plain) :]
@@ -116,7 +125,7 @@ def _resolve_path(table: str, current: dict[str, str]) -> str:
 
 
 def _rename(lines: dict[str, int], current: dict[str, str], table: str, name: str) -> None:
-    """Rename keys of a list's entry from its number to `name`, and record the new path in `current`."""
+    """Rename the keys of a list's entry `table` in `lines` from its number to `name`; store its path in `current`."""
     list_path = table.rpartition(".")[0]
     current[list_path] = f"{list_path}.{name}"
     for path in [path for path in lines if path == table or path.startswith(f"{table}.")]:

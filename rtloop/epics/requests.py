@@ -40,7 +40,7 @@ class Requests:
         def execute_unless_stopped() -> None:
             """Execute the request. Raises LoopFault if a stop came since it was made."""
             if self._stop_count != stop_count:
-                raise LoopFault("withdrawn: a stop was written after it")
+                raise LoopFault("this write was withdrawn: a stop was written after it")
             request()
 
         self._pending_count += 1

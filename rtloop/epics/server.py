@@ -48,7 +48,7 @@ class ChannelServer:
         self._add((*LOOP_VARIABLES, self._message))
 
     def _add(self, variables: tuple[Variable, ...]) -> None:
-        """Add the channels of variables that have none yet."""
+        """Add the channels of variables that have none yet; they are writable if clients may write them."""
         for variable in variables:
             name = f"{self._prefix}{variable.suffix}"
             if name in self._channels:

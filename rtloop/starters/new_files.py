@@ -14,7 +14,8 @@ from rtloop.foundation.trusted import make_file
 def write_new_files(folder: Path, texts: Mapping[str, str]) -> list[Path]:
     """Write texts by file name to `folder`, which is created. Returns the paths.
 
-    Raises OutputError where a file exists already (none is written then), or if the system refuses.
+    Raises OutputError where a file exists already (none is written then), or if the system refuses (some may be
+    written then).
     """
     paths = [folder / name for name in texts]
     for path in paths:

@@ -147,7 +147,9 @@ def _headline(figures: StageFigures, actuator: Actuator) -> str:
 
 
 def _rate_hz(figures: StageFigures) -> float:
-    """Return the rate, or the lowest of RATES_HZ with SAMPLES_PER_PERIOD samples in a period of the resonance."""
+    """Return the rate of `figures`; None there: the lowest of RATES_HZ with SAMPLES_PER_PERIOD samples in a period of
+    the resonance.
+    """
     least_hz = SAMPLES_PER_PERIOD * figures.resonance_hz
     return figures.rate_hz or next(rate_hz for rate_hz in RATES_HZ if rate_hz >= least_hz)
 

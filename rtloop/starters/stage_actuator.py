@@ -90,11 +90,14 @@ def _weights(width: float) -> tuple[float, ...]:
 
 
 def _travel_um(weights: Sequence[float], dead_v: Sequence[float], change_v: float) -> float:
-    """Return the sum of the weights times the part of `change_v` beyond each play's dead range."""
+    """Return the sum of the weights times the part of `change_v` beyond each play's dead range, `dead_v`."""
     return sum(weight * max(0.0, change_v - dead) for weight, dead in zip(weights, dead_v, strict=True))
 
 
 def _largest(curve: Callable[[float], float], turns_v: Sequence[float], limit_um: float, most_v: float) -> float:
-    """Return the largest change up to `most_v` with which a rising curve, straight between `turns_v`, keeps a limit."""
+    """Return the largest change of the drive, 0 to `most_v`, with which the rising `curve` is at most `limit_um`.
+
+    The curve is straight between `turns_v`, which contain 0.
+    """
     points_v = sorted({turn for turn in turns_v if turn <= most_v} | {most_v})
     return float(np.interp(limit_um, [curve(point) for point in points_v], points_v))

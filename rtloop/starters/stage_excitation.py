@@ -54,7 +54,8 @@ def excitation_values(
 
 
 def _step_v(actuator: Actuator, damping: float, limit_um: float) -> float:
-    """Return the largest drive whose step from rest swings no farther than `limit_um`."""
+    """Return the largest drive in V, rounded down to three digits, whose step from rest swings at most to `limit_um`.
+    """
     overshoot = math.exp(-math.pi * damping / math.sqrt(1 - damping**2))
     return _shorten(actuator.drives_within(limit_um / (1 + overshoot))[1])
 

@@ -480,7 +480,7 @@ def test_the_ramp_of_a_return_is_smooth_and_slow_enough():
     ("keys", "message"),
     [
         ('causes = ["stale", "position"]', "'position': must be 'stale', 'driver', 'late' or 'heartbeat'"),
-        ("depolarise = true", r"recover.depolarise: true; allowed: with the sine of \[service.depolarise\]"),
+        ("depolarise = true", r"recover.depolarise: true; add the table \[service.depolarise\]"),
         ("max_per_hour = 0", "max_per_hour: 0: must be greater than or equal to 1"),
     ],
 )
