@@ -90,7 +90,10 @@ class VerdictTable:
         return [recording for recording in self._recordings if recording.paths[0] not in self.rows]
 
     def add(self, recording: ArchivedRecording, values: Row) -> None:
-        """Add the row of a recording, to the file first, with None for columns that `values` lacks. Raises OutputError."""
+        """Add the row of a recording, first to the file, with None for columns that `values` lacks.
+
+        Raises OutputError if the system refuses.
+        """
         row = {**self._empty(recording), **values}
         if self.path is not None:
             with output_errors(self.path):

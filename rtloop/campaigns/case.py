@@ -189,7 +189,10 @@ class CaseRunner:
         "" for a key without a fault.
         """
         if key.startswith(FIXED_KEYS):
-            return f"{key}: this key cannot be uncertain, as other settings depend on it; remove it from [uncertain]"
+            return (
+                f"{key}: this key cannot be uncertain, as the campaign sets it or other keys depend on it; remove it "
+                "from [uncertain]"
+            )
         disturbing = [experiment.label for experiment in self.options.experiment if experiment.disturbance is not None]
         if disturbing and "disturbance" in key.split("."):
             return f"{key}: experiment {disturbing[0]!r} sets the disturbance; remove the key or the experiment"

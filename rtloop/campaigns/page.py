@@ -150,7 +150,7 @@ def _estimate_text(sampling: str, estimate: Yield, rigs: int) -> str:
 
 
 def _campaign_section(folder: Path, summary: CampaignSummary, link: Link) -> dict[str, Any]:
-    """Return the values of the template for one campaign by name, its pictures included; raises as `render_campaign`."""
+    """Return the template's values for one campaign by name, its pictures included; raises as `render_campaign`."""
     manifest, columns = read_manifest(folder), read_columns(folder)
     sampled = _select(columns, columns["rig"] != NOMINAL)
     runnable = _select(sampled, sampled["status"] != REFUSED)

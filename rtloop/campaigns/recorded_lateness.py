@@ -42,7 +42,8 @@ def recorded_lateness(path: Path) -> tuple[float, ...]:
 def _new_lateness(lateness_us: Real, missed: Real, period_us: float) -> Real:
     """Return the time from each tick's first deadline to its wake in µs, (n,); NaN where `lateness_us` is NaN.
 
-    It is `lateness_us` with the `missed` periods of the tick, without the time that the wake before had lost already.
+    It is `lateness_us` and the `missed` periods of the tick, less the time by which the wake before was more than a
+    period late: that time counts at the wake before.
     """
     lost_us = np.concatenate([[0.0], np.nan_to_num(np.maximum(lateness_us[:-1] - period_us, 0.0))])
     return lateness_us + np.maximum(missed * period_us - lost_us, 0.0)

@@ -59,8 +59,9 @@ class RigBuilder:
         return self._nominal.plan.pacing.rate_hz
 
     def nominal_value(self, key: str) -> Any:
-        """Return the value of a key in the configuration, defaults included. Raises ValueError for a key that no option
-        has.
+        """Return the value of a key in the configuration, defaults included.
+
+        Raises ValueError for a key that no option has.
         """
         return option_value(self._nominal.configuration, self._nominal.configuration.driver_options, key)
 
@@ -88,7 +89,8 @@ class RigBuilder:
     def text(self, values: Mapping[str, Any], experiment: Experiment, heading: str) -> str:
         """Return the configuration of a rig in one experiment as TOML, whose first line is the comment `heading`.
 
-        Raises ValueError for values that the tables have no place for.
+        `values` are by key; those that are None are left out. Raises ValueError for a key for which the tables have no
+        place.
         """
         tables = self._add_disturbance(replace_values(self._tables, _present(values)), experiment)
         for axis in tables["axis"]:
@@ -108,7 +110,10 @@ class RigBuilder:
         return b"".join(parts)
 
     def _build_loop(self, tables: Mapping[str, Any]) -> Loop:
-        """Return configuration and plan of tables. Raises ConfigError where they cannot run on a simulated rig."""
+        """Return configuration and plan of a configuration's tables, for virtual time and with mode closed_loop.
+
+        Raises ConfigError where they cannot run on a simulated rig.
+        """
         campaign, name = self._campaign, self._campaign.configuration_name
         library = Library(campaign.folder, campaign.laws) if campaign.laws is not None else None
         configuration = parse(write_section("", tables, []), name, campaign.folder, name, library)

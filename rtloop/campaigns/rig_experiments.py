@@ -83,7 +83,10 @@ class ExperimentOptions(Options):
 
 
 class StepsExperiment(ExperimentOptions):
-    """Steps between levels, from rest at 0; figures are the worst of all steps, infinite if a step is not reached."""
+    """Steps between levels, from rest at 0; figures are the worst of all steps.
+
+    Overshoot and settling time are infinite if a step does not reach its level.
+    """
 
     kind: Literal["steps"]
     """Selects steps of the reference, judged by overshoot, settling time and static error."""
@@ -122,7 +125,10 @@ class StepsExperiment(ExperimentOptions):
         return ("overshoot_percent", "settling_ms", "static_error_percent")
 
     def measure(self, motion: Motion) -> tuple[float, ...]:
-        """Return the largest overshoot, settling time and static error of all steps; inf if a step is not reached."""
+        """Return the largest overshoot (%), settling time (ms) and static error (%) of all steps.
+
+        Overshoot and settling time are infinite if a step is not reached, all are if a position is not finite.
+        """
         position_um, level_um, steps = motion.position_um.ravel(), 0.0, []
         dwell = POINTS * round(self.dwell_s * motion.rate_hz)
         for number, next_um in enumerate(self.cycles * self.levels_um, start=1):
@@ -231,9 +237,10 @@ class DisturbanceExperiment(ExperimentOptions):
         return ("error_peak_um", "error_rms_um", "settling_ms")
 
     def measure(self, motion: Motion) -> tuple[float, ...]:
-        """Return largest magnitude and root mean square of the error from `start_s` on in µm, and the settling time.
+        """Return largest magnitude and root mean square (µm) of the error from `start_s` on, and settling time (ms).
 
-        The time is infinite if the error is outside the band at the end; all are if a position is not finite.
+        The time is 0 without a step, infinite if the error is outside the band at the end. All three are infinite if a
+        position is not finite.
         """
         error_um = np.abs(motion.error_um[motion.tick(self.start_s) :]).ravel()
         if not np.all(np.isfinite(error_um)):

@@ -60,8 +60,9 @@ def run_campaign(
 ) -> bool:
     """Run the rigs of a campaign that have no result in `folder`, then record the worst ones in its folder `worst`.
 
-    Returns whether all rigs have results; no worst one is recorded before. After a request to stop, the rigs that were
-    submitted end and no other one starts. Raises as `CaseRunner`, `Store`, `Coordinator.run` and `record_rig`.
+    Returns whether all rigs have results; only then the worst ones are recorded, `keep_worst` of them. After a request
+    to stop, the rigs that were submitted end and no other one starts. Raises as `CaseRunner`, `Store`,
+    `Coordinator.run` and `record_rig`.
     """
     runner = CaseRunner(campaign)
     with open_store(folder, campaign, runner.sample_values(NOMINAL)) as store:

@@ -95,7 +95,10 @@ def find_worst(
     count = 0
 
     def run_generation(_: Any, candidates: Any) -> list[float]:
-        """Run the rigs at some shares of their distributions; return the negative figures. Stores the worst rig."""
+        """Run the rigs at `candidates` (rigs, keys), shares of the distributions; return the negative figures.
+
+        Stores the worst rig so far in `worst_cases`.
+        """
         nonlocal count
         numbered = []
         for shares in candidates:

@@ -137,7 +137,7 @@ class Store:
             replaced.unlink(missing_ok=True)
 
     def equals(self, case: CaseResult) -> bool | None:
-        """Whether the stored row of the rig of `case` equals its row byte for byte; None if no row is stored."""
+        """Whether the stored row of the rig equals the row of its result `case` byte for byte; None without a row."""
         firsts = [first for first in self._paths if first <= case.rig]
         rows = {} if not firsts else {row["rig"]: row for row in self._rows(Unit(max(firsts), case.rig))}
         if case.rig not in rows:

@@ -126,7 +126,7 @@ def summarise_campaign(folder: Path, worst_count: int = 5) -> CampaignSummary:
 
 
 def independent_rigs(columns: Mapping[str, Any], manifest: Mapping[str, Any]) -> Any:
-    """Return for each row, (rigs,), whether it counts for a yield: sampled, possible, and drawn independently."""
+    """Return for each row, (rigs,), whether it counts for a yield: sampled, not refused, and drawn independently."""
     counted = (columns["rig"] != NOMINAL) & (columns["status"] != REFUSED)
     if manifest["sampling"] == "saltelli":
         counted &= (columns["rig"] - 1) % block_size(len(manifest["keys"])) < INDEPENDENT_ROWS
@@ -134,7 +134,7 @@ def independent_rigs(columns: Mapping[str, Any], manifest: Mapping[str, Any]) ->
 
 
 def _yield(columns: Mapping[str, Any], manifest: Mapping[str, Any]) -> Yield:
-    """Return the yield of the sampled rigs that are possible; of Saltelli's design the independent rows alone count."""
+    """Return the yield of the sampled rigs that could run; of Saltelli's design the independent rows alone count."""
     states = columns["status"][independent_rigs(columns, manifest)]
     return clopper_pearson(int(np.count_nonzero(states == PASSED)), states.size)
 

@@ -71,7 +71,10 @@ class UncertainOptions(Options):
         return values[min(int(share * len(values)), len(values) - 1)]
 
     def _normal_quantile(self, mean: float, deviation: float, share: float) -> float:
-        """Return the quantile of a normal distribution between the limits. Raises ValueError if it does not reach them."""
+        """Return the quantile of a normal distribution, cut off beyond `limits` unless these are None.
+
+        Raises ValueError if it does not reach them.
+        """
         from statistics import NormalDist
 
         distribution = NormalDist(mean, deviation)

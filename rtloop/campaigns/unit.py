@@ -50,7 +50,7 @@ class WorkerFacts:
 
     @classmethod
     def of_this_process(cls) -> WorkerFacts:
-        """Return the facts of this process."""
+        """Return the versions of rtloop and NUMERICAL_PACKAGES in this process."""
         return cls((("rtloop", __version__), *((name, version(name)) for name in NUMERICAL_PACKAGES)))
 
 

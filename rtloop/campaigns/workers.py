@@ -39,7 +39,7 @@ class Workers(Protocol):
     """Kind, number and address of the workers, for messages."""
 
     def submit(self, function: Callable[..., Any], *arguments: Any) -> Future[Any]:
-        """Start a function of a module in a worker; return the future of its result, whose errors `explain` converts."""
+        """Start a function of a module in a worker; return the future, whose errors `explain` converts."""
         ...
 
     def explain(self, error: BaseException) -> BaseException:
@@ -51,7 +51,7 @@ class Workers(Protocol):
         ...
 
     def close(self) -> None:
-        """End; functions that run are awaited, functions that wait are dropped."""
+        """End the workers; functions that run are awaited, functions that wait are dropped."""
         ...
 
 
@@ -76,7 +76,7 @@ class ProcessWorkers:
         self._executor = self._start()
 
     def submit(self, function: Callable[..., Any], *arguments: Any) -> Future[Any]:
-        """Run a function of a module in one of the processes."""
+        """Start a function of a module in one of the processes; return the future of its result."""
         return self._executor.submit(function, *arguments)
 
     def explain(self, error: BaseException) -> BaseException:
@@ -89,7 +89,7 @@ class ProcessWorkers:
         self._executor = self._start()
 
     def close(self) -> None:
-        """End the processes after the functions that they run."""
+        """Wait for the functions that run, drop those that wait, and end the processes."""
         self._executor.shutdown(wait=True, cancel_futures=True)
 
     def _start(self) -> Executor:
@@ -153,7 +153,7 @@ class DaskWorkers:
         """
 
         def version_there(module: str) -> str:  # pickled by value, as rtloop may be missing there
-            """Return the version of rtloop once `module` is imported, or the reason why it cannot be."""
+            """Return "rtloop VERSION" once `module` is imported, or "no rtloop (REASON)" if it cannot be."""
             from importlib import import_module
 
             try:
@@ -173,7 +173,7 @@ class DaskWorkers:
             raise UnavailableError(f"{self.name}: {'; '.join(mismatches)}; install rtloop {__version__} there")
 
     def submit(self, function: Callable[..., Any], *arguments: Any) -> Future[Any]:
-        """Run a function of a module in one of the scheduler's workers."""
+        """Start a function of a module in one of the scheduler's workers; return the future of its result."""
         return self._executor.submit(function, *arguments)
 
     def explain(self, error: BaseException) -> BaseException:

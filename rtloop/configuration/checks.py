@@ -152,9 +152,10 @@ class AxisCheck:
         return self.linear is not None
 
     def loop(self, dynamics: Transfer, delay_ticks: int) -> Loop:
-        """Return the sampled loop with another plant and delay.
+        """Return the sampled loop with the plant `dynamics` behind `delay_ticks` samples in place of the model's.
 
-        Raises ValueError for no or no linear law, and for a shared controller with an unknown model.
+        Raises ValueError without a law, for a law that is not linear, and for a shared controller with an unknown
+        model.
         """
         if self.together is not None:
             return self.together.broken_loop(dynamics, delay_ticks, self.reference)
@@ -195,7 +196,7 @@ def _checks_and_findings(configuration: Configuration) -> tuple[list[AxisCheck],
 
 
 def delay_ticks(configuration: Configuration, axis: AxisOptions) -> int:
-    """Samples of delay in an axis's loop: the model's, where it states them, else the simulated rig's."""
+    """Samples of delay in an axis's loop: the model's, where it states them, else those of rig or driver."""
     return loop_delay_ticks(axis.model, driver_delay_ticks(configuration))
 
 
@@ -227,7 +228,8 @@ def promised_loop(axis: AxisOptions, rate_hz: float, delay: int, plant: Transfer
 def _check_axis(configuration: Configuration, axes: Sequence[AxisOptions], findings: Findings) -> list[AxisCheck]:
     """Return the check of one axis that shares its controller with no other, and append faults to `findings`.
 
-    `axes` has one entry, and the returned list too. The check has no law if this is a transfer function that cannot be discretised.
+    `axes` has one entry, and the returned list too. The check has no law if this is a transfer function that cannot be
+    discretised.
     """
     (axis,) = axes
     law = make_controller(axis, 1.0 / configuration.loop.rate_hz)
@@ -269,7 +271,10 @@ def _warn_of_missing_model(axis: AxisOptions, findings: Findings) -> None:
 
 
 def _report_instability(loop: Loop, options: ControllerOptions, key: str, models: str, findings: Findings) -> None:
-    """Append a fault, or with `allow_unstable` a warning, where a sampled loop is unstable."""
+    """Append to `findings` a fault, or with `allow_unstable` a warning, where a sampled loop is unstable.
+
+    The message begins with the `key` of the controller; `models` names the plants in it.
+    """
     if loop.is_stable or loop.period_s is None:
         return
     fault = (
@@ -285,7 +290,8 @@ def _report_instability(loop: Loop, options: ControllerOptions, key: str, models
 def _check_shared(configuration: Configuration, axes: Sequence[AxisOptions], findings: Findings) -> list[AxisCheck]:
     """Return a check of each of `axes`, which share the controller of the first one, and append faults to `findings`.
 
-    Each axis's loop is broken alone, and all at once. A check has no law if a shipped law is not linear. Raises TypeError for a law that is for one axis.
+    Each axis's loop is broken alone, and all at once. A check has no law if a shipped law is not linear. Raises
+    TypeError for a law that is for one axis.
     """
     names, key = tuple(axis.name for axis in axes), f"axis.{axes[0].name}.controller"
     law = make_controller(axes[0], 1.0 / configuration.loop.rate_hz, [axis.model for axis in axes])

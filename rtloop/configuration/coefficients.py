@@ -36,7 +36,7 @@ def make_controller(
 
 
 def _law_class(options: LawOptions, default: LawReference) -> Any:
-    """Return the class of the law that `options` belong to."""
+    """Return the class of the law that `options` are bound to, of `default` if to none."""
     return law_class(options.law or default)
 
 

@@ -125,7 +125,7 @@ def connect(law: Law, owned: Sequence[str], inputs: Sequence[str], outputs: Mapp
     """Set `law.channels`, the numbers, from 0, of its inputs and of its outputs by name; `owned` are the law's axes.
 
     `inputs` and `outputs` are all channels of the configuration, in order. Raises ValueError for a channel that the law
-    names and the configuration lacks, and for an output of another axis.
+    names and the configuration lacks, and for an output of another axis or with a mark.
     """
     numbers = {name: number for number, name in enumerate(inputs)}
     numbers |= {name: number for number, name in enumerate(outputs)}

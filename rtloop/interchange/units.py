@@ -80,7 +80,7 @@ def factor_between(source: str, target: str, by: str = "") -> Fraction:
 
 
 def is_unit(text: str) -> bool:
-    """Whether this is a known unit; a number alone is none."""
+    """Whether a text is a known unit; a number alone is none, nor is ""."""
     try:
         parse_unit(text)
     except UnknownUnit:

@@ -30,7 +30,7 @@ class Starter(NamedTuple):
 
 
 def paper() -> Starter:
-    """Return the paper's loop, specification and campaign, and the loop of rtloop's own design."""
+    """Return files and first commands: the paper's loop, specification and campaign, and a loop of rtloop's design."""
     commands = (
         "rtloop check paper.toml",
         "rtloop run paper.toml --duration 2",
@@ -41,7 +41,7 @@ def paper() -> Starter:
 
 
 def stage(figures: StageFigures) -> Starter:
-    """Return a simulated stage with its controller, two excitations of it, and a specification for a faster loop."""
+    """Return files and first commands: a simulated stage with its controller, its two excitations, a specification."""
     texts = stage_files(figures)
     excitations = [_first_command(texts[name]) for name in ("stage-sine.toml", "stage-step.toml")]
     commands = (
@@ -56,13 +56,16 @@ def stage(figures: StageFigures) -> Starter:
 
 
 def law(name: str, stage: Configuration | None = None) -> Starter:
-    """Return a law, its test and a configuration that uses it: `stage` with another controller, or the paper's rig."""
+    """Return files and first commands: the law `name`, its test and a configuration that uses it.
+
+    The configuration is `stage` with this controller, by default the paper's rig.
+    """
     commands = (f"rtloop check {name}.toml", f"rtloop run {name}.toml --duration 2", *_test_commands(name))
     return Starter(law_files(name, stage), commands)
 
 
 def driver(kind: str) -> Starter:
-    """Return a package with a driver, its test and a configuration that uses it."""
+    """Return files and first commands: a package with the driver `kind`, its test and a configuration that uses it."""
     commands = (
         "pip install --editable .",
         "rtloop drivers",

@@ -80,7 +80,7 @@ def _values(figures: StageFigures) -> dict[str, object]:
 
 
 def _loop_numbers(figures: StageFigures, actuator: Actuator) -> dict[str, float]:
-    """Return the numbers that depend on resonance and drive."""
+    """Return the numbers of the templates that depend on resonance and drive, by name."""
     omega, rate_hz = 2 * math.pi * figures.resonance_hz, _rate_hz(figures)
     ki_per_s, pole = _integral_gain(figures, rate_hz), RESPONSE_PER_OMEGA * omega
     return {
@@ -109,9 +109,10 @@ def _sensor_min_line(sensor_min_v: float | None, noise_v: float) -> str:
 
 
 def _travel_numbers(range_um: float, reach_um: float, remanence_um: float) -> dict[str, float]:
-    """Return the numbers that are shares of the travel, or of its part within the position interlock, `reach_um`.
+    """Return the templates' numbers that are shares of the travel `range_um`, or of its part `reach_um`, by name.
 
-    `remanence_um` is the position below which a drive of one sign does not bring the stage back; 0 for any other drive.
+    `reach_um` is the travel within the position interlock, `remanence_um` the position below which a drive of one
+    sign does not bring the stage back; 0 for any other drive.
     """
     return {
         "largest_command_um": COMMAND_SHARE * reach_um,
@@ -155,7 +156,7 @@ def _rate_hz(figures: StageFigures) -> float:
 
 
 def _integral_gain(figures: StageFigures, rate_hz: float) -> float:
-    """Return the gain ki of the integrator in 1/s (see the module's equation)."""
+    """Return the gain ki of the integrator in 1/s: a third of the unstable 2ζω, at most a tenth of the rate."""
     unstable_at = 2 * figures.damping * 2 * math.pi * figures.resonance_hz
     return min(unstable_at / GAIN_MARGIN, LARGEST_GAIN_PER_TICK * rate_hz)
 

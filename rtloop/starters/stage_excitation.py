@@ -25,7 +25,10 @@ SHORTEST_LEVEL_S, LONGEST_LEVEL_S, LEVEL_DECAYS = 0.45, 4.5, 6.0
 def excitation_values(
     figures: StageFigures, actuator: Actuator, position_um: float, noise_um: float, rate_hz: float
 ) -> dict[str, object]:
-    """Return the values of the templates of sine and step by name, for a position interlock at ±`position_um`."""
+    """Return the values of the templates of sine and step by name, for a position interlock at ±`position_um`.
+
+    `noise_um` is the sensor's noise, rms; `rate_hz` is the rate of the step, in whose ticks its times are.
+    """
     noise_um *= NOISE_DEVIATIONS
     lowest_v, highest_v = map(_shorten, actuator.drives_within(SINE_SHARE * position_um - noise_um))
     step_v = _step_v(actuator, figures.damping, STEP_SHARE * position_um - noise_um)
@@ -54,8 +57,7 @@ def excitation_values(
 
 
 def _step_v(actuator: Actuator, damping: float, limit_um: float) -> float:
-    """Return the largest drive in V, rounded down to three digits, whose step from rest swings at most to `limit_um`.
-    """
+    """Return the largest drive in V, to three digits, whose step from rest swings at most to `limit_um`."""
     overshoot = math.exp(-math.pi * damping / math.sqrt(1 - damping**2))
     return _shorten(actuator.drives_within(limit_um / (1 + overshoot))[1])
 

@@ -31,7 +31,7 @@ VALUE_KEYS = ("data", "values")
 
 
 def read_mat(path: Path, group: str | None = None) -> Table:
-    """Return the signals of one raster or structure: `group`, else the only or the longest one.
+    """Return the signals of the raster or structure `group`; None: of the longest one, if possible of several columns.
 
     Raises UnreadableData if the file is no MAT file, damaged or too large, or has no such group or no numbers;
     MissingExtra without h5py for version 7.3.
@@ -167,8 +167,7 @@ def _collect_arrays(columns: FileColumns, path: str, value: Any, depth: int, uni
     """Collect every array of numbers below `value` into `columns`, by its path; names and units are beside it.
 
     `unit` is that of `value` if it is an array itself, `depth` the number of levels above it. Objects that only MATLAB
-    can read are listed as left out. Raises UnreadableData for structures that are nested too
-    deeply.
+    can read are listed as left out. Raises UnreadableData for structures that are nested too deeply.
     """
     if depth > MAX_DEPTH:
         raise UnreadableData(f"{columns.path}: {path}: nested too deeply; allowed: up to {MAX_DEPTH} levels")
