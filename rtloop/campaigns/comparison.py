@@ -104,7 +104,7 @@ def mcnemar(only_first: int, only_second: int) -> float:
 def paired_difference(first: Real, second: Real, seed: int = 0) -> FigureDifference:
     """Return the median of `second` − `first` (n,) over the pairs that are finite, with its bootstrap interval.
 
-    `seed` is that of the bootstrap. The interval is NaN for less than two pairs, the median for none.
+    The bootstrap draws with `seed`. The interval is NaN for less than two pairs, the median for none.
     """
     from scipy.stats import bootstrap
 

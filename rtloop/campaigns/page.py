@@ -55,7 +55,7 @@ class RankedKeys(NamedTuple):
 def render_campaign(folder: Path, summary: CampaignSummary, link: Link) -> str:
     """Return the report of the results in `folder` as one HTML page.
 
-    `summary` is that of the folder; `link` returns a file's path relative to the folder of the page. Raises
+    `summary` describes the same results; `link` returns a file's path relative to the folder of the page. Raises
     InputFileError for a folder without results or with damaged ones, MissingExtra without pyarrow or matplotlib.
     """
     section = _campaign_section(folder, summary, link)

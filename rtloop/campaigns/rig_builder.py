@@ -89,8 +89,7 @@ class RigBuilder:
     def text(self, values: Mapping[str, Any], experiment: Experiment, heading: str) -> str:
         """Return the configuration of a rig in one experiment as TOML, whose first line is the comment `heading`.
 
-        `values` are by key; those that are None are left out. Raises ValueError for a key for which the tables have no
-        place.
+        `values` are by key; a value None is left out. Raises ValueError for a key for which the tables have no place.
         """
         tables = self._add_disturbance(replace_values(self._tables, _present(values)), experiment)
         for axis in tables["axis"]:

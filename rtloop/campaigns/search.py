@@ -176,7 +176,7 @@ def _bisect(
 ) -> tuple[float, str]:
     """Return the last value that passes between a passing and a failing one, and the cause of the nearest failure.
 
-    `failure` returns the cause at a value, "" if it passes; `cause` is that of `failing`.
+    `failure` returns the cause at a value, "" if it passes; `cause` belongs to `failing`.
     """
     for _ in range(BISECTIONS):
         if abs(failing - passing) <= tolerance:

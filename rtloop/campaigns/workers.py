@@ -89,7 +89,7 @@ class ProcessWorkers:
         self._executor = self._start()
 
     def close(self) -> None:
-        """Wait for the functions that run, drop those that wait, and end the processes."""
+        """Wait for the functions that run, drop the waiting ones, and end the processes."""
         self._executor.shutdown(wait=True, cancel_futures=True)
 
     def _start(self) -> Executor:

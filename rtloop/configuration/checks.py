@@ -196,7 +196,7 @@ def _checks_and_findings(configuration: Configuration) -> tuple[list[AxisCheck],
 
 
 def delay_ticks(configuration: Configuration, axis: AxisOptions) -> int:
-    """Samples of delay in an axis's loop: the model's, where it states them, else those of rig or driver."""
+    """Samples of delay in an axis's loop: the model's, where it states them, else the driver's."""
     return loop_delay_ticks(axis.model, driver_delay_ticks(configuration))
 
 

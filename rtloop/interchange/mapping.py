@@ -164,7 +164,7 @@ def column_unit(table: Table, name: str) -> str | None:
 
 
 def name_without_unit(name: str) -> str:
-    """Return a column's name without the unit at its end, or as it is if no known unit ends it."""
+    """Return a column's name without the unit at its end, unchanged if no known unit ends it."""
     return _split_unit(name)[0]
 
 

@@ -166,7 +166,7 @@ def _description(value: dict[str, Any]) -> dict[str, str]:
 def _collect_arrays(columns: FileColumns, path: str, value: Any, depth: int, unit: str | None = None) -> None:
     """Collect every array of numbers below `value` into `columns`, by its path; names and units are beside it.
 
-    `unit` is that of `value` if it is an array itself, `depth` the number of levels above it. Objects that only MATLAB
+    `unit` counts if `value` is an array itself; `depth` is the number of levels above it. Objects that only MATLAB
     can read are listed as left out. Raises UnreadableData for structures that are nested too deeply.
     """
     if depth > MAX_DEPTH:

@@ -16,7 +16,7 @@ WORKBOOK = "xl/workbook.xml"
 
 
 def read_npz(path: Path, group: str | None = None) -> Table:
-    """Return the arrays of one length, those of `group`; None: the longest ones, if possible of several columns.
+    """Return the arrays of one length, by the name `group`; None: the longest ones, if possible of several columns.
 
     Raises UnreadableData if the file is no npz file, damaged, an Excel workbook or too large, or has no such group or
     no numbers.
