@@ -84,7 +84,7 @@ def _is_recovered(path: str) -> bool:
 
 
 def _group_runs(paths: Sequence[str]) -> Iterator[tuple[str, ...]]:
-    """Yield the files of each run, in the order of the sorted `paths`; a file without a number is a run alone.
+    """Yield the files of each run, in the order of the sorted `paths`; a file that fits no other is a run alone.
 
     Files are of one run if their names differ in the number alone, and if `open_run` accepts them together.
     """

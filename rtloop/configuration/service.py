@@ -81,7 +81,7 @@ class ServiceOptions(Options):
 
     @property
     def prepares(self) -> bool:
-        """Whether a start depolarises or tares the actuator, where nothing forbids it."""
+        """Whether `depolarise` or `tare_s` is set: a start without `arm` or a schedule then prepares the actuator."""
         return self.depolarise is not None or self.tare_s > 0
 
     def faults_with_schedule(self) -> list[str]:

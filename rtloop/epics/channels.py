@@ -63,7 +63,7 @@ class Channel(ChannelData):
         await super().write(value, verify_value=False, status=status, severity=severity, **metadata)
 
     def check_access(self, hostname: str, username: str) -> AccessRights:
-        """Return whether clients may write; names that a client gives itself are no proof, and count for nothing."""
+        """Return READ, with WRITE if the channel has a writer; the client's `hostname` and `username` are ignored."""
         return AccessRights.READ if self.writer is None else AccessRights.READ | AccessRights.WRITE
 
     async def auth_write(self, hostname: str, username: str, data: Any, data_type: Any, metadata: Any, *,

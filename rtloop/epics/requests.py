@@ -1,4 +1,4 @@
-"""Requests of EPICS clients to the service: one after another, except that a stop waits for none of them."""
+"""Requests of EPICS clients to the service: one after another, except that a stop waits for no other request."""
 
 from __future__ import annotations
 

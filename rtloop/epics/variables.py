@@ -38,7 +38,10 @@ class Variable(NamedTuple):
 
 
 def axis_variables(axis: str) -> tuple[Variable, ...]:
-    """Return the variables of an axis; those of its reference are in V in mode raw (`unit_in_mode`)."""
+    """Return position, reference, error, drive and setpoint of an axis; its name and ":" begin their suffixes.
+
+    Reference and setpoint are in V in mode raw (`unit_in_mode`).
+    """
 
     def signal(name: str) -> Callable[[Status], float | None]:
         """Return a function that returns a signal of the axis, None without a loop or where it is not finite."""
