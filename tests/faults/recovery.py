@@ -30,6 +30,8 @@ STANDS_STILL_S = 3.0
 SHORT_AGE = ("sample_age_us = 400000.0", "sample_age_us = 100000.0")
 LATE = ("sample_age_us = 400000.0", "sample_age_us = 400000.0\nlate_us = 10000.0\nlate_ticks = 1")
 LATE_S = 0.025
+SLOW_RETURN = ("[axis.limits]\n", "[axis.limits]\nbump_s = 0.1\n")
+"""A return takes ten times as long as a bump: a second, so that a busy host can act in the middle of it."""
 
 
 def policy(text: str = "", before: str = "") -> tuple[str, str]:
@@ -323,11 +325,11 @@ FAULTS = (
     Fault("recover: stop while it waits", "ends; does not move", client_takes_over("/stop", "waiting"),
           changes=(policy(), SHORT_AGE)),
     Fault("recover: stop while it returns", "ends; ramps down", client_takes_over("/stop", "returning"),
-          changes=(policy(), SHORT_AGE)),
+          changes=(policy(), SHORT_AGE, SLOW_RETURN)),
     Fault("recover: reset while it confirms", "ends; does not move", client_takes_over("/reset", "confirming"),
           changes=(policy(), SHORT_AGE)),
     Fault("recover: trip while it returns", "counts, and returns again", trips_in_the_middle,
-          changes=(policy(), SHORT_AGE)),
+          changes=(policy(), SHORT_AGE, SLOW_RETURN)),
     Fault("recover: SIGTERM in the middle", "ends safe, exit 0", service_ends, changes=(policy(), SHORT_AGE)),
     Fault("recover: configuration replaced", "stays tripped", another_configuration, changes=(policy(), SHORT_AGE)),
     Fault("recover: card flaps", "latched after three; no drive, service lives", card_flaps, changes=(policy(),),
