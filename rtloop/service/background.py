@@ -13,14 +13,15 @@ T = TypeVar("T")
 
 @contextmanager
 def repeat_every(period_s: float, action: Callable[[], object]) -> Iterator[None]:
-    """Call `action` every `period_s` in a separate thread during the work within, first after one period.
+    """Call `action` again and again in a separate thread during the work within, after a pause of `period_s` each time.
 
-    A call in progress is not awaited at the end; an exception of `action` ends the repetition.
+    The first pause comes before the first call. A call in progress is not awaited at the end; an exception of `action`
+    ends the repetition, and is not raised in the work.
     """
     end_event = threading.Event()
 
     def work() -> None:
-        """Call `action` every `period_s` until `end_event`."""
+        """Call `action` after each pause of `period_s` until `end_event` is set."""
         while not end_event.wait(period_s):
             action()
 
@@ -33,7 +34,7 @@ def repeat_every(period_s: float, action: Callable[[], object]) -> Iterator[None
 
 @contextmanager
 def set_in_context(variable: ContextVar[T], value: T) -> Iterator[None]:
-    """Set a context variable during the work within, also for threads that copy its context."""
+    """Set a context variable during the work within, also for threads that copy its context; then restore its value."""
     token = variable.set(value)
     try:
         yield

@@ -81,7 +81,10 @@ def can_supervision(service: Service) -> Iterator[None]:
 
 
 def _require_frames(frames: dict[str, Any], options: BusOptions) -> None:
-    """Raise ValueError, which names the DBC file, for a missing frame or one with another number of signals."""
+    """Raise ValueError, which names the DBC file, unless `frames`, by name, have all REPORTS and COMMANDS.
+
+    Each must have its number of signals, too.
+    """
     for name, signal_names in (REPORTS | COMMANDS).items():
         allowed = f"allowed: a message {name} with the signals {', '.join(signal_names)}"
         if name not in frames:
@@ -111,7 +114,10 @@ class CanSupervision:
         self._logged_s = 0.0
 
     def send_frames(self) -> None:
-        """Send Status and Heartbeat with the periods of the DBC, and Trip when a trip begins, until `end_event`."""
+        """Send Status and Heartbeat with the periods of the DBC, and Trip when a trip begins, until `end_event` is set.
+
+        A frame that cannot be sent is logged and lost.
+        """
         due_s = dict.fromkeys(("Status", "Heartbeat"), time.monotonic())
         beat_count, is_tripped = 0, False
         while not self.end_event.wait(POLL_S):
@@ -133,7 +139,7 @@ class CanSupervision:
                     due_s[name] = now_s + self._frames[name].cycle_s
 
     def receive_frames(self) -> None:
-        """Execute received command frames until `end_event`; ignore other frames, and log errors of the bus."""
+        """Execute received command frames until `end_event` is set; ignore other frames, and log errors of the bus."""
         while not self.end_event.is_set():
             try:
                 message = self._bus.recv(POLL_S)
@@ -145,7 +151,9 @@ class CanSupervision:
                 self._execute_frame(message)
 
     def _execute_frame(self, message: Any) -> None:
-        """Execute a command frame; refusals and errors are counted and logged, never raised."""
+        """Execute `message`, a received frame of COMMANDS; a refusal or error is logged and counted in `refused_count`,
+        never raised.
+        """
         frame, command = self._commands[message.arbitration_id]
         try:
             if not frame.fits(message):
@@ -159,10 +167,10 @@ class CanSupervision:
             self._log_warning(f"{frame.name}: {'; '.join(getattr(error, 'faults', [str(error)]))}")
 
     def _set_setpoint(self, axis: float, value: float) -> None:
-        """Hold the reference of axis number `axis` at `value` (µm; V in raw mode), with the lock.
+        """Hold the reference of axis number `axis`, from 0, at `value` (µm; V in raw mode).
 
-        Raises Refusal for an unknown number, without a loop or while another name holds the lock; else as
-        `LiveReferences.set`.
+        Takes the service's lock as a client without a name. Raises Refusal for an unknown number, without a loop or
+        while another name holds the lock; else as `LiveReferences.set`.
         """
         live = self._service.require_live()
         axes = live.prepared.plan.axes
@@ -172,9 +180,10 @@ class CanSupervision:
             live.references.set(axes[int(axis)], {"kind": "hold", "value": value})
 
     def _set_mode(self, number: float) -> None:
-        """Set the mode with this number, with the lock unless it is off.
+        """Set the mode whose value in `Mode` is `number`.
 
-        Raises Refusal for an unknown number or while another name holds the lock, and as `Service.set_mode`.
+        Takes the service's lock as a client without a name, except for mode off, which needs none. Raises Refusal for
+        an unknown number or while another name holds the lock, and as `Service.set_mode`.
         """
         if number not in list(Mode):
             raise Refusal(
@@ -185,7 +194,7 @@ class CanSupervision:
             self._service.set_mode(Mode(int(number)).name.lower())
 
     def _reset_trip(self, confirm: float) -> None:
-        """Reset a trip, with the lock, if `confirm` is 1.
+        """Reset a trip if `confirm` is 1; takes the service's lock as a client without a name.
 
         Raises Refusal for another number or while another name holds the lock, and as `Service.reset`.
         """
@@ -200,7 +209,10 @@ class CanSupervision:
         return None if supervisor is None else supervisor.latest()
 
     def _send(self, name: str, *values: float) -> None:
-        """Send the CAN frame `name` of the DBC with these values, in the order of its signals; a failure is logged."""
+        """Send the CAN frame `name` of the DBC with these values, in the order of its signals.
+
+        A failure is logged, not raised.
+        """
         try:
             self._bus.send(self._frames[name].message(self._options, values))
         except Exception as error:

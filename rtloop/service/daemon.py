@@ -98,8 +98,9 @@ def _api_server(service: Service) -> Iterator[None]:
 def _bind(path: Path, mode: int) -> socket.socket:
     """Return a listening socket at `path` with permissions `mode` and, if possible, the folder's group.
 
-    The socket of a service that died is removed. Raises UnavailableError if another service listens there, the path is
-    no socket or the system refuses, HostRefusal for a folder that other users may write to.
+    Missing folders are made (FOLDER_MODE); the socket of a service that died is removed. Raises UnavailableError if
+    another service listens there, the path is no socket or the system refuses, HostRefusal for a folder that another
+    user owns or may change.
     """
     listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
     try:
@@ -168,7 +169,10 @@ class _JournalFormatter(logging.Formatter):
 
 
 def _log_to_stderr() -> None:
-    """Send log messages from INFO on to stderr alone: with priorities under systemd, else with times."""
+    """Send log messages from INFO on to stderr, with priorities under systemd, else with times.
+
+    This handler replaces all others of the root logger.
+    """
     handler = Journal()
     is_under_systemd = "JOURNAL_STREAM" in os.environ
     handler.setFormatter(

@@ -50,7 +50,7 @@ class Requester:
 
 
 UNNAMED_REQUESTER = Requester()
-"""A requester without a name."""
+"""Requester with the name OPERATOR, which stands for a client without a name."""
 _requester = ContextVar("requester", default=UNNAMED_REQUESTER)
 
 
@@ -60,7 +60,7 @@ def current_requester() -> Requester:
 
 
 def use_requester(requester: Requester) -> AbstractContextManager[None]:
-    """Return a context whose commands, also from threads that copy it, are sent by `requester`."""
+    """Return a context manager: commands sent within, also by threads that copy the context, come from `requester`."""
     return set_in_context(_requester, requester)
 
 
@@ -92,7 +92,7 @@ class UnconfirmedCommand(RtloopError):
 class Desk:
     """Sender of commands to the loop of `block`, from any thread; the recorder reads requesters' names from `names`.
 
-    `rate_hz` is the loop's rate: a slow loop gets more time to acknowledge.
+    None stores no names. `rate_hz` is the loop's rate: a slow loop gets more time to acknowledge.
     """
 
     def __init__(self, block: SharedBlock, rate_hz: float = 1e6, names: RequesterNames | None = None) -> None:
@@ -102,7 +102,10 @@ class Desk:
         self._changes: OrderedDict[int, str] = OrderedDict()
 
     def change_text(self, identity: int) -> str | None:
-        """Return a command's change of a law in words; None if it has none, or after MAX_CHANGES later changes."""
+        """Return in words the change of a law that a command made; `identity` is the number in the command's event.
+
+        None if the command changed no law, and after MAX_CHANGES later changes.
+        """
         return self._changes.get(identity)
 
     def submit(
@@ -134,10 +137,11 @@ class Desk:
         return self._answer(kind, identity, cursor, position)
 
     def _answer(self, kind: Kind | Note, identity: int, cursor: int, position: int) -> int:
-        """Wait for the acknowledgement of a command and return its tick; `position` is its place in the queue.
+        """Wait for the event with `identity`, the acknowledgement of a command, and return its tick.
 
-        `cursor` is the number of the first event to read. Raises Refusal for a command that the loop refused or that
-        was withdrawn in time, UnconfirmedCommand for one that the loop took without acknowledgement.
+        `cursor` is the number of the first event to read, `position` the command's place in the queue, `kind` names it
+        in messages. Raises RefusedByLoop if the loop refused the command. Without an acknowledgement in time, withdraws
+        it and raises Refusal, or UnconfirmedCommand if the loop has taken it and it can no longer be withdrawn.
         """
         timeout_s = ANSWER_TIMEOUT_S + ANSWER_PERIODS * self._period_s
         ring, deadline = self._block.ring("events"), time.monotonic() + timeout_s

@@ -46,7 +46,7 @@ class Lock:
 
     @property
     def holder(self) -> dict[str, Any] | None:
-        """{name, since_unix_s, until_unix_s: end without a further command}; None for a free lock."""
+        """{name, since_unix_s, until_unix_s: end without a further command}, in s since 1970; None for a free lock."""
         with self._guard:
             holder = self._current_holder()
             if holder is None:
@@ -56,12 +56,12 @@ class Lock:
             return {"name": holder.name, "since_unix_s": round(since_s, 3), "until_unix_s": round(until_s, 3)}
 
     def take(self, name: str) -> None:
-        """Take the lock, or restart its LOCK_TIMEOUT_S. Raises Refusal while another name holds it."""
+        """Take the lock for `name`, or restart its LOCK_TIMEOUT_S. Raises Refusal while another name holds it."""
         with self._guard:
             self._take(name)
 
     def release(self, name: str) -> None:
-        """Release the lock; a free lock stays free. Raises Refusal while another name holds it."""
+        """Release the lock that `name` holds; a free lock stays free. Raises Refusal while another name holds it."""
         with self._guard:
             self._require_available(name)
             self._holder = None
@@ -88,8 +88,8 @@ class Lock:
     def hold(self, name: str, origin: Origin = Origin.OPERATOR) -> Iterator[None]:
         """Take the lock, let it not expire during the work within, and send the work's commands under `name`.
 
-        The lock stays taken afterwards, for LOCK_TIMEOUT_S without a command. Raises Refusal while another name holds
-        it.
+        `origin` is the commands' origin in the recording. The lock stays taken afterwards, for LOCK_TIMEOUT_S without a
+        command. Raises Refusal while another name holds it; so does a command within, once another name has taken it.
         """
         with self._guard:
             holder = self._take(name)

@@ -21,7 +21,8 @@ TIMEOUT_FACTOR = 3.0
 
 
 def prepare_actuator(options: ServiceOptions, supervisor: Supervisor, live: LiveLaw, desk: Desk) -> None:
-    """Depolarise and tare all axes as configured, and wait until that is done; the outputs end at safe.
+    """Erase the hysteresis of all axes by a decaying sine (`depolarise`), then make the mean reading of each its
+    position 0 (tare), each of both if `options` say so; wait until that is done. The outputs end at their safe values.
 
     Raises Refusal after a trip and if the loop executes no ticks in time, and as `LiveReferences.play_raw`,
     `LiveLaw.tare` and `Desk.submit`.
@@ -36,12 +37,15 @@ def prepare_actuator(options: ServiceOptions, supervisor: Supervisor, live: Live
 
 
 def depolarise(options: DepolariseOptions, supervisor: Supervisor, live: LiveLaw, desk: Desk) -> None:
-    """Erase the memory of all axes by the same sine, and wait until the outputs are at safe; raises as
-    `prepare_actuator`. Clients' references are refused meanwhile.
+    """Erase the hysteresis of all axes by the same decaying sine of the drive, in mode raw, then set mode off and wait
+    until the outputs are at their safe values.
+
+    Clients' references are refused meanwhile. Raises Refusal after a trip, if the loop executes no ticks in time and if
+    a client sets another mode, and as `LiveReferences.play_raw` and `Desk.submit`.
     """
     rate_hz = live.prepared.plan.pacing.rate_hz
     sine_v = decaying_sine(options, rate_hz)
-    with live.references.reserved("the actuator is depolarised"):
+    with live.references.reserved("the actuator is being depolarised"):
         for axis in range(len(live.prepared.plan.axes)):
             live.references.play_raw(axis, sine_v)
         first_tick = desk.submit(Kind.SET_MODE, values=[float(Mode.RAW)])
@@ -51,7 +55,7 @@ def depolarise(options: DepolariseOptions, supervisor: Supervisor, live: LiveLaw
 
 
 def decaying_sine(options: DepolariseOptions, rate_hz: float) -> npt.NDArray[np.float64]:
-    """Return a sine of `cycles` cycles whose amplitude falls linearly to 0, V (n,), one sample per tick."""
+    """Return a sine (n,), V, a sample per tick, whose amplitude falls linearly from `amplitude_v` to 0."""
     sample_count = max(2, round(options.cycles / options.frequency_hz * rate_hz))
     phase = np.arange(sample_count) / (sample_count - 1)
     return options.amplitude_v * (1 - phase) * np.sin(2 * np.pi * options.cycles * phase)
@@ -60,7 +64,7 @@ def decaying_sine(options: DepolariseOptions, rate_hz: float) -> npt.NDArray[np.
 def await_ticks(supervisor: Supervisor, count: int, rate_hz: float, raw_from_tick: int | None = None) -> None:
     """Wait until `count` more ticks were executed. Raises Refusal after a trip or the time limit.
 
-    With `raw_from_tick`, also if a tick after that one has another mode than raw, because a client requested it.
+    With `raw_from_tick`, raises Refusal also if a tick after that one has another mode than raw: a client set it.
     """
     final_tick, limit_s = supervisor.ticks + count, 1.0 + TIMEOUT_FACTOR * count / rate_hz
     start_s = time.monotonic()
@@ -78,7 +82,10 @@ def _has_left_raw(supervisor: Supervisor, from_tick: int) -> bool:
 
 
 def _await_rest(supervisor: Supervisor) -> None:
-    """Wait until no output ramps: all are at their safe values. Raises Refusal after a trip or the time limit."""
+    """Wait, after mode off was set, until no output ramps any more: all are then at their safe values.
+
+    Raises Refusal after a trip or the time limit.
+    """
     start_s, limit_s = time.monotonic(), 1.0 + TIMEOUT_FACTOR
     while (row := supervisor.latest()) is None or int(row[signals.FLAGS]) & Flag.RAMPING:
         _require_progress(supervisor, start_s, limit_s)
@@ -98,7 +105,7 @@ def _require_progress(supervisor: Supervisor, start_s: float, limit_s: float) ->
 
 
 def _mean_inputs_v(supervisor: Supervisor, count: int, axis_count: int) -> list[float]:
-    """Wait for `count` ticks, at most half of the ring's length, and return their mean reading of each axis, V.
+    """Wait for `count` ticks, at most half of the ring's length, and return the mean reading (ADC) of each axis, V.
 
     Raises Refusal after a trip or the time limit.
     """

@@ -56,7 +56,7 @@ class SecondOpinion:
                 if not self.faults:
                     write(path, b"")
         except (RtloopError, DriverError, OSError) as error:
-            log.warning("no second opinion on the loop: %s", error)
+            log.warning("python-control could not check rtloop's computation of the loop: %s", error)
         finally:
             self._is_known.set()
 
@@ -77,9 +77,9 @@ class SecondOpinion:
 
 
 def _compare(prepared: Prepared) -> list[str]:
-    """Return the disagreements on the loops of a running plan, from a process that ends with this call.
+    """Return `_faults` of a running plan, computed in a process that ends with this call; [] for an agreement.
 
-    Raises RtloopError or DriverError if the process ends or takes too long.
+    Raises RtloopError or DriverError if the process ends, takes too long or cannot compare.
     """
     process = LimitedProcess()
     try:

@@ -75,9 +75,10 @@ class State(StrEnum):
 class Service:
     """Service of one configuration, until `end` or until a loop has run for `duration_s`.
 
-    `name` replaces the name in the file `config`. Raises ConfigError for an invalid file. `faults` are latched texts,
-    `results` come from ended loops, `measurements` the figures by axis; `supervisor` and `live` are None without
-    a loop. Methods named like API requests may be called from any thread.
+    `name` replaces the stem of the file's name, `config`. Raises ConfigError for an invalid file, InputFileError for
+    one that cannot be read. `faults` are the latched faults, a text each, `results` those of ended loops,
+    `measurements` the figures by axis; `supervisor` and `live` are None without a loop. Methods named like API requests
+    may be called from any thread.
     """
 
     def __init__(self, config: Path, duration_s: float | None = None, name: str | None = None) -> None:
@@ -197,7 +198,7 @@ class Service:
         target_mode = Mode[mode.upper()]
         self._require_permission(target_mode)
         if target_mode is not Mode.OFF and self._is_preparing and self.configuration.service.prepares:
-            raise Refusal(f"mode {mode}: the actuator is depolarised or tared; send the request again afterwards")
+            raise Refusal(f"mode {mode}: the actuator is being depolarised or tared; send the request again afterwards")
         self.recovery.end()
         self._requested_mode = target_mode
         return self._enter(target_mode)
@@ -210,7 +211,11 @@ class Service:
             raise Refusal(f"mode {mode.name.lower()}: the outputs are not armed; use arm first ({self.ctl('arm')})")
 
     def _enter(self, mode: Mode) -> int:
-        """Change the mode bumplessly. Returns the tick at which it took effect; raises as `set_mode`."""
+        """Change the mode bumplessly, without the checks of `set_mode`. Returns the tick at which it took effect.
+
+        Mode off in a loop that is tripped or stops changes nothing, and returns the tick of the loop's refusal. Raises
+        Refusal without a loop, and for mode off if the driver refuses every write; else as `Desk.submit`.
+        """
         try:
             return self.desk.submit(Kind.SET_MODE, values=[float(mode), 0.0, 1.0])
         except RefusedByLoop as refusal:
@@ -226,7 +231,7 @@ class Service:
         """Ramp the outputs to safe and keep them there; disarm if service.arm is set.
 
         Returns the tick at which the ramp begins, or a later one if the outputs ramp already, as after a trip. Raises
-        Refusal without a loop, and as `Desk.submit`.
+        Refusal without a loop and if the driver refuses every write, and as `Desk.submit`.
         """
         tick = self.set_mode("off")
         self.armed = not self.configuration.service.arm
@@ -250,7 +255,7 @@ class Service:
     # The daemon
 
     def run(self) -> int:
-        """Serve until `end`. Returns the exit code of the last loop, 0 if the end came before a loop.
+        """Serve until `end` is called. Returns the exit code of the last loop, 0 if the end came before a loop.
 
         Unfinished recordings are recovered in the background, and once more at the end. Raises LoopFault if more than
         service.restarts loops ended by themselves within service.restart_window_s, and the error of the last loop that
@@ -269,7 +274,10 @@ class Service:
                 self._start_thread(self._recover_leftovers).join(RECOVERY_TIMEOUT_S)
 
     def _serve(self) -> int:
-        """Run loop after loop until `end`, with outputs off after a failure. Returns the exit code; raises as `run`."""
+        """Run loop after loop until `end` is called; a loop after a failure begins with its outputs off.
+
+        Adds each loop's result to `results`. Returns the exit code, and raises, as `run`.
+        """
         outputs_off = self.configuration.service.arm
         while not self._end_requested.is_set():
             try:
@@ -382,7 +390,7 @@ class Service:
         return result
 
     def _follow_events(self) -> None:
-        """Read the loop's new events, for its references and for the recovery."""
+        """Read the loop's new events, for its references and for the recovery; do nothing without a loop."""
         if self.live is not None:
             self.live.references.follow()
             self.recovery.observe()
@@ -420,7 +428,8 @@ class Service:
     def _latch_and_allow_restart(self, reason: str) -> bool:
         """Latch a loop's failure as a fault, log it, and pause RESTART_PAUSE_S, with the watchdog at START_TIMEOUT_S.
 
-        Returns False, without the pause, after more than service.restarts failures in service.restart_window_s.
+        Returns True if the loop may be started again; False, without the pause, after more than service.restarts
+        failures in service.restart_window_s.
         """
         self.faults.append(reason)
         log.error("%s", reason)
@@ -452,7 +461,10 @@ class Service:
         return thread
 
     def _recover_leftovers(self) -> None:
-        """Recover unfinished recordings of services that were killed; a failure is logged, and its file stays."""
+        """Recover the unfinished recordings in the folder of recordings, as of services that were killed.
+
+        Successes and failures are logged; a file that cannot be recovered stays.
+        """
         for part_file in find_leftovers(Path(self.configuration.recording.folder)):
             try:
                 report = recover(part_file, opener=open_own)
@@ -462,9 +474,10 @@ class Service:
             log.info("%s: %d ticks recovered from %s", report["output"], report["ticks"], part_file.name)
 
     def _prepare_and_start(self) -> None:
-        """Depolarise and tare the actuator, set the configured references and mode; latch an RtloopError as a fault.
+        """Depolarise and tare the actuator, then set the configured references and mode; runs in its own thread.
 
-        A mode that a client requests meanwhile, such as off, takes the place of the configured one.
+        A mode that a client requests meanwhile, such as off, takes the place of the configured one. An RtloopError is
+        added to `faults` and logged, unless a client requested a mode or the service ends. Does nothing without a loop.
         """
         supervisor, live, desk = self.supervisor, self.live, self._desk
         if supervisor is None or live is None or desk is None:
@@ -501,7 +514,9 @@ class Service:
             prepare_builder()
 
     def _judge_loop(self, prepared: Prepared) -> None:
-        """Compute the second opinion. A disagreement brings the outputs to safe, and is latched as a fault."""
+        """Have python-control check the loop (`second_opinion`). A disagreement stops the loop's outputs, as `stop`
+        does, and is latched in `faults`.
+        """
         self.second_opinion.compute(prepared)
         if not self.second_opinion.faults:
             return
@@ -510,11 +525,14 @@ class Service:
         except RtloopError as error:  # no loop runs any more
             log.warning("%s", error)
         for fault in self.second_opinion.faults:
-            log.error("second opinion: %s", fault)
+            log.error("python-control disagrees with rtloop's computation of the loop: %s", fault)
         self.faults += self.second_opinion.faults
 
     def _apply_reload(self) -> None:
-        """Reload and notify systemd; log an error, which names the axes that were changed already."""
+        """Do the work of `reload_now` and notify systemd before and after it.
+
+        An RtloopError or DriverError is logged; its text names the axes that were changed already.
+        """
         self.notifier.send(RELOADING=1, MONOTONIC_USEC=time.monotonic_ns() // 1000)
         try:
             self.reload_now()
@@ -524,20 +542,24 @@ class Service:
             self.notifier.send(READY=1)
 
     def _reuse_loaded_laws(self, configuration: Configuration) -> Configuration:
-        """Return a configuration with the laws loaded at the start: compiled code cannot change in a running service.
+        """Return `configuration` with the laws loaded at the start: compiled code cannot change in a running service.
 
         Raises Refusal if it needs a law that was not loaded, or whose text has changed since.
         """
         loaded = self.configuration.laws
         if missing_kinds := [law.kind for law in configuration.laws if law not in loaded]:
-            raise Refusal(f"law {', '.join(missing_kinds)}: not loaded, or changed in its file; restart the service")
+            raise Refusal(
+                f"law {', '.join(missing_kinds)}: not loaded when the service started, or changed in its file since; "
+                "restart the service"
+            )
         return replace(configuration, laws=loaded)
 
     def reload_now(self) -> dict[str, Any]:
-        """Read the configuration file again and apply it. Returns {changed: ["axis.NAME", …]}, [] without a loop.
+        """Read the configuration file again and apply it to the loop, after any reload in progress.
 
-        Raises ConfigError, DriverError, UnavailableError if it takes too long, Refusal if it needs a restart; see
-        `LiveLaw.replace_all` for a refusal after some axes were changed.
+        Returns {changed: ["axis.NAME", …]}, the axes that changed, [] if none or without a loop. Raises ConfigError,
+        InputFileError, DriverError, UnavailableError if it takes too long, Refusal if it needs a restart or the loop
+        refuses; see `LiveLaw.replace_all` for a refusal after some axes were changed.
         """
         with self._reload_lock:  # One at a time: the file that was read last stays in force.
             configuration = self._reuse_loaded_laws(load(self.config, self._name))
@@ -550,5 +572,9 @@ class Service:
 
 
 def _is_driver_error(error: Exception) -> bool:
-    """Return whether a loop did not start because its driver could not be opened, in this process or the loop's."""
+    """Return whether `error`, with which a loop did not start, counts as a driver that could not be opened.
+
+    True for a DriverError, and for any error with the exit code of UnavailableError: the loop's process reports its
+    driver's errors so.
+    """
     return isinstance(error, DriverError) or getattr(error, "exit_code", None) == UnavailableError.exit_code

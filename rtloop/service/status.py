@@ -77,7 +77,8 @@ def running_configuration(service: Service) -> dict[str, Any]:
 def timing(service: Service) -> dict[str, Any]:
     """Return {rate_hz, lateness_us: {p50, p99, max}, overruns, periods_missed} over the last WINDOW_TICKS.
 
-    Returns {} before the second tick.
+    `overruns` is the number of ticks that ended after the next deadline, `periods_missed` that of periods without a
+    tick. Returns {} without a loop and before the second tick.
     """
     rows = None if service.supervisor is None else service.supervisor.newest(WINDOW_TICKS)
     if rows is None or len(rows) < 2:
@@ -100,7 +101,8 @@ def timing(service: Service) -> dict[str, Any]:
 def newest_signals(service: Service) -> dict[str, Any]:
     """Return {tick, mode, trip: causes, trip_reason, axes: {axis: {signal: value}}, condition: {axis: Condition}}.
 
-    A signal that is not finite is None; an axis outside closed loop has no condition. {} before the first tick.
+    `trip` is [] and `trip_reason` None without a trip. A signal that is not finite is None; an axis outside closed loop
+    has no condition. {} without a loop and before its first tick.
     """
     supervisor = service.supervisor
     row = None if supervisor is None else supervisor.latest()

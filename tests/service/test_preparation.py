@@ -71,9 +71,9 @@ def test_while_the_actuator_is_depolarised_setpoints_move_nothing_and_no_start_u
     with Bench(tmp_path, ("[recording]", sine)) as bench:
         wait_for(lambda: bench.seen().largest_v > 0.5, "the sine")
         for resource, body in (("/setpoint", {"value": 4.0}), ("/waveform", {"samples": [4.0, 4.0]})):
-            with pytest.raises(RtloopError, match="the actuator is depolarised; send the request again"):
+            with pytest.raises(RtloopError, match="the actuator is being depolarised; send the request again"):
                 bench.client.post(resource, {"axis": "x"} | body)
-        with pytest.raises(RtloopError, match="mode closed_loop: the actuator is depolarised or tared; send"):
+        with pytest.raises(RtloopError, match="mode closed_loop: the actuator is being depolarised or tared; send"):
             bench.client.post("/start")
         bench.client.post("/stop")
         wait_for(lambda: "not started: mode off was requested meanwhile" in bench.log(), "the end of the preparation")
