@@ -40,7 +40,10 @@ def application(service: Service) -> Starlette:
 
     @asynccontextmanager
     async def stream(socket: WebSocket) -> AsyncIterator[bool]:
-        """Accept a WebSocket and yield True; with MAX_STREAMS open, close it and yield False. Its end is no error."""
+        """Accept a WebSocket and yield True; with MAX_STREAMS open, close it and yield False.
+
+        The end of the connection ends the work within, without an error.
+        """
         nonlocal streams
         if streams >= MAX_STREAMS:
             await socket.close(1013)
@@ -56,7 +59,9 @@ def application(service: Service) -> Starlette:
             streams -= 1
 
     async def watch(socket: WebSocket) -> None:
-        """Send state, faults, lock holder, measurement and newest signals as JSON text, WATCH_HZ times a second."""
+        """Send state, faults, lock holder, measurement, recovery and newest signals as JSON text, WATCH_HZ times a
+        second, until the client disconnects.
+        """
         async with stream(socket) as accepted:
             while accepted:
                 message = {"state": service.state, "faults": list(service.faults), "lock": service.lock.holder}
@@ -74,7 +79,7 @@ def application(service: Service) -> Starlette:
                 await socket.send_text(bytes(response.body).decode())
 
     async def answer(request: Request) -> Response:
-        """Respond to a request of the table."""
+        """Return the response to an HTTP request of REQUESTS: its result, or an error as {error: message}."""
         method = "GET" if request.method == "HEAD" else request.method
         try:
             data = await _read_body(request)
@@ -99,7 +104,9 @@ def application(service: Service) -> Starlette:
 
 
 async def _read_body(request: Request) -> bytes:
-    """Return the body. Raises ValueError for more than MAX_BODY_BYTES, without reading the rest; ClientDisconnect."""
+    """Return the request's whole body. Raises ValueError, without reading the rest, beyond MAX_BODY_BYTES, and
+    ClientDisconnect if the client disconnects before its end.
+    """
     data = b""
     async for part in request.stream():
         data += part

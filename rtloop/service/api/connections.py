@@ -53,7 +53,9 @@ class BoundedConnection(H11Protocol):
 
     @property
     def is_idle(self) -> bool:
-        """Whether the service waits for the client, to send a request or to read a response."""
+        """Whether the connection waits for its client, to send a request or to read a response, and not for the
+        service.
+        """
         return self.cycle is None or self.cycle.response_complete or self.cycle.more_body or self.flow.write_paused
 
     def drop(self) -> None:

@@ -13,7 +13,11 @@ from rtloop.service.desk import UnconfirmedCommand
 
 
 def error_response(error: Exception) -> Response:
-    """Return {error: message} as a response, 422, 409, 503 or 504 (`description.ERRORS`). Raises any other `error`."""
+    """Return {error: message} as a response, with the status of the error's class.
+
+    422 for an invalid request, 503 for a full lane or UnavailableError, 504 for UnconfirmedCommand, 409 for any other
+    RtloopError or DriverError. Raises any other `error` itself.
+    """
     match error:
         case ValidationError():
             return message_response(422, "; ".join(describe(error, "", None)))

@@ -44,7 +44,9 @@ class Lanes:
         """
         limit = lane.value[1]
         if self._pending_counts[lane] >= limit:
-            raise TooManyRequests(f"{count_text(limit, 'request')} of this kind run or wait already; {RETRY_TEXT}")
+            raise TooManyRequests(
+                f"the service has {count_text(limit, 'request')} of this kind to answer already; {RETRY_TEXT}"
+            )
         self._pending_counts[lane] += 1
         try:
             return await anyio.to_thread.run_sync(action, *arguments, limiter=self._limiters[lane])

@@ -49,12 +49,14 @@ class ServiceCollector(Collector):
         self._service = service
 
     def collect(self) -> Iterator[Metric]:
-        """Yield the present values, one gauge for each metric."""
+        """Yield a gauge for each metric of `_state` and `_measurements`, with the present values."""
         for name, text, labels, samples in (*self._state(), *self._measurements()):
             yield _family(GaugeMetricFamily, name, text, samples, labels)
 
     def _state(self) -> Iterator[tuple[str, str, tuple[str, ...], Samples]]:
-        """Yield (name, help, labels, samples) for loop, recording, timing, limits and newest signals."""
+        """Yield (name, help, names of labels, samples) for state, loop, recording, timing, drive limits, trip,
+        conditions and newest signals; without a loop, only some of these have samples.
+        """
         service, supervisor, state = self._service, self._service.supervisor, self._service.state
         yield "rtloop_state", "1 for the state in force", ("state",), [(one.value, state is one) for one in State]
         ticks = 0 if supervisor is None else supervisor.ticks
@@ -95,7 +97,7 @@ class ServiceCollector(Collector):
         yield "rtloop_signal", "Newest value of a signal", ("axis", "signal"), values
 
     def _measurements(self) -> Iterator[tuple[str, str, tuple[str, ...], Samples]]:
-        """Yield (name, help, labels, samples) for the last measurement of each axis; nothing before the first one.
+        """Yield (name, help, names of labels, samples) for the last measurement of each axis; nothing before the first.
 
         The metrics are its time, margins, resonance and gain, the last three with standard deviations.
         """
@@ -150,7 +152,9 @@ class QualityCollector(Collector):
         yield lateness
 
     def _axis_metrics(self) -> Iterator[Metric]:
-        """Yield the sums of each axis, and its largest values of the last minute."""
+        """Yield the sums of each axis as counters, and its largest |error| and its ends of the drive in the last minute
+        as gauges.
+        """
         axes = self._quality.axes
         for name, text, field in (
             ("rtloop_closed_loop_ticks", "Ticks in closed loop", "closed_ticks"),

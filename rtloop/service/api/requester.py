@@ -57,7 +57,10 @@ def authorise(
 
 @asynccontextmanager
 async def watch_client(request: Request) -> AsyncIterator[None]:
-    """Let the work within ask by `is_client_waiting` whether the client is connected; its body must have been read."""
+    """Make `is_client_waiting` return, during the work within, whether the client of `request` is still connected.
+
+    The request's body must have been read.
+    """
     disconnect_event = threading.Event()
     async with call_at_disconnect(request, disconnect_event.set):
         with bind_client(lambda: not disconnect_event.is_set()):

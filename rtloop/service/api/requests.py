@@ -178,7 +178,10 @@ def _undo(service: Service, body: UndoBody) -> dict[str, Any]:
 
 
 def _command_origin(service: Service, query: IdentityQuery) -> dict[str, str | None]:
-    """Return {name, change} of a command, by its event's `identity`: requester, change of the law; None if unknown."""
+    """Return {name: requester, change: change of a law in words} of the command whose event has this `identity`.
+
+    Each is None if it is unknown, and without a loop.
+    """
     supervisor, live, identity = service.supervisor, service.live, int(query.identity)
     name = None if supervisor is None else supervisor.names.requester(identity)
     return {"name": name, "change": None if live is None else live.change_text(identity)}

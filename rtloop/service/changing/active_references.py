@@ -73,7 +73,10 @@ class ActiveReferences:
         self._trip, self._is_latched = NO_TRIP, False
 
     def follow(self) -> None:
-        """Read the new events. If some were overwritten before, all references are unknown until they are set again."""
+        """Read the loop's new events, and apply them to references, mode and trip.
+
+        If some were overwritten before they were read, all references are unknown until they are set again.
+        """
         ring = self._staging.block.ring("events")
         with self._lock:
             event_count = len(self._events)
@@ -93,9 +96,10 @@ class ActiveReferences:
             return self._trip
 
     def values(self, number: int) -> tuple[tuple[float, ...], bool] | None:
-        """Return [kind, *parameters] of the generator of axis `number`, and whether it is in V; None if it is unknown.
+        """Return ([kind, *parameters] of the generator of axis `number`, whether it is in V); None if it is unknown.
 
-        Does not wait for the loop, and uses the events that were read.
+        Unknown is also a constant that only the records show, until the loop has executed its first tick. Does not wait
+        for the loop, and uses the events that were read.
         """
         record = self._staging.newest_record
         with self._lock:
@@ -128,7 +132,7 @@ class ActiveReferences:
             time.sleep(POLL_S)
 
     def _apply_event(self, event: Any) -> None:
-        """Apply one event, a MESSAGE record, to mode and references; the lock must be held."""
+        """Apply one event, a MESSAGE record, to mode, references and trip; the lock must be held."""
         kind, tick, values = int(event["kind"]), int(event["tick"]), event["values"]
         if kind == Kind.SET_MODE:
             self._mode = Mode(int(values[0]))
@@ -159,7 +163,7 @@ class ActiveReferences:
         self._mode, self._is_latched = Mode.OFF, True
 
     def _change_units(self, to_volts: bool, holds_output: bool, tick: int) -> None:
-        """Set the unit of all references, V or µm, from `tick` on.
+        """Set the unit of all references, V or µm, from `tick` on; the lock must be held.
 
         With `holds_output`, a reference in the former unit becomes a constant, which holds the output; else its kind
         stays.

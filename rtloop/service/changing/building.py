@@ -16,21 +16,24 @@ from rtloop.service.changing.preview import Figures, loop_figures
 
 
 def prepare_limited(configuration: Configuration) -> Prepared:
-    """Build and verify a changed configuration in the limited process, and return it.
+    """Build and verify a changed configuration in the limited process, and return the result of `prepare`.
 
-    Raises ConfigError, DriverError, RtloopError, and UnavailableError if the process takes too long, prints too much or
-    ends.
+    The limited process is a separate one, killed if it takes too long. Raises ConfigError, DriverError, RtloopError as
+    `prepare`, and UnavailableError if the process takes too long, prints too much or ends.
     """
     return PROCESS.run(prepare, configuration, compiles=_needs_compiler(configuration))
 
 
 def figures_limited(configuration: Configuration, number: int, least_step_ms: float = 0.0) -> Figures:
-    """Return `loop_figures` of axis `number`, built in the limited process. Raises as `prepare_limited`."""
+    """Return `loop_figures` of axis `number`, computed in the limited process; its step lasts at least `least_step_ms`.
+
+    Raises as `prepare_limited`.
+    """
     return PROCESS.run(_prepare_figures, configuration, number, least_step_ms, compiles=_needs_compiler(configuration))
 
 
 def prepare_builder() -> None:
-    """Start the limited process, which imports `prepare`, before it is needed."""
+    """Start the limited process before it is needed, and let it import `prepare`; does not wait for it."""
     PROCESS.prepare_ahead(prepare)
 
 

@@ -30,11 +30,11 @@ class ChangeHistory:
         self._changes.append(change)
 
     def newest(self, axis_numbers: Collection[int]) -> Change | None:
-        """Return the newest change of any of these axes, None without one; it stays in the history."""
+        """Return the newest change of any of the axes `axis_numbers`, None without one; it stays in the history."""
         return next((change for change in reversed(self._changes) if change.number in axis_numbers), None)
 
     def remove(self, change: Change | None = None) -> None:
-        """Remove a change that was undone; None removes all changes."""
+        """Remove `change`, an object in the history, after its undo; None removes all changes."""
         if change is None:
             self._changes.clear()
         else:

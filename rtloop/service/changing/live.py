@@ -72,10 +72,10 @@ class LiveLaw:
         return self._staging.desk.change_text(identity)
 
     def tune(self, axis: str, section: str, changes: Mapping[str, Any]) -> int:
-        """Build and verify the law with changed keys of [axis.SECTION]; load it. Returns the tick of the load.
+        """Build and verify the law with other values of keys of [axis.SECTION], `changes`, and load it.
 
-        Raises as `_swap`; ConfigError also for a section that is not in TUNABLE_SECTIONS and for invalid values, which
-        change nothing.
+        Returns the tick of the load; `undo` takes the change back. Raises as `_swap`; ConfigError also for an unknown
+        axis, a section that is not in TUNABLE_SECTIONS and invalid values, which change nothing.
         """
         with self._build_lock:
             return self._apply_change(*self._axis_with_keys(axis, section, changes), f"{section}: {', '.join(changes)}")
@@ -83,7 +83,8 @@ class LiveLaw:
     def load_controller(self, axis: str, controller: Mapping[str, Any]) -> int:
         """Replace [axis.controller] as a whole: build, verify and load it. Returns the tick of the load.
 
-        `controller` are all its keys. Raises as `_swap`; ConfigError also for invalid keys, which change nothing.
+        `controller` are all its keys with their values; `undo` takes the change back. Raises as `_swap`; ConfigError
+        also for an unknown axis and invalid keys, which change nothing.
         """
         with self._build_lock:
             return self._apply_change(
@@ -105,9 +106,10 @@ class LiveLaw:
             return {"before": before, "after": after}
 
     def undo(self, axis: str) -> tuple[int, str]:
-        """Undo the last change of an axis, or of the controller that it shares; its reference stays.
+        """Load the options of an axis from before its last change, or before that of the controller that it shares.
 
-        Returns the tick, and the undone change in words. Raises Refusal if there is no change, and as `_swap`.
+        The reference stays; the change leaves the history. Returns the tick of the load, and the undone change in
+        words. Raises ConfigError for an unknown axis, Refusal if there is no change, and as `_swap`.
         """
         with self._build_lock:
             number, configuration = self.axis_number(axis), self.prepared.configuration
@@ -134,9 +136,10 @@ class LiveLaw:
         return tick
 
     def _axis_with_keys(self, axis: str, section: str, changes: Mapping[str, Any]) -> tuple[int, AxisOptions]:
-        """Return number and options of the axis that owns the section, with the changes.
+        """Return number and options of the axis that owns the section, with the changes; nothing is loaded.
 
-        Raises ConfigError for an unknown axis, a section that is not in TUNABLE_SECTIONS and invalid values.
+        For the section "controller" that is the axis whose controller `axis` uses, else `axis` itself. Raises
+        ConfigError for an unknown axis, a section that is not in TUNABLE_SECTIONS and invalid values.
         """
         number = self.axis_number(axis)
         if section not in TUNABLE_SECTIONS:
@@ -174,10 +177,11 @@ class LiveLaw:
             return self._stage(number, self.prepared, axis, f"position 0 µm is now at a reading of {offset_v:.4g} V")
 
     def replace_all(self, prepared: Prepared) -> list[str]:
-        """Apply another configuration, axis by axis; clear the undo history if an axis changed.
+        """Load the options and references of another configuration, axis by axis, where they differ from the present.
 
-        Returns the changed axes as ["axis.NAME", …], [] if none changed. Raises Refusal if it needs a restart,
-        ConfigError for a reference beyond the limits, and as `Desk.submit`. An error after the first axis becomes a
+        `prepared` is then the new one; the undo history is cleared if an axis changed. Returns the changed axes as
+        ["axis.NAME", …], [] if none changed. Raises Refusal if the new one needs a restart, ConfigError for a reference
+        that is invalid or beyond the limits, and as `Desk.submit`. An RtloopError after the first axis becomes a
         Refusal that names the axes changed already: these stay changed.
         """
         with self._build_lock, self._staging.lock:
@@ -233,10 +237,10 @@ class LiveLaw:
         self.prepared = replace(self.prepared, configuration=configuration, plan=plan, checks=tuple(checks))
 
     def _validated_axis(self, raw: Mapping[str, Any]) -> AxisOptions:
-        """Return the options of an axis, checked against the laws that the loop has loaded.
+        """Return the options of an axis from `raw`, the keys of its section [[axis]], with the name.
 
-        A user's laws are tried in the limited process first. Raises ConfigError for invalid values, and for a law whose
-        code ends that process or does not return.
+        They are checked against the laws that the loop has loaded. A user's laws are tried in the limited process
+        first. Raises ConfigError for invalid values, and for a law whose code ends that process or does not return.
         """
         configuration = self.prepared.configuration
         library = Library(configuration.folder, configuration.laws)

@@ -94,9 +94,10 @@ def step_duration_ms(figures: Figures) -> float:
 
 
 def lengthen_step(figures: Figures, check: AxisCheck, end_ms: float) -> Figures:
-    """Return `figures` with a step that lasts until `end_ms`; unchanged without a step or with one that is long enough.
+    """Return a copy of `figures`, of `loop_figures`, whose step lasts until `end_ms`.
 
-    `check` is the check of the axis, from which the step is computed again.
+    Returns `figures` itself without a step or with one that is long enough. `check` is the check of the axis, from
+    which the step is computed again.
     """
     if check.running is None or not 0 < step_duration_ms(figures) < end_ms:
         return figures
@@ -104,7 +105,10 @@ def lengthen_step(figures: Figures, check: AxisCheck, end_ms: float) -> Figures:
 
 
 def _step_figures(check: AxisCheck, analysis: LoopAnalysis, min_duration_s: float) -> dict[str, list[float]] | None:
-    """Return the response to a step of 1 µm, {t_ms, y (µm)}, STEP_POINTS samples; None if the loop does not settle."""
+    """Return the response to a step of 1 µm, {t_ms, y (µm)}, STEP_POINTS samples over at least `min_duration_s`.
+
+    None without a discrete-time loop on a model, and if the loop does not settle.
+    """
     loop = check.on_model
     if loop is None or loop.period_s is None or not math.isfinite(analysis.settling_time_s):
         return None

@@ -66,10 +66,11 @@ class LiveReferences:
         """Reason for refusing the references of clients, in words; empty while clients may set references."""
 
     def set(self, axis: str, reference: Mapping[str, Any], *, restores: bool = False) -> int:
-        """Start a generator, {kind, …} as in [axis.reference], on an axis. Returns its first tick.
+        """Start a generator, {kind, …} as in [axis.reference], on the axis of this name. Returns its first tick.
 
         `restores`: the reference was active before, so a position interlock that was narrowed since does not refuse it.
-        Raises ConfigError for an unknown axis, invalid keys or values beyond the limits; Refusal, UnconfirmedCommand.
+        Raises ConfigError for an unknown axis, invalid keys, a table that cannot be read and values beyond the limits;
+        Refusal within `reserved`, and as `Desk.submit`.
         """
         try:
             options = type_adapter(ReferenceOptions).validate_python(dict(reference))
@@ -117,7 +118,10 @@ class LiveReferences:
             return self._submit_table(number, values, samples.T.ravel())
 
     def setting(self, number: int) -> Setting | None:
-        """Return the reference of axis `number` for `restart`; None if it is unknown. Does not wait."""
+        """Return the reference of axis `number` for `restart`, with a copy of its samples; None if it is unknown.
+
+        Does not wait for the loop.
+        """
         active = self._active_references.values(number)
         if active is None:
             return None
@@ -140,7 +144,10 @@ class LiveReferences:
 
     @contextmanager
     def reserved(self, activity: str) -> Iterator[None]:
-        """Refuse the references of clients within, with `activity` as the reason: the loop would take µm for V."""
+        """Refuse the references of clients during the work within: the loop would take their µm for V.
+
+        `activity` is the reason in the refusal, in words. References of the service itself are accepted.
+        """
         with self._staging.lock:
             self._activity = activity
         try:
@@ -166,11 +173,11 @@ class LiveReferences:
 
     @property
     def trip(self) -> Trip:
-        """The newest trip in the events that were read."""
+        """The newest trip in the events that `follow` has read; NO_TRIP, whose number is 0, before the first."""
         return self._active_references.trip
 
     def set_count(self, number: int) -> int:
-        """Return how many references were set on axis `number`, after a change that is under way has ended."""
+        """Return how many references were set on axis `number` so far; waits for the end of a change under way."""
         with self._staging.lock:
             return self._set_counts[number]
 
@@ -193,7 +200,7 @@ class LiveReferences:
             return self._submit(number, [float(generator["kind"]), *generator["parameters"].tolist()])
 
     def constant_reference_um(self, number: int) -> float:
-        """Return the constant reference that the loop has for axis `number`, µm.
+        """Return the constant reference that the loop has for axis `number`, µm; waits for a change under way.
 
         Raises Refusal if it is not constant, is in V, is unknown, or the loop stands still.
         """
@@ -252,10 +259,10 @@ class LiveReferences:
         return self._submit(number, [float(value) for value in values])
 
     def _submit(self, number: int, values: list[float], *, table: bool = False) -> int:
-        """Start a generator and count it, unless it is refused. Returns the tick; raises as `Desk.submit`.
+        """Start a generator on axis `number` and count it, unless it is refused. Returns its first tick.
 
-        The staging lock must be held. `table`: the samples are in the free place of the axis in shared memory, which
-        must not change until the loop has read it.
+        `values` are [kind, *parameters]. The staging lock must be held. `table`: the samples are in the free place of
+        the axis in shared memory, which must not change until the loop has read it. Raises as `Desk.submit`.
         """
         try:
             if table:
@@ -269,7 +276,9 @@ class LiveReferences:
         return tick
 
     def _record_set(self, number: int, table: bool) -> None:
-        """Count a reference of axis `number`; with `table`, the other place in shared memory is free from now on."""
+        """Count a reference of axis `number`; with `table`, its place in shared memory is in use from now on, and the
+        other one is free.
+        """
         self._set_counts[number] += 1
         if table:
             self._active_places[number] = 1 - self._active_places[number]
@@ -300,12 +309,12 @@ def _setpoint_fault(values: Sequence[float], position_limit_um: float) -> str | 
 
 
 def axis_number(prepared: Prepared, name: str) -> int:
-    """Return the number of an axis. Raises ConfigError for an unknown name."""
+    """Return the number of an axis, from 0. Raises ConfigError for an unknown name."""
     if name not in prepared.plan.axes:
         raise invalid_request(f"axis {name!r}: unknown; allowed: {', '.join(prepared.plan.axes)}")
     return prepared.plan.axes.index(name)
 
 
 def invalid_request(message: str) -> ConfigError:
-    """Return the error for a request that no state allows."""
+    """Return, without raising it, the error for a request that no state allows; `message` is its only fault."""
     return ConfigError("request", [message])

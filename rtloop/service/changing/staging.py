@@ -23,7 +23,9 @@ class Staging:
         self._unsettled_tick: int | None = None
 
     def require_settled(self) -> None:
-        """Raise Refusal for two ticks after an UnconfirmedCommand: the loop may still read the data staged for it."""
+        """Raise Refusal until the loop has executed two ticks after an UnconfirmedCommand of `submit`: until then, the
+        loop may still read the data staged for it.
+        """
         if self._unsettled_tick is not None and int(self.block["ticks_head"][0]) <= self._unsettled_tick + 1:
             raise Refusal("the loop stands still and has not finished an earlier change; try again when the loop runs")
         self._unsettled_tick = None

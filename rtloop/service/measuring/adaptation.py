@@ -29,7 +29,10 @@ CommandRunner = Callable[[Sequence[str]], subprocess.CompletedProcess[str]]
 
 
 def run_adaptation(service: Service, socket: Path) -> contextlib.AbstractContextManager[None]:
-    """Return a context in which every axis with [axis.adapt] is retuned when it is due."""
+    """Return a context manager: during the work within, a thread retunes each axis with [axis.adapt] when it is due.
+
+    `socket` is the path of the service's control socket.
+    """
     schedule = RetuneSchedule(service, socket)
     return repeat_every(LOOK_PERIOD_S, lambda: schedule.retune_due_axes(time.monotonic()))
 

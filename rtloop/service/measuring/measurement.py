@@ -66,7 +66,9 @@ class MeasurementHistory:
         return self._figures[-1]
 
     def for_json(self) -> dict[str, Any]:
-        """Return the newest figures, and `resonance_trend`: [time (s since 1970), Hz, standard deviation] of each."""
+        """Return the newest figures, and `resonance_trend`: [[time (s since 1970), Hz, its standard deviation], …] of
+        the stored measurements that found a resonance. There must be a measurement.
+        """
         resonances = [
             (figures["unix_time_s"], figures["resonance"]) for figures in self._figures if figures["resonance"]
         ]
@@ -151,8 +153,8 @@ def require_room(axis: AxisOptions, ends_um: tuple[float, float], hold_um: float
 def _line_grid(request: ResponseRequest, rate_hz: float, near_hz: float | None, half_width_hz: float) -> LineGrid:
     """Return the multisine's lines, with automatic period and band where the request has none.
 
-    `half_width_hz` is that of the model's mode, 0 without. Raises ConfigError for a band or period that is not
-    possible.
+    `near_hz` is the expected resonance, or None, `half_width_hz` that of the model's mode, 0 without. Raises
+    ConfigError for a band or period that is not possible.
     """
     shortest_s = MIN_MODE_PERIOD_S if request.resonance_only else MIN_PERIOD_S
     mode_period_s = MODE_LINES / half_width_hz if half_width_hz else MIN_PERIOD_S
@@ -231,7 +233,9 @@ class _ExcitationRun:
         )
 
     def _whole_periods(self, lines: LineGrid, loop_signals: dict[str, Real]) -> PeriodSignals:
-        """Return error, command, position (periods, samples) of the complete periods after the one for settling."""
+        """Return error, command and position, µm, (periods, samples) each, of the complete periods after the first one,
+        which is for settling.
+        """
         series = (loop_signals[name][lines.samples :] for name in ("error_um", "command_um", "position_um"))
         return PeriodSignals(
             *(part[: part.size // lines.samples * lines.samples].reshape(-1, lines.samples) for part in series)

@@ -60,14 +60,17 @@ class Player:
     def play(self, samples: Real, *, repeat: bool = False) -> int:
         """Play samples (n, 1 or 2), µm, one per tick: reference, addition to the command. Returns the first one's tick.
 
-        Raises as `LiveReferences.set_waveform`, and Refusal if another client has set a reference.
+        They play once, and the last is held; with `repeat`, endlessly. Does not wait for them. Raises as
+        `LiveReferences.set_waveform`, and Refusal if another client has set a reference.
         """
         self._require_ownership()
         with self._count_own_reference():
             return self._live.references.set_waveform(self.axis, samples, 1, repeat)
 
     def hold(self, value_um: float) -> None:
-        """Set a constant reference and wait REST_S. Raises as `LiveReferences.set`."""
+        """Set a constant reference, also in place of another client's, and wait REST_S. Raises as
+        `LiveReferences.set`.
+        """
         with self._count_own_reference():
             self._live.references.set(self.axis, {"kind": "hold", "value": value_um}, restores=True)
         time.sleep(REST_S)
@@ -89,7 +92,10 @@ class Player:
 
     @contextmanager
     def return_to_hold(self) -> Iterator[None]:
-        """Return to the setpoint after the work within, unless another reference was set; its failure is ignored."""
+        """Hold the setpoint again after the work within, unless another client has set a reference.
+
+        A failure of this is ignored.
+        """
         try:
             yield
         finally:

@@ -86,7 +86,8 @@ class Quality:
     def update(self, supervisor: Supervisor | None, limits: Sequence[LimitsOptions] = ()) -> None:
         """Add the ticks since the last call; set the condition of each axis, by its `limits`, over the last of them.
 
-        A `supervisor` of None, without a loop, clears the conditions, and so does a loop before its first tick.
+        `limits` are in the order of axes. Another `supervisor` is another loop, whose ticks are added from its first.
+        None, without a loop, clears the conditions, and so does a loop before its first tick.
         """
         if supervisor is None or not supervisor.ticks:
             for sums in self.axes.values():
@@ -140,7 +141,7 @@ class Quality:
 def watch_quality(
     quality: Quality, current_loop: Callable[[], tuple[Supervisor | None, Sequence[LimitsOptions]]]
 ) -> AbstractContextManager[None]:
-    """Return a context in which the sums are updated every LOOK_PERIOD_S in a separate thread.
+    """Return a context manager: during the work within, a thread calls `quality.update` every LOOK_PERIOD_S.
 
     `current_loop` returns the running supervisor, None without one, and the limits of its axes.
     """

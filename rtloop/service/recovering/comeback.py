@@ -62,7 +62,7 @@ def raised_cosine(start: float, end: float, count: int) -> Real:
 
 
 def ramp_ticks(live: LiveLaw) -> int:
-    """Return the duration of the return's ramp in ticks, for the slowest axis."""
+    """Return the duration in ticks, at least 2, of the ramp to the former references, for the slowest axis."""
     plan, durations_s = live.prepared.plan, []
     safe_v = np.asarray(plan.coefficients)["safe_v"]
     for number, axis in enumerate(live.prepared.configuration.axes):
@@ -75,10 +75,11 @@ def ramp_ticks(live: LiveLaw) -> int:
 def come_back(
     former: FormerState, loop: RunningLoop, sine: DepolariseOptions | None, on_step: Callable[[ReturnStep], None]
 ) -> None:
-    """Reset the trip and return to `former`; the caller's requester sends all commands.
+    """Reset the trip, set the mode of `former`, and move to its references by a ramp; wait until that is done.
 
-    `sine` depolarises first; `on_step` is called after each step. Raises Refusal after another trip, ReferenceReplaced
-    if a client sets a reference, and as `Desk.submit`.
+    The caller's requester sends all commands. `sine`, unless it is None, depolarises after the reset; `on_step` is
+    called after each step. Raises Refusal after another trip and for an unknown reference, ReferenceReplaced if a
+    client sets a reference, and as `Desk.submit`.
     """
     supervisor, live, desk = loop
     desk.submit(Kind.RESET_TRIP)
@@ -102,12 +103,15 @@ def come_back(
 
 
 def _restart(former: FormerState, number: int, loop: RunningLoop) -> tuple[float, float]:
-    """Start the former reference of axis `number` from its beginning. Returns its first value (µm, in raw mode V), and
-    its first addition to the command, µm. Raises as `come_back`.
+    """Start the former reference of axis `number` from its beginning, and wait for its first tick.
+
+    Returns (first value, µm or in raw mode V; first addition to the command, µm). Raises as `come_back`.
     """
     setting = former.settings[number]
     if setting is None:
-        raise Refusal(f"reference of axis {loop.live.prepared.plan.axes[number]}: unknown")
+        raise Refusal(
+            f"reference of axis {loop.live.prepared.plan.axes[number]}: unknown, so the service cannot return to it"
+        )
     tick = loop.live.references.restart(number, setting, former.client_counts[number])
     record = _await_record(loop.supervisor, tick)
     return (
@@ -117,7 +121,11 @@ def _restart(former: FormerState, number: int, loop: RunningLoop) -> tuple[float
 
 
 def _hold_present(former: FormerState, number: int, loop: RunningLoop) -> float:
-    """Hold the reference of axis `number` where the former mode does not move the drive. Returns this value."""
+    """Hold the reference of axis `number` at the value with which entering the former mode does not move the drive.
+
+    That is the newest value of the signal in HELD_COLUMNS. Returns it, µm or in raw mode V. Raises as
+    `LiveReferences.restart`.
+    """
     value = float(loop.supervisor.newest(1)[-1, signals.axis_column(number, HELD_COLUMNS[former.mode])])
     hold = Setting((float(Generator.HOLD), value), former.mode is Mode.RAW)
     loop.live.references.restart(number, hold, former.client_counts[number])
@@ -125,7 +133,10 @@ def _hold_present(former: FormerState, number: int, loop: RunningLoop) -> float:
 
 
 def _await_record(supervisor: Supervisor, tick: int) -> Real:
-    """Return the record (columns,) of `tick`, which was executed just now. Raises Refusal after a time limit."""
+    """Return the record (columns,) of `tick`, executed just now or next; waits for it.
+
+    Raises Refusal after RECORD_TIMEOUT_S.
+    """
     deadline_s = time.monotonic() + RECORD_TIMEOUT_S
     while time.monotonic() < deadline_s:
         rows = supervisor.newest(max(supervisor.ticks - tick, 1))

@@ -19,8 +19,10 @@ class Confirmation:
         self._period_s, self._since_s, self._next_tick = period_s, now_s, supervisor.ticks
 
     def advance(self, prepared: Prepared, now_s: float) -> StepReason | None:
-        """Judge the ticks of a period that has passed. Returns the reason of unsound readings, None for sound ones and
-        before the end of the period.
+        """Judge the ticks of a period that has passed by `now_s`, monotonic, and begin the next period.
+
+        Sound readings add 1 to `count`, unsound ones set it to 0. Returns the reason for which they are unsound, None
+        for sound ones, and before the end of the period or a new tick.
         """
         ticks = self.supervisor.ticks
         if now_s - self._since_s < self._period_s or ticks == self._next_tick:

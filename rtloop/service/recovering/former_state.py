@@ -47,7 +47,10 @@ class FormerState:
         return None if has_table or not uses_table else StepReason.CHANGED
 
     def renewed(self, live: LiveLaw) -> FormerState:
-        """Return this state with the references that clients have set since, in the loop of `live`. Does not wait."""
+        """Return this state with the references that clients have set since, in the loop of `live`; itself if none.
+
+        Does not wait.
+        """
         expected_counts = self.client_counts if live is self.live else (0,) * len(self.settings)
         if (counts := live.references.client_counts) == expected_counts and live is self.live:
             return self
@@ -69,5 +72,5 @@ def record_former_state(mode: Mode, live: LiveLaw) -> FormerState:
 
 
 def options_without_references(live: LiveLaw) -> tuple[AxisOptions, ...]:
-    """Return the options of the running axes; a reference is no part of the law."""
+    """Return the options of the running axes, each with the default reference: a reference is no part of the law."""
     return tuple(axis.model_copy(update={"reference": HoldOptions()}) for axis in live.prepared.configuration.axes)

@@ -112,7 +112,11 @@ class Recovery:
         self._steps: deque[Step] = deque(maxlen=64)
 
     def observe(self) -> None:
-        """Look at the newest trip of the loop; call this often, after the references followed the loop's events."""
+        """Begin a recovery after a new trip in the loop's events; end one under way that is no longer allowed.
+
+        It ends when [service.recover] is removed, and before the return for any reason of `_obstacle`. A reference that
+        a client sets meanwhile becomes one to return to. Call this often, each time after `LiveReferences.follow`.
+        """
         with self._guard:
             options, live = self._options, self._host.live
             if options is None:
@@ -135,9 +139,10 @@ class Recovery:
                     self._former = self._former.renewed(live)
 
     def _begin(self, trip: Trip, live: LiveLaw, options: RecoverOptions) -> None:
-        """Begin a recovery after a new trip, also in the middle of another one, or latch; the guard must be held.
+        """Begin a recovery after a new trip, also in the middle of another one; the guard must be held.
 
-        A trip in mode off begins nothing: there is no mode to return to.
+        Latches instead (no return before `reset`) for a reason of `_obstacle`, for an unknown mode, and if no recovery
+        is left within the hour. A trip in mode off begins nothing: there is no mode to return to.
         """
         is_under_way = self._former is not None
         if self._state is RecoveryState.LATCHED or (trip.mode is Mode.OFF and not is_under_way):
@@ -159,7 +164,10 @@ class Recovery:
         self._add_step(RecoveryStep.BEGUN)
 
     def _obstacle(self, trip: Trip, options: RecoverOptions) -> StepReason | None:
-        """Return why the service may not return after `trip` as things are now, None if it may."""
+        """Return why the service may not return after `trip` in its present state, None if it may.
+
+        In this order: another cause, a client's stop, another fault of the service, a measurement, outputs not armed.
+        """
         if not _are_allowed(trip, options):
             return StepReason.CAUSE
         if trip.is_stopped:
@@ -171,7 +179,10 @@ class Recovery:
         return None if self._host.armed else StepReason.DISARMED
 
     def confirm(self, supervisor: Supervisor, live: LiveLaw) -> Return | None:
-        """Judge the newest readings if it is time. Returns the return once all confirmations have succeeded."""
+        """Judge the newest readings if a confirmation is due; return a Return once all confirmations have succeeded.
+
+        None before, and if something then stands against the return: the recovery latches (no return before `reset`).
+        """
         with self._guard:
             options, former = self._options, self._former
             is_due = self._state in (RecoveryState.WAITING, RecoveryState.CONFIRMING) and self._now_s() >= self._due_s
@@ -198,15 +209,17 @@ class Recovery:
         return self._serial == serial
 
     def report(self, serial: int, step: RecoveryStep) -> None:
-        """Record a step of the return."""
+        """Add a step of the return `serial`, to be sent to the loop; does nothing once that recovery has ended."""
         with self._guard:
             if self._serial == serial:
                 self._add_step(step)
 
     def finish(self, serial: int, failure: StepReason | None = None) -> bool:
-        """End the return `serial`: it succeeded, a client took over (CLIENT), or it failed and latches.
+        """End the return `serial`: it succeeded (None), a client took over (CLIENT), or it failed and latches until
+        `reset` (any other reason).
 
-        Returns False if it has ended already, or if another trip is in the loop's events: `observe` handles it.
+        Returns True; False, without effect, if it has ended already, if that loop is gone, or if another trip is in the
+        loop's events: `observe` handles it.
         """
         with self._guard:
             live = self._host.live
@@ -240,9 +253,10 @@ class Recovery:
             self._own_faults.clear()
 
     def accept_end(self, outcome: str, fault: str) -> bool:
-        """Return whether the policy covers a loop that ended without a request; else the recovery latches.
+        """Return whether the policy covers a loop that ended without a request; `outcome` is that of its RunResult.
 
-        `fault` is the text that the service latches for it.
+        If True, the return will remove `fault`, the text that the service latches for it, from the service's faults. If
+        False, the recovery latches until `reset`; without a policy nothing happens.
         """
         with self._guard:
             options = self._options
@@ -257,7 +271,8 @@ class Recovery:
     def accept_failed_start(self, fault: str) -> bool:
         """Return whether the policy covers a loop whose driver could not be opened.
 
-        The first loop of a service must start.
+        If True, the return will remove `fault`, the text that the service latches for it, from the service's faults.
+        False without the cause "driver" in the policy, and before a first loop has run: that one must start.
         """
         with self._guard:
             options = self._options
@@ -266,7 +281,7 @@ class Recovery:
             return self._accept(fault)
 
     def _accept(self, fault: str) -> bool:
-        """Add a fault that the return removes, and count the failure. Returns True."""
+        """Add `fault` to those that the return removes, and count the failure; always return True."""
         self._own_faults.add(fault)
         self._failures += 1
         return True
@@ -279,18 +294,20 @@ class Recovery:
 
     @property
     def pause_s(self) -> float:
-        """Time to the next start of a loop, s; it doubles with each one that fails."""
+        """Pause before the next start of a loop, s: `wait_s`, doubled with each further failure, at most
+        LONGEST_PAUSE_S.
+        """
         wait_s = LONGEST_PAUSE_S if self._options is None else self._options.wait_s
         return min(wait_s * 2.0 ** min(max(self._failures - 1, 0), 10), LONGEST_PAUSE_S)
 
     @property
     def oldest_step(self) -> Step | None:
-        """The oldest step that is not in a recording; None if there is none."""
+        """The oldest step that no loop has acknowledged as an event of its recording; None if there is none."""
         with self._guard:
             return self._steps[0] if self._steps else None
 
     def forget_step(self, step: Step) -> None:
-        """Forget the oldest step, `step`, once it is an event of the loop."""
+        """Remove `step`, once it is an event of the loop; does nothing if it is not the oldest step."""
         with self._guard:
             if self._steps and self._steps[0] is step:
                 self._steps.popleft()
@@ -298,7 +315,8 @@ class Recovery:
     def for_json(self) -> dict[str, Any] | None:
         """Return {state, left, confirmed, confirmations, causes, reason} for `/status`; None without [service.recover].
 
-        `left` is the number of recoveries left within the hour, `reason` the last reason in words, or None.
+        `left` is the number of recoveries left within the hour, `confirmed` that of successive confirmations so far out
+        of `confirmations`, `causes` names those of the trip, `reason` is the last reason in words, or None.
         """
         with self._guard:
             options = self._options
@@ -317,20 +335,29 @@ class Recovery:
         return self._host.configuration.service.recover
 
     def _count_remaining(self, options: RecoverOptions) -> int:
-        """Return how many recoveries the policy still allows in the last 3600 s; `self._guard` must be held."""
+        """Return how many recoveries the policy still allows, given those begun in the last 3600 s.
+
+        `self._guard` must be held.
+        """
         while self._begun_s and self._now_s() - self._begun_s[0] >= HOUR_S:
             self._begun_s.popleft()
         return max(options.max_per_hour - len(self._begun_s), 0)
 
     def _end(self, step: RecoveryStep, reason: StepReason, state: RecoveryState) -> None:
-        """End the recovery with a step, and enter `state`; the guard must be held."""
+        """End the recovery: enter `state`, add `step` with its reason, and refuse further commands of this recovery.
+
+        The guard must be held.
+        """
         self._serial += 1
         self._former, self._confirmation = None, None
         self._state, self._reason = state, reason
         self._add_step(step, reason)
 
     def _add_unsound(self, reason: StepReason) -> None:
-        """Add a step for unsound readings, at most one in UNSOUND_PERIOD_S for the same reason."""
+        """Add a step for unsound readings, at most one in UNSOUND_PERIOD_S for the same reason.
+
+        The guard must be held.
+        """
         if reason is not self._reason or self._now_s() >= self._unsound_s:
             self._reason, self._unsound_s = reason, self._now_s() + UNSOUND_PERIOD_S
             self._add_step(RecoveryStep.UNSOUND, reason)
@@ -343,11 +370,14 @@ class Recovery:
         causes, text = ", ".join(signals.trip_causes(self._causes)), REASON_TEXTS.get(reason)
         is_bad = step in (RecoveryStep.LATCHED, RecoveryStep.UNSOUND)
         words = f"recovery after {causes or 'a trip'}: {step.name.lower()}{f' ({text})' if text else ''}"
-        log.log(logging.WARNING if is_bad else logging.INFO, "%s; %d left within the hour", words, left)
+        log.log(logging.WARNING if is_bad else logging.INFO, "%s; recoveries left within the hour: %d", words, left)
 
 
 def _are_allowed(trip: Trip, options: RecoverOptions) -> bool:
-    """Return whether the policy covers the first causes of a trip and the later ones."""
+    """Return whether the policy, `options.causes`, covers the first causes of a trip and the later ones.
+
+    The later cause `frozen` is also covered after `stale` or `driver`.
+    """
     first, allowed = set(signals.trip_causes(trip.first_causes)), set(options.causes)
     followers = {STANDSTILL} if first & STANDSTILL_CAUSES else set()
     return first <= allowed and set(signals.trip_causes(trip.causes)) <= allowed | followers

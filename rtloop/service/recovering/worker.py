@@ -22,7 +22,7 @@ log = logging.getLogger("rtloop")
 
 
 def run_recovery(host: Host, recovery: Recovery) -> contextlib.AbstractContextManager[None]:
-    """Return a context in which a thread takes the steps of `recovery`."""
+    """Return a context manager: during the work within, a thread calls `RecoveryWorker.step` every PERIOD_S."""
     return repeat_every(PERIOD_S, RecoveryWorker(host, recovery).step)
 
 
@@ -33,7 +33,10 @@ class RecoveryWorker:
         self._host, self._recovery = host, recovery
 
     def step(self) -> None:
-        """Report, judge and return, whatever is due; an error is logged."""
+        """Do what is due: send the recovery's new steps to the loop, judge its readings, return to the former state.
+
+        A return takes seconds. Does nothing without a loop; an RtloopError is logged.
+        """
         try:
             loop = self._running_loop()
             if loop is None:
@@ -67,7 +70,10 @@ class RecoveryWorker:
                 self._recovery.forget_step(step)
 
     def _return(self, loop: RunningLoop, confirmed: Return) -> None:
-        """Return to the former state, then watch the loop for one more confirmation."""
+        """Return to the former state of `confirmed`, wait one more `confirmation_s` for a trip, and end the recovery.
+
+        A failure before ends it by `_fail`.
+        """
         recovery, serial = self._recovery, confirmed.serial
         sine = self._host.configuration.service.depolarise if confirmed.options.depolarise else None
         requester = Requester(
@@ -91,7 +97,9 @@ class RecoveryWorker:
             raise Refusal("the recovery has ended")
 
     def _take_step(self, loop: RunningLoop, serial: int, step: ReturnStep) -> None:
-        """Remove the faults after the reset; report the other steps of a return."""
+        """Report `step` of the return `serial` as an event of the loop; after the reset, only remove the service's
+        faults that the recovery covers.
+        """
         if step is ReturnStep.RESET:
             self._recovery.remove_own_faults()
             return
@@ -101,7 +109,10 @@ class RecoveryWorker:
         self._report_steps(loop)
 
     def _fail(self, error: RtloopError, loop: RunningLoop, serial: int) -> None:
-        """Latch a return that failed without a trip, with the outputs off; leave it to a client that took over."""
+        """End the return `serial`, which `error` ended: latch it, log the error as a fault, and set mode off.
+
+        If a client took over, or after another trip, the loop stays as it is. Raises as `Desk.submit`.
+        """
         is_client = isinstance(error, ReferenceReplaced)
         if not self._recovery.finish(serial, StepReason.CLIENT if is_client else StepReason.REFUSED) or is_client:
             return
