@@ -66,10 +66,10 @@ class Examination:
 def examine(
     pacing: Pacing, seconds: float, root: Path = Path("/"), line: NetworkLine | SerialLine | None = None
 ) -> Examination:
-    """Run the loop's clock for `seconds` in another process, then check every condition below `root`, and the `line`
-    to a node.
+    """Run the loop's clock for `seconds` in another process, then check every condition of the host below `root`, and
+    the `line` to a node unless it is None. Returns the measured lateness and all findings.
 
-    Raises RtloopError where that process fails or does not end.
+    Raises RtloopError if that process fails or does not end.
     """
     before_s = Host({}, root).stolen_s()
     timeout_s = START_S + 3 * seconds

@@ -25,24 +25,28 @@ class Host:
     allowed_cpus: tuple[int, ...] = field(default_factory=lambda: tuple(sorted(os.sched_getaffinity(0))))
 
     def read(self, path: str) -> str | None:
-        """Return the stripped text of a file; None where it is missing or unreadable."""
+        """Return the stripped text of the file `path` below `root`; None if it is missing or unreadable."""
         try:
             return (self.root / path.lstrip("/")).read_text(encoding="utf-8", errors="replace").strip()
         except OSError:
             return None
 
     def paths(self, pattern: str) -> list[str]:
-        """Return the files that match a glob pattern, sorted, as absolute paths of the host."""
+        """Return the files below `root` that match a glob pattern, sorted, as absolute paths of the host, without
+        `root`.
+        """
         return sorted(f"/{path.relative_to(self.root)}" for path in self.root.glob(pattern.lstrip("/")))
 
     def refusal_reason(self, name: str) -> str:
-        """Return the kernel's reason for refusing the right `name`; "not requested" where no refusal is known."""
+        """Return the kernel's reason for refusing the right `name`, such as "mlock"; "not requested" if `grants` have
+        no refusal of it.
+        """
         reasons = (text.partition(": ")[2] for text in self.grants["refused"] if text.startswith(f"{name}: "))
         return next(reasons, "not requested")
 
     @property
     def kernel_options(self) -> str | None:
-        """The kernel's build configuration; None where the host does not show it."""
+        """Text of the kernel's build configuration (CONFIG_… lines); None if the host does not show it."""
         try:
             return gzip.decompress((self.root / "proc/config.gz").read_bytes()).decode()
         except OSError:

@@ -29,10 +29,11 @@ class ChannelPair:
 
 
 def measure_pair(drive_v: Real, reading_v: Real, settling_ticks: int) -> ChannelPair:
-    """Return the figures of a pair, from samples at which the drive has stood still for `settling_ticks`.
+    """Return gain, offset, noise and delay of a wire, from samples at which the drive has stood still for
+    `settling_ticks`.
 
-    `drive_v` and `reading_v` are (ticks,). The delay is searched up to `settling_ticks`. Raises ValueError where the
-    drive never stood still at two different values.
+    `drive_v` and `reading_v` are (ticks,). The delay is searched from 0 to `settling_ticks`, in all samples. Raises
+    ValueError if the drive never stood still at two different values.
     """
     changes = np.flatnonzero(np.diff(drive_v)) + 1
     starts = np.concatenate([[0], changes])

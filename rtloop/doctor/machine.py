@@ -12,7 +12,7 @@ CPUS = "/sys/devices/system/cpu"
 
 
 def loop_cpus(host: Host, pacing: Pacing) -> set[int]:
-    """Return the processors on which the loop may run: loop.cpu, else all of the process."""
+    """Return the numbers of the processors on which the loop may run: loop.cpu, else all that this process may use."""
     return set(host.allowed_cpus) if pacing.cpu is None else {pacing.cpu}
 
 
@@ -78,7 +78,7 @@ def isolation(host: Host, pacing: Pacing) -> Finding:
 
 
 def interrupts(host: Host, pacing: Pacing) -> Finding:
-    """Check that no device's interrupts come to the loop's processors; unknown where the host lists no interrupts."""
+    """Check that no device's interrupts come to the loop's processors; `good` is None if the host lists none."""
     loop_processors, allowed_processors = loop_cpus(host, pacing), set(host.allowed_cpus)
     affinities = {path: parse_cpus(host.read(path) or "") for path in host.paths("/proc/irq/[0-9]*/smp_affinity_list")}
     shared_paths = [path for path, cpus in affinities.items() if cpus & loop_processors]
@@ -100,7 +100,7 @@ def interrupts(host: Host, pacing: Pacing) -> Finding:
 
 
 def frequency(host: Host, pacing: Pacing) -> Finding:
-    """Check that the frequency governor of the loop's processors is "performance"; unknown where none is shown."""
+    """Check that the frequency governor of the loop's processors is "performance"; `good` is None if none is shown."""
     paths = {f"{CPUS}/cpu{cpu}/cpufreq/scaling_governor" for cpu in loop_cpus(host, pacing)}
     governors = {path: text for path in paths if (text := host.read(path))}
     name, requirement = "frequency governor", "performance"
@@ -120,9 +120,10 @@ def frequency(host: Host, pacing: Pacing) -> Finding:
 
 
 def idle_states(host: Host, pacing: Pacing) -> Finding:
-    """Check that deep idle states are held off, or that waking from each takes at most SHORT_IDLE_US.
+    """Check that the process was granted to prevent deep idle states, or that waking from each takes at most
+    SHORT_IDLE_US.
 
-    The times to wake are read for processor 0; also good where the host shows none.
+    The times to wake are read for processor 0; also good if the host shows none.
     """
     is_held_off = bool(host.grants["pm_qos"])
     latencies = [float(host.read(path) or 0) for path in host.paths(f"{CPUS}/cpu0/cpuidle/state*/latency")]
@@ -144,7 +145,7 @@ def idle_states(host: Host, pacing: Pacing) -> Finding:
 
 
 def clock_source(host: Host, pacing: Pacing) -> Finding:
-    """Check that the kernel reads the time from one of EXACT_CLOCKS; unknown where it is not shown."""
+    """Check that the kernel reads the time from one of EXACT_CLOCKS; `good` is None if its clock is not shown."""
     folder = "/sys/devices/system/clocksource/clocksource0"
     path = f"{folder}/current_clocksource"
     source = host.read(path)

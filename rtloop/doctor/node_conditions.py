@@ -17,7 +17,10 @@ US_PER_MS = 1e3
 
 
 def check_line(line: NetworkLine | SerialLine | None, host: Host, pacing: Pacing) -> tuple[Finding, ...]:
-    """Return the findings on the line to a node; none without a node, and one for the loopback interface."""
+    """Return the findings on the line to a node.
+
+    () without a node; only that of `route` for the loopback interface and without a usable route.
+    """
     if isinstance(line, SerialLine):
         return (latency_timer(line, host), low_latency(line, host))
     if line is None:
@@ -29,7 +32,9 @@ def check_line(line: NetworkLine | SerialLine | None, host: Host, pacing: Pacing
 
 
 def route(line: NetworkLine, host: Host) -> Finding:
-    """Check that an interface leads to the node, that it is up, and that it has a cable."""
+    """Check that an interface leads to the node, that it is not wireless, and that it is not down; also good for
+    loopback.
+    """
     name, required, net = line.interface, "a cable to the node", f"/sys/class/net/{line.interface}"
     if not name:
         return Finding(
@@ -54,7 +59,7 @@ def route(line: NetworkLine, host: Host) -> Finding:
 
 
 def cable(line: NetworkLine, host: Host) -> Finding:
-    """Check that the interface runs at MIN_SPEED_MBIT or more, full duplex; unknown where it does not tell."""
+    """Check that the interface runs at MIN_SPEED_MBIT or more, full duplex; `good` is None if it does not tell."""
     net = f"/sys/class/net/{line.interface}"
     speed, duplex = host.read(f"{net}/speed"), host.read(f"{net}/duplex")
     required = f"{MIN_SPEED_MBIT} Mbit/s or more, full duplex"
@@ -69,7 +74,7 @@ def cable(line: NetworkLine, host: Host) -> Finding:
 
 
 def coalescing(line: NetworkLine) -> Finding:
-    """Check that the card interrupts at each packet; unknown where its driver does not tell."""
+    """Check that the card interrupts at each packet at once; `good` is None if its driver does not tell."""
     required = "0 µs, not adaptive"
     if line.rx_usecs is None:
         return Finding("interrupt coalescing", "not shown", required, None)
@@ -82,7 +87,9 @@ def coalescing(line: NetworkLine) -> Finding:
 
 
 def packet_merging(line: NetworkLine) -> Finding:
-    """Check that the card does not wait for packets to join (LRO); unknown where its driver does not tell."""
+    """Check that the card does not join received packets (LRO), for which it waits; `good` is None if its driver does
+    not tell.
+    """
     if line.collects is None:
         return Finding("large receive offload", "not shown", "off", None)
     return Finding(
@@ -92,7 +99,9 @@ def packet_merging(line: NetworkLine) -> Finding:
 
 
 def card_interrupts(line: NetworkLine, host: Host, pacing: Pacing) -> Finding:
-    """Check that no interrupt of the card comes to the loop's processors; unknown where the host lists none of it."""
+    """Check that no interrupt of the card comes to the loop's processors; `good` is None if the host lists none of
+    the card.
+    """
     loop_processors, allowed = loop_cpus(host, pacing), set(host.allowed_cpus)
     numbers = _interrupt_numbers(host.read("/proc/interrupts") or "", line.interface)
     numbers |= {path.rpartition("/")[2] for path in host.paths(f"/sys/class/net/{line.interface}/device/msi_irqs/*")}
@@ -123,7 +132,7 @@ def _interrupt_numbers(table: str, interface: str) -> set[str]:
 
 
 def latency_timer(line: SerialLine, host: Host) -> Finding:
-    """Check that an FTDI adapter hands on received bytes after 1 ms; unknown for a line without such a timer."""
+    """Check that an FTDI adapter hands on received bytes after 1 ms; `good` is None for a line without such a timer."""
     path = f"/sys/bus/usb-serial/devices/{_terminal(line)}/latency_timer"
     milliseconds = host.read(path)
     if milliseconds is None or not milliseconds.isdecimal():
@@ -136,7 +145,9 @@ def latency_timer(line: SerialLine, host: Host) -> Finding:
 
 
 def low_latency(line: SerialLine, host: Host) -> Finding:
-    """Check that a serial port hands on received bytes at once; unknown where its flags cannot be read."""
+    """Check that a serial port has the flag low_latency, which hands on received bytes at once; `good` is None if its
+    flags cannot be read.
+    """
     try:
         flags = int(host.read(f"/sys/class/tty/{_terminal(line)}/flags") or "", 0)
     except ValueError:

@@ -52,7 +52,11 @@ def find_line(configuration: Configuration) -> NetworkLine | SerialLine | None:
 
 
 def find_network_line(host: str, port: int, bind: str | None) -> NetworkLine:
-    """Return the interface by which the system would send to a node, with what its card tells. Sends nothing."""
+    """Return the interface by which the system would send to a node from the address `bind`, with its card's settings.
+
+    `bind` None: from any address. Sends nothing to the node. `interface` is "" without a route, also for a `host` or
+    `bind` that is unknown.
+    """
     try:
         family, _, _, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)[0]
         with socket.socket(family, socket.SOCK_DGRAM) as probe:
@@ -66,9 +70,10 @@ def find_network_line(host: str, port: int, bind: str | None) -> NetworkLine:
 
 
 def _interface_of(own_address: str, node_address: str) -> str:
-    """Return the interface that has an address of this computer, "" if none has it.
+    """Return the name of the interface that has `own_address`, an address of this computer; "" if none has it.
 
-    A node at an address of this computer is reached by the loopback interface, whatever interface has the address.
+    "lo" if the node has the same address: the node is on this computer, and is reached by the loopback interface.
+    Raises OSError if the system does not list its addresses.
     """
     if own_address == node_address:
         return "lo"
@@ -85,7 +90,7 @@ def _interface_of(own_address: str, node_address: str) -> str:
 
 
 def _coalescing(interface: str) -> tuple[int | None, bool | None]:
-    """Return an interface's `rx_usecs` and `is_adaptive`; None where its driver does not tell them."""
+    """Return an interface's (`rx_usecs`, `is_adaptive`) as in NetworkLine; (None, None) if its driver does not tell."""
     words = _ask_card(interface, ETHTOOL_GCOALESCE, COALESCE_WORDS)
     return (None, None) if words is None else (words[RX_USECS], bool(words[ADAPTIVE_RX]))
 
@@ -97,7 +102,10 @@ def _joins_packets(interface: str) -> bool | None:
 
 
 def _ask_card(interface: str, command: int, words: int) -> tuple[int, ...] | None:
-    """Return the words of an answer of the interface's driver to a command of ethtool; None if it refuses."""
+    """Return the answer of the interface's driver to a command of ethtool; None if it refuses.
+
+    The answer has `words` numbers of 32 bits, as the struct of this command; the first is the command.
+    """
     answer = ctypes.create_string_buffer(struct.pack(f"{words}I", command, *[0] * (words - 1)), 4 * words)
     try:
         _interface_request(interface, SIOCETHTOOL, struct.pack("P", ctypes.addressof(answer)).ljust(24, b"\0"))
@@ -107,6 +115,9 @@ def _ask_card(interface: str, command: int, words: int) -> tuple[int, ...] | Non
 
 
 def _interface_request(interface: str, number: int, content: bytes) -> bytes:
-    """Return the answer to an ioctl about a network interface. Raises OSError."""
+    """Return the kernel's answer to ioctl `number` about a network interface: a struct ifreq (40 bytes).
+
+    `content` (24 bytes) stands behind the name in the request. Raises OSError if the kernel refuses.
+    """
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as any_socket:
         return fcntl.ioctl(any_socket, number, struct.pack("16s", interface.encode()) + content)

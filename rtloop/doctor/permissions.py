@@ -16,7 +16,7 @@ def spinning_share(pacing: Pacing) -> float:
 
 
 def _grant_command(limit: str) -> str:
-    """Return the command that grants a limit to the group rtloop; the unit of deploy/systemd needs none."""
+    """Return the shell command that grants `limit`, such as "rtprio 99", to the group rtloop."""
     return f"echo '@rtloop - {limit}' | sudo tee -a {LIMITS}, and log in again as a member of rtloop"
 
 
@@ -40,7 +40,7 @@ def fifo(host: Host, pacing: Pacing) -> Finding:
 def throttling(host: Host, pacing: Pacing) -> Finding:
     """Check that real-time throttling, which stops threads that never sleep, is off where the loop spins.
 
-    The loop spins if `spinning_share` is at least SPINNING_SHARE. Unknown where the host does not show the setting.
+    The loop spins if `spinning_share` is at least SPINNING_SHARE. `good` is None if the host does not show the setting.
     """
     path = "/proc/sys/kernel/sched_rt_runtime_us"
     runtime, period = host.read(path), host.read("/proc/sys/kernel/sched_rt_period_us") or "1000000"
@@ -63,7 +63,8 @@ def throttling(host: Host, pacing: Pacing) -> Finding:
 def fair_server(host: Host, pacing: Pacing) -> Finding:
     """Check that the fair server, which reserves time from kernel 6.12 on, is off where the loop spins.
 
-    The loop spins if `spinning_share` is at least SPINNING_SHARE. Unknown where debugfs does not show the setting.
+    The loop spins if `spinning_share` is at least SPINNING_SHARE. Also good with an older kernel and for a loop that
+    sleeps; else `good` is None if debugfs does not show the setting.
     """
     name, requirement = "fair server", "off where the loop spins"
     if host.kernel_version < (6, 12):
@@ -73,7 +74,7 @@ def fair_server(host: Host, pacing: Pacing) -> Finding:
     cpu = 0 if pacing.cpu is None else pacing.cpu
     path = f"/sys/kernel/debug/sched/fair_server/cpu{cpu}/runtime"
     runtime = host.read(path)
-    value = "not shown (debugfs)" if runtime is None else f"{runtime} ns of each second"
+    value = "not shown: debugfs cannot be read" if runtime is None else f"{runtime} ns of each second"
     return Finding(
         name,
         value,
@@ -87,12 +88,13 @@ def fair_server(host: Host, pacing: Pacing) -> Finding:
 
 
 def real_time_groups(host: Host, pacing: Pacing) -> Finding:
-    """Check that SCHED_FIFO is granted, or that the kernel has no real-time group scheduling, which may be the cause.
+    """Check that SCHED_FIFO is granted, or else that the kernel has no real-time group scheduling, which may refuse it.
 
-    A control group has no real-time runtime by default. Unknown where the kernel's configuration is not shown.
+    A control group has no real-time runtime by default. `good` is None if SCHED_FIFO is refused and the kernel's
+    configuration is not shown.
     """
     options, is_granted = host.kernel_options, host.grants["scheduler"] == "SCHED_FIFO"
-    name, requirement = "control groups", "SCHED_FIFO inside"
+    name, requirement = "control groups", "allow SCHED_FIFO"
     if is_granted or (options is not None and "CONFIG_RT_GROUP_SCHED=y" not in options):
         return Finding(name, "do not limit SCHED_FIFO", requirement, True)
     if options is None:

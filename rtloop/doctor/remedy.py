@@ -19,7 +19,10 @@ class SettingWrite(NamedTuple):
 
 
 def apply_remedies(findings: Sequence[Finding], root: Path = Path("/")) -> list[SettingWrite]:
-    """Write the settings that mend each bad condition, where it has some. Returns each with its outcome."""
+    """Write the settings in `writes` of each bad condition (`good` is False) to files below `root`.
+
+    Returns each write with its outcome; [] for none.
+    """
     return [
         SettingWrite(finding.condition, path, text, _write_setting(root / path.lstrip("/"), text))
         for finding in findings

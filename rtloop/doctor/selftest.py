@@ -70,7 +70,9 @@ class SelfTest:
     """The self-test of one configuration, with steps of up to `amplitude_v` from the safe value."""
 
     def __init__(self, configuration: Configuration, amplitude_v: float) -> None:
-        """Prepare the staircases. Raises RtloopError for a configuration that cannot run. Opens no hardware."""
+        """Prepare the staircases; opens no hardware. Raises RtloopError or DriverError for a configuration that cannot
+        run.
+        """
         self._configuration = configuration
         self._rate_hz = configuration.loop.rate_hz
         self._facts = prepare(_open_loop(configuration, "off", self._rate_hz)).facts
@@ -114,10 +116,11 @@ class SelfTest:
         return report | {"realtime": realtime, "real": self._facts.real, "exchange": exchange}
 
     def _measure_exchanges(self, progress: Callable[[str], None]) -> dict[str, Any] | None:
-        """Return figures of EXCHANGES exchanges with a node, in µs; None for a driver without such exchanges.
+        """Measure EXCHANGES exchanges with a node; return {count, p50_us, p99_us, max_us, lost, late, added_us}.
 
-        `added_us` is the delay that p99 adds to the model's: all of it where a tick waits for its own sample, else the
-        whole periods in it. Raises DriverError, LoopFault if no exchange was answered.
+        None for a driver without such exchanges. `lost` were not answered, `late` took longer than a period. `added_us`
+        is the delay that p99 adds to the model's: all of it where a tick waits for its own sample, else the whole
+        periods in it. `progress` receives a text first. Raises DriverError, LoopFault if no exchange was answered.
         """
         configuration = self._configuration
         driver = build_driver(configuration)
@@ -135,7 +138,10 @@ class SelfTest:
         return figures | {"lost": exchanges.lost, "late": late, "added_us": added_us}
 
     def _measure(self, recording: Recording, staircase: Staircase) -> ChannelPair:
-        """Return the figures of an axis's channel pair. Raises LoopFault where its drive did not stand still."""
+        """Return gain, offset, noise and delay of an axis's wire, from its recorded staircase.
+
+        Raises LoopFault if its drive never stood still at two different values.
+        """
         name, settling_ticks = staircase.axis.name, round(staircase.steps.dwell_s * self._rate_hz) // 2
         try:
             return measure_pair(recording[f"{name}_drive_v"], recording[f"{name}_adc_v"], settling_ticks)
@@ -202,7 +208,9 @@ class SelfTest:
 
 
 def _sign_verdict(slope_um_per_v: float | None) -> bool | None:
-    """Return False where the position falls as the drive rises: its loop is unstable. None: the figures say no more."""
+    """Return False if the position falls as the drive rises, which makes a loop unstable; else None, never True: the
+    slope alone says no more.
+    """
     return False if slope_um_per_v is not None and slope_um_per_v < 0.0 else None
 
 
@@ -229,9 +237,10 @@ def _open_loop(configuration: Configuration, mode: ModeName, rate_hz: float) -> 
 
 
 def _run_and_load(prepared: Prepared) -> tuple[Recording, dict[str, Any]]:
-    """Run once. Returns the recording, all in memory, and the host's real-time grants.
+    """Run once. Returns (the recording, all in memory; the host's real-time grants). Its file is deleted.
 
-    Raises LoopFault at an early end and after a trip, RtloopError, DriverError if the run cannot start.
+    Ctrl-C and SIGTERM stop the run. Raises LoopFault for a run that ends early or trips, RtloopError or DriverError for
+    one that cannot start.
     """
     with tempfile.TemporaryDirectory(prefix="rtloop-selftest-") as folder, Processes() as processes:
         supervisor = Supervisor(processes, prepared, Path(folder) / "selftest.mcap")

@@ -16,9 +16,9 @@ LIBRARIES = ("rtloop", "numpy", "numba", "llvmlite", "scipy", "mcap")
 
 
 def compiled_code(host: Host, pacing: Pacing) -> Finding:
-    """Check that the cache of compiled code outlives a restart and has no damaged file; ticks are not affected.
+    """Check that the cache of compiled code outlives a restart of the machine and has no damaged file.
 
-    Without it each start compiles for half a minute.
+    Bad values make a start slower, and no tick late. Raises OSError for a file of the cache that cannot be read.
     """
     cache_text = f"{CACHE_FOLDER}" if CACHE_IS_PERSISTENT else f"{CACHE_FOLDER}, gone after a restart"
     if damaged_count := len(damaged_files(CACHE_FOLDER)) + len(quarantined_files(CACHE_FOLDER)):
@@ -34,7 +34,7 @@ def compiled_code(host: Host, pacing: Pacing) -> Finding:
     return Finding(
         "compiled code",
         cache_text,
-        "kept in ~/.cache",
+        "a folder that outlives a restart",
         CACHE_IS_PERSISTENT,
         0.0,
         "the first start after each restart of the machine compiles for half a minute",

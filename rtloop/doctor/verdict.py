@@ -46,8 +46,8 @@ def axis_delays(prepared: Prepared, latency: Latency) -> list[AxisDelay]:
 def reasons_unsuitable(examination: Examination, delays: Sequence[AxisDelay] = ()) -> list[str]:
     """Return the reasons that make the host unsuitable for the loop, a sentence each; [] where it is suitable.
 
-    A bad condition is a reason where it can make a tick later than a period, the measurement where a tick was, an axis
-    where one tick in a hundred is later than its loop tolerates.
+    Reasons are: a bad condition that can make a tick later than a period, a measured tick that was, and an axis in
+    `delays` for which one tick in a hundred is later than its loop tolerates.
     """
     latency = examination.latency
     objections = [

@@ -20,7 +20,11 @@ class Child:
     """
 
     def __init__(self, module: str, fd: int, **other_files: int) -> None:
-        """Start `python -m MODULE --fd N --NAME M …`; the child inherits these open files. Raises OSError."""
+        """Start `python -m MODULE --fd N --NAME M …` and a thread that reads its stdout.
+
+        `fd` and `other_files`, by option name, are descriptors of open files that the child inherits. Raises OSError if
+        the process cannot be started.
+        """
         files = {"fd": fd, **other_files}
         options = [word for name, file in files.items() for word in (f"--{name}", str(file))]
         self.process = subprocess.Popen(
@@ -49,7 +53,7 @@ class Child:
                 stdin.flush()
 
     def reports(self) -> list[dict[str, Any]]:
-        """Return the JSON objects that the child has written since the last call, oldest first."""
+        """Return the JSON objects that the child has written since the last call, oldest first; [] for none."""
         reports = []
         while not self._reports.empty():
             reports.append(self._reports.get())
@@ -75,7 +79,10 @@ class Child:
             self.process.kill()
 
     def end(self) -> bool:
-        """Kill the child, wait for its end, close its pipes. Returns False if it has not died within END_TIMEOUT_S."""
+        """Kill the child, wait for its end, close its pipes. Returns True.
+
+        Returns False, with the pipes open, if it has not died within END_TIMEOUT_S.
+        """
         self.kill()
         if self.wait(END_TIMEOUT_S) is None:
             return False

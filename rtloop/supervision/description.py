@@ -69,7 +69,10 @@ def recording_header(prepared: Prepared, realtime: dict[str, Any]) -> dict[str, 
 
 
 def _law_description(plan: Plan) -> dict[str, Any]:
-    """Return the layout of the law; a user's law also has its `sha256`, `text` (for a replay without file), `file`."""
+    """Return the layout of the loop's laws as JSON values: `Layout.description`.
+
+    In its list `laws`, a user's law also has its `sha256`, `text` (for a replay without file) and `file`.
+    """
     layout = plan.layout.description()
     for entry, law in zip(layout["laws"], plan.laws, strict=True):
         if law.text:
@@ -86,7 +89,7 @@ def _package_version(package: str) -> str:
 
 
 def _cpu_name() -> str:
-    """Return the CPU's model, "unknown" without one, and the compiler's name for it in parentheses."""
+    """Return "MODEL (NAME)": the CPU's model, "unknown" if the system names none, and the compiler's name for it."""
     try:
         with open("/proc/cpuinfo", encoding="utf-8", errors="replace") as info:
             model = next((line.split(":", 1)[1].strip() for line in info if line.startswith("model name")), "unknown")

@@ -64,7 +64,7 @@ class Hardware:
         )
 
     def drives_same_outputs(self, other: Hardware) -> bool:
-        """Whether driver, its options and wiring are equal; figures of the ramp may differ."""
+        """Whether driver, its options and wiring equal those of `other`; rate and figures of the ramp may differ."""
         return (self.driver_kind, json.loads(self.driver_options), dict(self.wiring)) == (
             other.driver_kind, json.loads(other.driver_options), dict(other.wiring)
         )  # fmt: skip
@@ -85,9 +85,9 @@ _ADAPTER = TypeAdapter(Hardware)
 
 
 def write_note(path: Path, hardware: Hardware) -> None:
-    """Write a note to `path`; an old note stays until the new one is complete.
+    """Write a note to `path`, in a folder that is made if missing; an old note stays until the new one is complete.
 
-    Raises OutputError if the system refuses, HostRefusal for a folder that other users may write to.
+    Raises OutputError if the system refuses, HostRefusal for a folder that another user owns or may change.
     """
     target, new_path = "the note of the hardware", path.with_name(f"{path.name}.new")
     with output_errors(f"{path}: cannot write {target}"):
@@ -99,8 +99,8 @@ def write_note(path: Path, hardware: Hardware) -> None:
 def read_note(path: Path) -> Hardware | None:
     """Return the hardware noted at `path`, with a driver that can be created; None if there is no note.
 
-    Raises UnusableNote for invalid content or a driver that cannot be created, UnreadableNote if the system refuses,
-    and HostRefusal for a file that another user may have written.
+    Raises UnusableNote for invalid content, a driver that cannot be created or a ramp that takes too long,
+    UnreadableNote if the system refuses, and HostRefusal for a file that another user may have written.
     """
     try:
         with os.fdopen(open_file(path, os.O_RDONLY), "rb") as file:
@@ -127,8 +127,8 @@ def read_note(path: Path) -> Hardware | None:
 def configured_hardware(config: Path) -> Hardware:
     """Return the hardware of a configuration file, which must be valid as a whole; its driver can be created.
 
-    Raises InputFileError for a file that cannot be read, ConfigError for an invalid one, DriverError for a missing
-    library.
+    Raises InputFileError for a file that cannot be read, ConfigError for an invalid one, also if its driver cannot be
+    created or an axis's ramp takes too long, DriverError as for a missing library.
     """
     configuration = load(config)
     hardware = Hardware.from_configuration(configuration)
@@ -165,5 +165,5 @@ def _require_short_ramp(hardware: Hardware, driver: Driver) -> None:
 
 
 def _unusable_note(path: Path, reason: str) -> UnusableNote:
-    """Return the error for a note at `path` that is ignored because of `reason`."""
+    """Return, without raising it, the error for a note at `path` that is ignored because of `reason`."""
     return UnusableNote(f"{path}: the note of the hardware cannot be used and is ignored: {reason}")

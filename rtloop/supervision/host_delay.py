@@ -72,9 +72,10 @@ class SpentMargin:
 
 
 def store_host_delay(configuration: Configuration, **figures: Any) -> None:
-    """Store measured `figures` (fields of HostDelay) for the configuration's rate; other figures for this rate stay.
+    """Store measured `figures` (fields of HostDelay) for the configuration's rate in the file of `_file_name`.
 
-    Raises OutputError if the system refuses, HostRefusal for a folder that other users may write to.
+    Other figures stored for this rate stay; those for another rate are replaced. Raises OutputError if the system
+    refuses, HostRefusal for a folder or file that another user owns or may change.
     """
     rate_hz = configuration.loop.rate_hz
     previous = load_host_delay(configuration)
@@ -105,14 +106,14 @@ def load_host_delay(configuration: Configuration) -> HostDelay | None:
 
 
 def _file_name(configuration: Configuration) -> str:
-    """Return NAME.host.json for the configuration's name."""
+    """Return the name of the file with the host's delay: NAME.host.json for the configuration's name."""
     return f"{configuration.name}.host.json"
 
 
 def spent_margin(check: AxisCheck, host: HostDelay) -> SpentMargin | None:
     """Return the delay that a host adds to an axis, and the loop's delay margin; None for an unknown or unstable loop.
 
-    An axis without measured wire adds the clock's lateness alone.
+    For an axis without a measured wire, only lateness and exchange are added, no ticks.
     """
     if check.on_model is None or not check.on_model.is_stable:
         return None
@@ -126,8 +127,10 @@ def spent_margin(check: AxisCheck, host: HostDelay) -> SpentMargin | None:
 
 
 def require_margins(prepared: Prepared) -> None:
-    """Raise ConfigError for each axis with `require_margin` whose margin is used up by the host's delay, or where delay
-    or margin is unknown. Runs in virtual time pass.
+    """Raise one ConfigError with a fault for each axis with `require_margin` whose delay margin the measured delay of
+    this host uses up, or where delay or margin is unknown.
+
+    Without such an axis, and for a run in virtual time, does nothing.
     """
     configuration, faults = prepared.configuration, list[str]()
     required_axes = [axis.name for axis in configuration.axes if axis.margins.require_margin]

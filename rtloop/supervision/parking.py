@@ -39,9 +39,8 @@ MARGIN_S = 2.0
 def park_configuration(config: Path, name: str | None = None) -> str:
     """Park the outputs of a configuration in place of a service that died. Returns a message about the result.
 
-    `name` is the service's name; None means the stem of `config`.
-
-    Without `name`, the outputs are parked in place of the service that drove them last, whatever its name.
+    `name` is the service's name. None means the service that drove these outputs last, whatever its name; if none is
+    known, the one named like the stem of `config`.
 
     A loop that outlived its service gets the time to ramp down, and is killed after that. The hardware is that of the
     last run; if the configuration names another board, that board is parked as well. A failure of one board does not
@@ -136,8 +135,8 @@ def _park(hardware: Hardware, noted_v: npt.NDArray[np.float64] | None, account: 
 def _open_last_block(path: Path, account: ParkingAccount) -> Iterator[SharedBlock | None]:
     """Open the shared block of a service for the work within; None if there is none that this version can read.
 
-    Raises UnavailableError if the block cannot be opened, or is unreadable while a process drives the outputs;
-    HostRefusal for a file that another user may have written.
+    An unreadable block adds a remark to the account. Raises UnavailableError if the block cannot be opened, or is
+    unreadable while a process drives the outputs; HostRefusal for a file that another user may have written.
     """
     fd = open_block(path)
     if fd is None:

@@ -21,7 +21,10 @@ class ParkingAccount:
 
     @contextmanager
     def collect_failures(self) -> Iterator[None]:
-        """Add an RtloopError or DriverError within to `failures`; raise UnavailableError, since a service is alive."""
+        """Catch an RtloopError or DriverError within and add it to `failures`.
+
+        An UnavailableError is not caught: it says that a service is alive.
+        """
         try:
             yield
         except UnavailableError:

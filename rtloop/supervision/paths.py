@@ -60,7 +60,7 @@ def create_file(path: Path, target: str = "the shared block") -> int:
     """Create an empty file in place of an old one, and its folder, and return its descriptor, open to read and write.
 
     A process that has mapped the old file keeps it. `target` names the file in messages. Raises OutputError if the
-    system refuses, HostRefusal for a folder that other users may write to.
+    system refuses, HostRefusal for a folder that another user owns or may change.
     """
     try:
         folder = open_folder(path.parent, FOLDER_MODE)
@@ -77,7 +77,7 @@ def create_file(path: Path, target: str = "the shared block") -> int:
 
 
 def open_block(path: Path, flags: int = os.O_RDWR) -> int | None:
-    """Open a service's shared block. Returns its descriptor, None if there is none.
+    """Open a service's shared block with the `flags` of os.open. Returns its descriptor, None if there is no file.
 
     Raises HostRefusal for a file that another user may have written, UnavailableError if the system refuses.
     """
@@ -92,5 +92,5 @@ def open_block(path: Path, flags: int = os.O_RDWR) -> int | None:
 
 
 def host_refusal(error: UntrustedPath) -> HostRefusal:
-    """Return the error for users in place of an UntrustedPath: path and reason."""
+    """Return, without raising it, the error for users in place of an UntrustedPath, with its path and reason."""
     return HostRefusal(f"{error.filename}: {error.strerror}")

@@ -86,10 +86,10 @@ class Quota:
         """Why the last `enforce` was incomplete; None if it was complete."""
 
     def enforce(self, budget_s: float = BUDGET_S) -> list[Removal]:
-        """Remove files until the quota holds, or no file may be removed. Returns the removed files.
+        """Remove files, oldest first, until the quota holds or no more may be removed. Returns the removed files.
 
         `budget_s` limits the time for reading new files; unread ones stay. An OSError, and files of other users, are
-        reported in `failure`.
+        reported in `failure`. Also updates `total_bytes`, `removed_files` and `removed_bytes`.
         """
         removals: list[Removal] = []
         self.failure = None
@@ -112,10 +112,13 @@ class Quota:
     def _removal_reason(self) -> str | None:
         """Return the exceeded limit in words; None if size and free space hold. Raises OSError of the file system."""
         if self.total_bytes > self._keep_bytes:
-            return f"recordings of {self._name} may take {self._keep_bytes / 2**30:g} GiB (recording.keep_gib)"
+            return f"recordings of {self._name} may take at most {self._keep_bytes / 2**30:g} GiB (recording.keep_gib)"
         status = os.statvfs(self._folder)
         if status.f_bavail * status.f_frsize < self._free_bytes:
-            return f"less than {self._free_bytes >> 20} MiB are free (recording.min_free_mib + {SPARE_BYTES >> 20} MiB)"
+            return (
+                f"less than {self._free_bytes >> 20} MiB are free on the disk "
+                f"(recording.min_free_mib + {SPARE_BYTES >> 20} MiB)"
+            )
         return None
 
     def _removable(self, entries: list[FileEntry]) -> list[FileEntry]:
@@ -134,9 +137,10 @@ class Quota:
         ]
 
     def _list_entries(self) -> list[FileEntry]:
-        """Return the configuration's files, finished or not, oldest run first. Other users' go to `failure` alone.
+        """Return the configuration's files, finished or not, oldest run first.
 
-        Raises OSError if the folder cannot be read.
+        Files of other users are left out, and counted in the text of `failure`. Raises OSError if the folder cannot be
+        read.
         """
         files, foreign_names = [], []
         with os.scandir(self._folder) as entries:
@@ -155,9 +159,10 @@ class Quota:
         return sorted(files)
 
     def _read_new_files(self, entries: list[FileEntry], budget_s: float) -> None:
-        """Read the contents of finished files that are new, oldest first, and begin none after `budget_s`.
+        """Read and store the contents of finished files in `entries` that are new, oldest first; begin none after
+        `budget_s`.
 
-        Files that have gone are forgotten.
+        Files that are no longer in `entries` are forgotten.
         """
         until_s = time.monotonic() + budget_s
         self._contents = {entry: self._contents[entry] for entry in entries if entry in self._contents}
@@ -171,7 +176,9 @@ class Quota:
                     self._contents[entry] = contents
 
     def _read_contents(self, entry: FileEntry) -> FileContents | None:
-        """Return the contents of a file; None if it is damaged, cut, imported, or of another configuration."""
+        """Return the contents of a file; None if it is unreadable, damaged, unfinished, cut, imported, or of another
+        configuration.
+        """
         try:
             with Reader(self._folder / entry.name, opener=open_own) as reader:
                 header, totals = reader.header, reader.totals

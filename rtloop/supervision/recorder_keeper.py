@@ -84,7 +84,9 @@ class RecorderKeeper:
         return self._child.exit_code
 
     def start(self, header: dict[str, Any]) -> None:
-        """Start recording with `header`, in a separate thread; then `recording` becomes True, or `failure` is set."""
+        """Start recording with `header`, in a separate thread; returns at once. Later `recording` becomes True, or
+        `failure` is set.
+        """
         self._header = header
         if self._options.keep_gib is not None:
             min_free_bytes = round(self._options.min_free_mib * 2**20)

@@ -51,8 +51,9 @@ START_TIME_FIELD = 19
 """Index of the start time in /proc/PID/stat, counted after the process's name."""
 OUTCOME_MESSAGES = {
     "heartbeat_lost": "the loop received no heartbeat from its supervisor and parked the outputs",
-    "law_failed": "law: a count or an index is beyond its array, or an axis has not exactly one controller; this is a "
-    "fault of rtloop, or another program changed the record; the outputs were brought to their safe values",
+    "law_failed": "law: its memory is invalid (a count or an index is beyond its array, or an axis has not exactly one "
+    "controller); this is a fault of rtloop, or another program changed the memory; the outputs were brought to their "
+    "safe values",
 }
 """Messages for outcomes that the loop's process does not explain."""
 
@@ -76,9 +77,9 @@ class Processes:
     """Processes of loop and recorder, started early: they import their modules while the plan is prepared."""
 
     def __init__(self, block: Path | None = None) -> None:
-        """Start both processes. `block` is the path of the shared block; None for a block without a name.
+        """Start both processes. `block` is the path of the shared block; None for a block without a file.
 
-        Raises OutputError and HostRefusal as `create_file` does.
+        Raises OutputError and HostRefusal as `create_file` does, OSError if a process cannot be started.
         """
         self.fd = SharedBlock.reserve() if block is None else create_file(block)
         self.names = RequesterNames.create()
@@ -144,12 +145,12 @@ class Supervisor:
         return int(self.block["ticks_head"][0])
 
     def latest(self) -> np.ndarray[Any, Any] | None:
-        """Return the newest record (columns,), or None before the first tick."""
+        """Return a copy of the newest record (columns,), None before the first tick."""
         rows = self.newest(1)
         return rows[-1] if len(rows) else None
 
     def newest(self, count: int) -> np.ndarray[Any, Any]:
-        """Return up to `count` newest records (n, columns), oldest first."""
+        """Return a copy of up to `count` newest records (n, columns), oldest first; n is 0 before the first tick."""
         ring = self.block.ring("ticks")
         rows = np.empty((count, ring.slots.shape[1]))
         copied, _, _ = drain(ring, max(self.ticks - count, 0), rows)
@@ -157,7 +158,10 @@ class Supervisor:
 
     @property
     def trip_reason(self) -> str | None:
-        """Reason of the newest trip: axis, value and limit, or the lost heartbeat; None for a trip without a reason."""
+        """Reason of the newest trip: axis, value and limit, or the lost heartbeat.
+
+        None for a trip without a reason, and if there is no trip in the ring of newest events.
+        """
         ring = self.block.ring("events")
         events: np.ndarray[Any, Any] = np.zeros(ring.slots.size, MESSAGE)
         copied, _, _ = drain(ring, max(int(ring.head[0]) - events.size, 0), events)
@@ -192,9 +196,10 @@ class Supervisor:
             on_progress(self)
 
     def start(self) -> None:
-        """Send both processes their orders, wait until both are ready, and let the loop begin.
+        """Send both processes their orders, wait until both are ready and the recording is open; let the loop begin.
 
-        Raises as `_await_ready`, and OutputError if the recording cannot be opened.
+        Sets `realtime`, and `startup_s`, the age of this process then. Raises as `_await_ready`, and OutputError if the
+        recording cannot be opened.
         """
         self.newest(0)  # Compile or load the function before it is needed in time.
         self._loop.send(pickle.dumps(self.prepared.plan))
@@ -212,7 +217,8 @@ class Supervisor:
     def poll(self) -> RunResult | None:
         """Let the heartbeat go on, and watch the loop: kill it if it stands still, park its outputs if it died.
 
-        Returns the result once loop and recorder have ended, None before.
+        Returns the result once loop and recorder have ended, None before. May take seconds when it kills the loop or
+        parks its outputs, which ramp.
         """
         self._watched_s = time.monotonic()
         self._collect_reports()
@@ -290,7 +296,9 @@ class Supervisor:
             time.sleep(START_POLL_S)
 
     def _raise_failure(self, exit_code: int) -> None:
-        """Raise RtloopError with the message and exit code that the loop's process reported, else LoopFault."""
+        """Raise RtloopError with the message and exit code that the loop's process reported; LoopFault, with
+        `exit_code`, the code of the process, if it reported no failure.
+        """
         failure = self._reports.get("failed")
         if failure is None:
             raise LoopFault(f"the loop's process ended ({_ending_text(exit_code)}) before the run began")
@@ -345,5 +353,5 @@ def process_age_s() -> float:
 
 
 def _ending_text(code: int | None) -> str:
-    """Return the end of a process with this exit code in words."""
+    """Return the end of a process in words: "signal 9" for the exit code −9, else "exit code N"."""
     return f"signal {-code}" if code is not None and code < 0 else f"exit code {code}"
