@@ -17,7 +17,7 @@ def loop_cpus(host: Host, pacing: Pacing) -> set[int]:
 
 
 def kernel(host: Host, pacing: Pacing) -> Finding:
-    """Check that the kernel is built with PREEMPT_RT."""
+    """Return the finding on the kernel: good if it is built with PREEMPT_RT."""
     is_realtime = host.read("/sys/kernel/realtime") == "1" or "PREEMPT_RT" in host.version
     return Finding(
         "kernel",
@@ -31,7 +31,7 @@ def kernel(host: Host, pacing: Pacing) -> Finding:
 
 
 def virtualisation(host: Host, pacing: Pacing) -> Finding:
-    """Check that no hypervisor is seen, which may stop the whole machine."""
+    """Return the finding on a hypervisor, which may stop the whole machine: good if none is seen."""
     flags = next((line for line in (host.read("/proc/cpuinfo") or "").splitlines() if line.startswith("flags")), "")
     is_virtual = "hypervisor" in flags.split()
     value = f"virtual machine, {host.stolen_s():.1f} s stolen since its start" if is_virtual else "none seen"
@@ -47,7 +47,9 @@ def virtualisation(host: Host, pacing: Pacing) -> Finding:
 
 
 def processors(host: Host, pacing: Pacing) -> Finding:
-    """Check that there is a processor for the loop and another one for all other processes."""
+    """Return the finding on the number of processors that this process may use: good for two or more, so that loop and
+    other processes do not share one.
+    """
     count = len(host.allowed_cpus)
     return Finding(
         "processors",
@@ -61,7 +63,7 @@ def processors(host: Host, pacing: Pacing) -> Finding:
 
 
 def isolation(host: Host, pacing: Pacing) -> Finding:
-    """Check that loop.cpu is set, and that the kernel schedules no other process there."""
+    """Return the finding on the loop's processor: good if loop.cpu is set, and isolated from other processes."""
     isolated = parse_cpus(host.read(f"{CPUS}/isolated") or "")
     cpu = max(host.allowed_cpus) if pacing.cpu is None else pacing.cpu
     isolated_text = f"isolated: {format_cpus(isolated) or 'none'}"
@@ -78,7 +80,9 @@ def isolation(host: Host, pacing: Pacing) -> Finding:
 
 
 def interrupts(host: Host, pacing: Pacing) -> Finding:
-    """Check that no device's interrupts come to the loop's processors; `good` is None if the host lists none."""
+    """Return the finding on devices' interrupts: good if none may come to the loop's processors, unknown if the host
+    lists none.
+    """
     loop_processors, allowed_processors = loop_cpus(host, pacing), set(host.allowed_cpus)
     affinities = {path: parse_cpus(host.read(path) or "") for path in host.paths("/proc/irq/[0-9]*/smp_affinity_list")}
     shared_paths = [path for path, cpus in affinities.items() if cpus & loop_processors]
@@ -100,7 +104,9 @@ def interrupts(host: Host, pacing: Pacing) -> Finding:
 
 
 def frequency(host: Host, pacing: Pacing) -> Finding:
-    """Check that the frequency governor of the loop's processors is "performance"; `good` is None if none is shown."""
+    """Return the finding on the frequency governors of the loop's processors: good if all are "performance", unknown if
+    none is shown.
+    """
     paths = {f"{CPUS}/cpu{cpu}/cpufreq/scaling_governor" for cpu in loop_cpus(host, pacing)}
     governors = {path: text for path in paths if (text := host.read(path))}
     name, requirement = "frequency governor", "performance"
@@ -120,8 +126,8 @@ def frequency(host: Host, pacing: Pacing) -> Finding:
 
 
 def idle_states(host: Host, pacing: Pacing) -> Finding:
-    """Check that the process was granted to prevent deep idle states, or that waking from each takes at most
-    SHORT_IDLE_US.
+    """Return the finding on idle states: good if the measuring process may prevent deep ones, or if waking takes at
+    most SHORT_IDLE_US from each.
 
     The times to wake are read for processor 0; also good if the host shows none.
     """
@@ -145,7 +151,7 @@ def idle_states(host: Host, pacing: Pacing) -> Finding:
 
 
 def clock_source(host: Host, pacing: Pacing) -> Finding:
-    """Check that the kernel reads the time from one of EXACT_CLOCKS; `good` is None if its clock is not shown."""
+    """Return the finding on the kernel's clock: good if it is one of EXACT_CLOCKS, unknown if it is not shown."""
     folder = "/sys/devices/system/clocksource/clocksource0"
     path = f"{folder}/current_clocksource"
     source = host.read(path)
@@ -165,9 +171,9 @@ def clock_source(host: Host, pacing: Pacing) -> Finding:
 
 
 def siblings(host: Host, pacing: Pacing) -> Finding:
-    """Check that no core of the loop has a second thread, which would share its units and caches.
+    """Return the finding on hyper-threading: good if no core of the loop has a second thread, which would share it.
 
-    Also good where the host does not show the threads of a core.
+    Also good if the host does not show the threads of a core.
     """
     shared_cores = {
         text
@@ -188,7 +194,7 @@ def siblings(host: Host, pacing: Pacing) -> Finding:
 
 
 def swap(host: Host, pacing: Pacing) -> Finding:
-    """Check that no page of the loop can be swapped out: there is no swap, or memory is locked."""
+    """Return the finding on swap: good if there is none or memory may be locked, so that no page is swapped out."""
     swap_files = [line.split()[0] for line in (host.read("/proc/swaps") or "").splitlines()[1:]]
     is_harmless = not swap_files or bool(host.grants["mlock"])
     value = (

@@ -17,9 +17,9 @@ US_PER_MS = 1e3
 
 
 def check_line(line: NetworkLine | SerialLine | None, host: Host, pacing: Pacing) -> tuple[Finding, ...]:
-    """Return the findings on the line to a node.
+    """Return the findings on the line to a node; () for None, a driver without a node.
 
-    () without a node; only that of `route` for the loopback interface and without a usable route.
+    Only the finding of `route` for the loopback interface, and if that finding is bad.
     """
     if isinstance(line, SerialLine):
         return (latency_timer(line, host), low_latency(line, host))
@@ -32,8 +32,8 @@ def check_line(line: NetworkLine | SerialLine | None, host: Host, pacing: Pacing
 
 
 def route(line: NetworkLine, host: Host) -> Finding:
-    """Check that an interface leads to the node, that it is not wireless, and that it is not down; also good for
-    loopback.
+    """Return the finding on the route to the node: good if an interface leads there that is neither wireless nor down,
+    also the loopback interface.
     """
     name, required, net = line.interface, "a cable to the node", f"/sys/class/net/{line.interface}"
     if not name:
@@ -59,7 +59,7 @@ def route(line: NetworkLine, host: Host) -> Finding:
 
 
 def cable(line: NetworkLine, host: Host) -> Finding:
-    """Check that the interface runs at MIN_SPEED_MBIT or more, full duplex; `good` is None if it does not tell."""
+    """Return the finding on the cable: good at MIN_SPEED_MBIT or more and full duplex, unknown if not shown."""
     net = f"/sys/class/net/{line.interface}"
     speed, duplex = host.read(f"{net}/speed"), host.read(f"{net}/duplex")
     required = f"{MIN_SPEED_MBIT} Mbit/s or more, full duplex"
@@ -74,7 +74,9 @@ def cable(line: NetworkLine, host: Host) -> Finding:
 
 
 def coalescing(line: NetworkLine) -> Finding:
-    """Check that the card interrupts at each packet at once; `good` is None if its driver does not tell."""
+    """Return the finding on interrupt coalescing: good if the card interrupts at each packet at once, unknown if its
+    driver does not tell.
+    """
     required = "0 µs, not adaptive"
     if line.rx_usecs is None:
         return Finding("interrupt coalescing", "not shown", required, None)
@@ -87,8 +89,8 @@ def coalescing(line: NetworkLine) -> Finding:
 
 
 def packet_merging(line: NetworkLine) -> Finding:
-    """Check that the card does not join received packets (LRO), for which it waits; `good` is None if its driver does
-    not tell.
+    """Return the finding on large receive offload (LRO), with which the card waits to join packets: good if it is off,
+    unknown if its driver does not tell.
     """
     if line.collects is None:
         return Finding("large receive offload", "not shown", "off", None)
@@ -99,8 +101,8 @@ def packet_merging(line: NetworkLine) -> Finding:
 
 
 def card_interrupts(line: NetworkLine, host: Host, pacing: Pacing) -> Finding:
-    """Check that no interrupt of the card comes to the loop's processors; `good` is None if the host lists none of
-    the card.
+    """Return the finding on the card's interrupts: good if none may come to the loop's processors, unknown if the host
+    lists no interrupt of the card.
     """
     loop_processors, allowed = loop_cpus(host, pacing), set(host.allowed_cpus)
     numbers = _interrupt_numbers(host.read("/proc/interrupts") or "", line.interface)
@@ -132,7 +134,9 @@ def _interrupt_numbers(table: str, interface: str) -> set[str]:
 
 
 def latency_timer(line: SerialLine, host: Host) -> Finding:
-    """Check that an FTDI adapter hands on received bytes after 1 ms; `good` is None for a line without such a timer."""
+    """Return the finding on the latency timer of an FTDI adapter: good if it hands on received bytes after 1 ms,
+    unknown for a line without such a timer.
+    """
     path = f"/sys/bus/usb-serial/devices/{_terminal(line)}/latency_timer"
     milliseconds = host.read(path)
     if milliseconds is None or not milliseconds.isdecimal():
@@ -145,8 +149,8 @@ def latency_timer(line: SerialLine, host: Host) -> Finding:
 
 
 def low_latency(line: SerialLine, host: Host) -> Finding:
-    """Check that a serial port has the flag low_latency, which hands on received bytes at once; `good` is None if its
-    flags cannot be read.
+    """Return the finding on a serial port's flag low_latency, with which received bytes are handed on at once: good if
+    it is set, unknown if the flags cannot be read.
     """
     try:
         flags = int(host.read(f"/sys/class/tty/{_terminal(line)}/flags") or "", 0)

@@ -54,8 +54,8 @@ def find_line(configuration: Configuration) -> NetworkLine | SerialLine | None:
 def find_network_line(host: str, port: int, bind: str | None) -> NetworkLine:
     """Return the interface by which the system would send to a node from the address `bind`, with its card's settings.
 
-    `bind` None: from any address. Sends nothing to the node. `interface` is "" without a route, also for a `host` or
-    `bind` that is unknown.
+    `bind` None: from any address. No datagram is sent to the node. `interface` is "" without a route, also for a `host`
+    or `bind` that is unknown.
     """
     try:
         family, _, _, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)[0]

@@ -21,7 +21,7 @@ def _grant_command(limit: str) -> str:
 
 
 def fifo(host: Host, pacing: Pacing) -> Finding:
-    """Check that SCHED_FIFO is granted at the loop's priority."""
+    """Return the finding on SCHED_FIFO: good if it was granted to the measuring process, at the loop's priority."""
     is_granted = host.grants["scheduler"] == "SCHED_FIFO"
     value = (
         f"granted, priority {host.grants['priority']}" if is_granted else f"refused: {host.refusal_reason('priority')}"
@@ -38,9 +38,10 @@ def fifo(host: Host, pacing: Pacing) -> Finding:
 
 
 def throttling(host: Host, pacing: Pacing) -> Finding:
-    """Check that real-time throttling, which stops threads that never sleep, is off where the loop spins.
+    """Return the finding on real-time throttling, which stops threads that never sleep: good if it is off, or if the
+    loop sleeps; unknown if the host does not show the setting.
 
-    The loop spins if `spinning_share` is at least SPINNING_SHARE. `good` is None if the host does not show the setting.
+    The loop sleeps if `spinning_share` is below SPINNING_SHARE.
     """
     path = "/proc/sys/kernel/sched_rt_runtime_us"
     runtime, period = host.read(path), host.read("/proc/sys/kernel/sched_rt_period_us") or "1000000"
@@ -61,10 +62,10 @@ def throttling(host: Host, pacing: Pacing) -> Finding:
 
 
 def fair_server(host: Host, pacing: Pacing) -> Finding:
-    """Check that the fair server, which reserves time from kernel 6.12 on, is off where the loop spins.
+    """Return the finding on the kernel's fair server, which takes time from a spinning loop: good if it is off, for a
+    kernel before 6.12, and if the loop sleeps; else unknown if debugfs does not show the setting.
 
-    The loop spins if `spinning_share` is at least SPINNING_SHARE. Also good with an older kernel and for a loop that
-    sleeps; else `good` is None if debugfs does not show the setting.
+    The loop sleeps if `spinning_share` is below SPINNING_SHARE.
     """
     name, requirement = "fair server", "off where the loop spins"
     if host.kernel_version < (6, 12):
@@ -88,10 +89,11 @@ def fair_server(host: Host, pacing: Pacing) -> Finding:
 
 
 def real_time_groups(host: Host, pacing: Pacing) -> Finding:
-    """Check that SCHED_FIFO is granted, or else that the kernel has no real-time group scheduling, which may refuse it.
+    """Return the finding on control groups, whose real-time scheduling may refuse SCHED_FIFO: good if SCHED_FIFO was
+    granted, or if the kernel has no such scheduling.
 
-    A control group has no real-time runtime by default. `good` is None if SCHED_FIFO is refused and the kernel's
-    configuration is not shown.
+    Unknown if it was refused and the kernel's configuration is not shown. A control group has no real-time runtime by
+    default.
     """
     options, is_granted = host.kernel_options, host.grants["scheduler"] == "SCHED_FIFO"
     name, requirement = "control groups", "allow SCHED_FIFO"
@@ -111,7 +113,7 @@ def real_time_groups(host: Host, pacing: Pacing) -> Finding:
 
 
 def locked_memory(host: Host, pacing: Pacing) -> Finding:
-    """Check that memory may be locked, so that no page fault delays a tick."""
+    """Return the finding on locked memory, which prevents page faults: good if the measuring process may lock it."""
     is_granted = bool(host.grants["mlock"])
     value = "granted" if is_granted else f"refused: {host.refusal_reason('mlock')}"
     return Finding(
@@ -126,7 +128,9 @@ def locked_memory(host: Host, pacing: Pacing) -> Finding:
 
 
 def timer_slack(host: Host, pacing: Pacing) -> Finding:
-    """Check that the timer slack, by which wake-ups may be late, is 1 ns; under SCHED_FIFO it has no effect."""
+    """Return the finding on the timer slack, by which wake-ups may be late: good if it is 1 ns, and under SCHED_FIFO,
+    where it has no effect.
+    """
     slack_ns, is_fifo = host.grants["timer_slack_ns"], host.grants["scheduler"] == "SCHED_FIFO"
     value = f"{slack_ns} ns" if slack_ns else host.refusal_reason("timer_slack_ns")
     value = "without effect under SCHED_FIFO" if is_fifo else value

@@ -217,7 +217,11 @@ def _sign_verdict(slope_um_per_v: float | None) -> bool | None:
 def _staircase(
     configuration: Configuration, axis: AxisOptions, outputs: tuple[Channel, ...], amplitude_v: float
 ) -> Staircase:
-    """Return the staircase of an axis about its safe value, within its limits and the output's range."""
+    """Return the staircase of an axis: safe value, `amplitude_v` above it, safe value, `amplitude_v` below it.
+
+    The levels are within the axis's limits and the range of its output, one of `outputs`; each is held for longer than
+    the ramp to it takes.
+    """
     output = outputs[channel_index(outputs, configuration.channels[axis.name].output)]
     lowest = max(output.safe_v - amplitude_v, output.minimum_v, axis.limits.lowest_v)
     highest = min(output.safe_v + amplitude_v, output.maximum_v, axis.limits.drive_v)
@@ -248,7 +252,9 @@ def _run_and_load(prepared: Prepared) -> tuple[Recording, dict[str, Any]]:
             interruption.set_supervisor(supervisor)
             result = supervisor.run()
         if result.error or result.outcome != "done":
-            raise LoopFault(f"the self-test did not finish ({result.outcome}): {result.error or 'stopped'}")
+            raise LoopFault(
+                f"the self-test did not finish ({result.outcome}): {result.error or 'Ctrl-C or a signal ended it'}"
+            )
         recording = load(result.recordings)
         for event in recording.events:
             if event["kind"] == "tripped":

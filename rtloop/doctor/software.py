@@ -16,9 +16,10 @@ LIBRARIES = ("rtloop", "numpy", "numba", "llvmlite", "scipy", "mcap")
 
 
 def compiled_code(host: Host, pacing: Pacing) -> Finding:
-    """Check that the cache of compiled code outlives a restart of the machine and has no damaged file.
+    """Return the finding on the cache of compiled code: good if it outlives a restart of the machine and has no damaged
+    file.
 
-    Bad values make a start slower, and no tick late. Raises OSError for a file of the cache that cannot be read.
+    A bad value makes a start slower, and no tick late. Raises OSError for a file of the cache that cannot be read.
     """
     cache_text = f"{CACHE_FOLDER}" if CACHE_IS_PERSISTENT else f"{CACHE_FOLDER}, gone after a restart"
     if damaged_count := len(damaged_files(CACHE_FOLDER)) + len(quarantined_files(CACHE_FOLDER)):
@@ -54,7 +55,7 @@ def library_versions() -> dict[str, str]:
 
 
 def libraries(host: Host, pacing: Pacing) -> Finding:
-    """Check that all libraries are installed, and report their versions."""
+    """Return the finding on LIBRARIES, with their versions: good if all are installed."""
     numbers = library_versions()
     missing = [name for name, number in numbers.items() if number == "not installed"]
     value = ", ".join(f"{name} {number}" for name, number in numbers.items())

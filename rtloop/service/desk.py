@@ -77,7 +77,7 @@ class RefusedByLoop(Refusal):
 
     def __init__(self, kind: Kind | Note, tick: int) -> None:
         reason = (
-            "the coefficients do not fit the loop's records; restart the service"
+            "the coefficients do not fit the memory of the running loop; restart the service"
             if kind is Kind.LOAD_LAW
             else "the loop is tripped or is stopping; after a trip use reset first (`rtloop ctl reset`)"
         )
@@ -111,12 +111,13 @@ class Desk:
     def submit(
         self, kind: Kind | Note, *, axis: int = ALL_AXES, values: Sequence[float] = (), change: str | None = None
     ) -> int:
-        """Send a command, wait until it took effect, and return its tick; `change` describes a change of a law.
+        """Send a command of the `current_requester`, wait until it took effect, and return the tick of the effect.
 
-        `axis` is a number from 0, by default all axes; `values` are those that `Kind` states for `kind`. Raises Refusal
-        if the requester has no permission (a stop and a reset need none), or without an acknowledgement in time (the
-        command is withdrawn); RefusedByLoop if the loop refuses it; UnconfirmedCommand if the loop took it and stands
-        still; QueueFull.
+        `axis` is a number from 0, by default all axes; `kind` and `values` as in `Kind`; `change` describes a change of
+        a law in words, for `change_text`. Raises Refusal if the requester has no permission (a stop and a reset need
+        none, unless `may_always_stop` is False), or without an acknowledgement in time (the command is withdrawn);
+        RefusedByLoop if the loop refuses it; UnconfirmedCommand if the loop took it and stands still; QueueFull if too
+        many commands wait for the loop.
         """
         requester = current_requester()
         command = message(cast(Kind, kind), axis=axis, origin=requester.origin, values=values)

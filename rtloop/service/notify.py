@@ -23,7 +23,7 @@ class Notifier:
         self._next_s = 0.0
 
     def send(self, **fields: str | int) -> None:
-        """Send fields in one datagram, as in `send(READY=1, STATUS="…")`; without a manager, do nothing.
+        """Send fields in one datagram, as in `send(READY=1, STATUS="…")`; no effect without a manager.
 
         An OSError is ignored, and the datagram is then lost.
         """
@@ -36,7 +36,7 @@ class Notifier:
             channel.sendto(message.encode(), self._address)
 
     def limit_watchdog(self, limit_s: float | None = None) -> None:
-        """Set the watchdog's time, s; None restores the unit's time. Sends nothing if the unit has no watchdog."""
+        """Set systemd's watchdog time, s; None restores the unit's time. No effect if the unit has no watchdog."""
         limit_s = limit_s or self.watchdog_s
         if self.watchdog_s and limit_s:
             self.send(WATCHDOG_USEC=round(limit_s * 1e6))

@@ -21,11 +21,11 @@ TIMEOUT_FACTOR = 3.0
 
 
 def prepare_actuator(options: ServiceOptions, supervisor: Supervisor, live: LiveLaw, desk: Desk) -> None:
-    """Erase the hysteresis of all axes by a decaying sine (`depolarise`), then make the mean reading of each its
-    position 0 (tare), each of both if `options` say so; wait until that is done. The outputs end at their safe values.
+    """Prepare the actuators as `options` say: erase the hysteresis of all axes by a decaying sine (`depolarise`), then
+    make the present mean reading of each axis its position 0 (tare).
 
-    Raises Refusal after a trip and if the loop executes no ticks in time, and as `LiveReferences.play_raw`,
-    `LiveLaw.tare` and `Desk.submit`.
+    Waits until that is done; the outputs are then at their safe values. Raises Refusal after a trip and if the loop
+    executes no ticks in time, and as `LiveReferences.play_raw`, `LiveLaw.tare` and `Desk.submit`.
     """
     axes = range(len(live.prepared.plan.axes))
     if options.depolarise is not None:

@@ -76,7 +76,7 @@ class Service:
     """Service of one configuration, until `end` or until a loop has run for `duration_s`.
 
     `name` replaces the stem of the file's name, `config`. Raises ConfigError for an invalid file, InputFileError for
-    one that cannot be read. `faults` are the latched faults, a text each, `results` those of ended loops,
+    one that cannot be read. `faults` are the latched faults, a text each; `results` are the results of ended loops,
     `measurements` the figures by axis; `supervisor` and `live` are None without a loop. Methods named like API requests
     may be called from any thread.
     """
@@ -213,7 +213,7 @@ class Service:
     def _enter(self, mode: Mode) -> int:
         """Change the mode bumplessly, without the checks of `set_mode`. Returns the tick at which it took effect.
 
-        Mode off in a loop that is tripped or stops changes nothing, and returns the tick of the loop's refusal. Raises
+        Mode off in a loop that is tripped or stops has no effect, and returns the tick of the loop's refusal. Raises
         Refusal without a loop, and for mode off if the driver refuses every write; else as `Desk.submit`.
         """
         try:
@@ -390,7 +390,7 @@ class Service:
         return result
 
     def _follow_events(self) -> None:
-        """Read the loop's new events, for its references and for the recovery; do nothing without a loop."""
+        """Read the loop's new events, for its references and for the recovery; no effect without a loop."""
         if self.live is not None:
             self.live.references.follow()
             self.recovery.observe()
@@ -398,10 +398,10 @@ class Service:
     def _notify_systemd(self, supervisor: Supervisor) -> None:
         """Send systemd the messages that are due; called at every poll.
 
-        READY goes once, after READY_TICKS; then two threads judge the loop and, later, start the limited process.
-        WATCHDOG and STATUS go periodically, WATCHDOG not while the ticks stand still, unless the loop has ended or was
-        ordered to end. The first ticks of a loop restore the watchdog's time, which is START_TIMEOUT_S while a loop is
-        restarted.
+        READY is sent once, after READY_TICKS; then two threads judge the loop and, later, start the limited process.
+        WATCHDOG and STATUS are sent periodically, WATCHDOG not while the ticks stand still, unless the loop has ended
+        or was ordered to end. The first ticks of a loop restore the watchdog's time, which is START_TIMEOUT_S while a
+        loop is restarted.
         """
         if not self._is_ready and supervisor.ticks >= READY_TICKS:
             self._is_ready = True
@@ -445,7 +445,8 @@ class Service:
     def _latch_and_wait(self, reason: str) -> None:
         """Latch a failure that a recovery covers as a fault, and wait for the recovery's pause or for `end`.
 
-        Such failures do not count for service.restarts: the next service would begin as at boot, and drive unproved.
+        Such failures do not count for service.restarts: a service that systemd starts anew would drive the outputs
+        without the recovery's confirmations.
         """
         if reason not in self.faults:
             self.faults.append(reason)
@@ -477,7 +478,7 @@ class Service:
         """Depolarise and tare the actuator, then set the configured references and mode; runs in its own thread.
 
         A mode that a client requests meanwhile, such as off, takes the place of the configured one. An RtloopError is
-        added to `faults` and logged, unless a client requested a mode or the service ends. Does nothing without a loop.
+        added to `faults` and logged, unless a client requested a mode or the service ends. No effect without a loop.
         """
         supervisor, live, desk = self.supervisor, self.live, self._desk
         if supervisor is None or live is None or desk is None:
@@ -509,7 +510,7 @@ class Service:
                 log.info("not started: mode %s was requested meanwhile", self._requested_mode.name.lower())
 
     def _start_builder_later(self) -> None:
-        """Wait BUILDER_PAUSE_S, then start the process that builds changes; nothing if the service ends meanwhile."""
+        """Wait BUILDER_PAUSE_S, then start the process that builds changes, unless the service ends meanwhile."""
         if not self._end_requested.wait(BUILDER_PAUSE_S):
             prepare_builder()
 

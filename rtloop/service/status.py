@@ -77,8 +77,8 @@ def running_configuration(service: Service) -> dict[str, Any]:
 def timing(service: Service) -> dict[str, Any]:
     """Return {rate_hz, lateness_us: {p50, p99, max}, overruns, periods_missed} over the last WINDOW_TICKS.
 
-    `overruns` is the number of ticks that ended after the next deadline, `periods_missed` that of periods without a
-    tick. Returns {} without a loop and before the second tick.
+    `overruns` counts the ticks that ended after the next deadline, `periods_missed` the periods without a tick. Returns
+    {} without a loop and before the second tick.
     """
     rows = None if service.supervisor is None else service.supervisor.newest(WINDOW_TICKS)
     if rows is None or len(rows) < 2:

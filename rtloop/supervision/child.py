@@ -45,7 +45,7 @@ class Child:
         threading.Thread(target=self._write, args=(data,), daemon=True).start()
 
     def _write(self, data: bytes) -> None:
-        """Write `data` to the child's stdin and flush it; does nothing once the child or its stdin has ended."""
+        """Write `data` to the child's stdin and flush it; no effect once the child or its stdin has ended."""
         stdin = self.process.stdin
         with contextlib.suppress(BrokenPipeError, ValueError):  # The child has ended, or its stdin was closed.
             if stdin is not None:

@@ -130,7 +130,7 @@ def require_margins(prepared: Prepared) -> None:
     """Raise one ConfigError with a fault for each axis with `require_margin` whose delay margin the measured delay of
     this host uses up, or where delay or margin is unknown.
 
-    Without such an axis, and for a run in virtual time, does nothing.
+    A run in virtual time, and a configuration without such an axis, pass.
     """
     configuration, faults = prepared.configuration, list[str]()
     required_axes = [axis.name for axis in configuration.axes if axis.margins.require_margin]

@@ -291,13 +291,17 @@ class Supervisor:
             if time.monotonic() > deadline:
                 before, compiled = compiled, stored_file_count()
                 if compiled == before:
-                    raise UnavailableError(f"loop and recorder were not ready within {START_TIMEOUT_S:g} s")
+                    raise UnavailableError(
+                        f"loop and recorder were not ready within {START_TIMEOUT_S:g} s; the host may be overloaded: "
+                        "start again"
+                    )
                 deadline = time.monotonic() + START_TIMEOUT_S
             time.sleep(START_POLL_S)
 
     def _raise_failure(self, exit_code: int) -> None:
-        """Raise RtloopError with the message and exit code that the loop's process reported; LoopFault, with
-        `exit_code`, the code of the process, if it reported no failure.
+        """Raise RtloopError with the message and exit code that the loop's process reported.
+
+        Without such a report, raise LoopFault, which names `exit_code`, the code of the process.
         """
         failure = self._reports.get("failed")
         if failure is None:
@@ -336,7 +340,7 @@ class Supervisor:
         return RunResult(paths, outcome, totals, self.recorder.notes, error, max(code, 0))
 
     def _park(self) -> str:
-        """Park the outputs in place of the loop. Returns the result in words, also that of a failure."""
+        """Park the outputs in place of the loop. Returns success or failure in words; raises no DriverError."""
         plan = self.prepared.plan
         try:
             park(plan.driver(), plan.trip_slew_v_per_s, self.block["last_drive_v"])

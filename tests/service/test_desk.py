@@ -70,7 +70,7 @@ def test_a_change_that_was_taken_is_settled_two_ticks_later(block):
     ("kind", "reason", "remedy"),
     [
         (Kind.SET_MODE, "the loop is tripped or is stopping", "rtloop ctl reset"),
-        (Kind.LOAD_LAW, "the coefficients do not fit the loop's records", "restart the service"),
+        (Kind.LOAD_LAW, "the coefficients do not fit the memory of the running loop", "restart the service"),
     ],
 )
 def test_a_refusal_names_the_reason_for_which_the_loop_refuses_this_kind(kind: Kind, reason: str, remedy: str):

@@ -90,7 +90,7 @@ def application(service: Service) -> Starlette:
         return await _answer_request(service, lanes, request, _REQUESTS[method, request.url.path], data)
 
     async def get_openapi(_: Request) -> Response:
-        """Respond with the OpenAPI description for the configured axes."""
+        """Return the response to /openapi.json: the description for the configured axes."""
         return JSONResponse(openapi([axis.name for axis in service.configuration.axes]))
 
     routes: list[Any] = [
@@ -141,7 +141,8 @@ def _parse_body(request: ApiRequest, connection: HTTPConnection, data: bytes | s
 async def _answer_request(
     service: Service, lanes: Lanes, connection: HTTPConnection, request: ApiRequest, data: bytes | str
 ) -> Response:
-    """Validate the request and run its action for its requester. Returns the response, also for an error.
+    """Validate a request and run its action for its requester; `data` is the body as received. Returns the response,
+    also for an error.
 
     Raises exceptions that `error_response` does not know.
     """

@@ -21,7 +21,9 @@ MAX_VALUES, MAX_DEPTH, MAX_CHARACTERS = 10_000, 6, 4096
 
 
 def _require_bounded(settings: dict[str, Any]) -> dict[str, Any]:
-    """Return `settings`. Raises ValueError beyond MAX_VALUES, MAX_DEPTH, MAX_CHARACTERS or ±LARGEST_INTEGER."""
+    """Return `settings` itself. Raises ValueError for more than MAX_VALUES keys and values, for nesting deeper than
+    MAX_DEPTH, texts longer than MAX_CHARACTERS and integers beyond ±LARGEST_INTEGER.
+    """
     for count, (depth, value) in enumerate(_walk_values(settings, 1), start=1):
         if count > MAX_VALUES:
             raise ValueError(f"more than {MAX_VALUES} keys and values; allowed: at most {MAX_VALUES}")
@@ -116,7 +118,7 @@ class WaveformBody(Body):
 
     @model_validator(mode="after")
     def _require_equal_lengths(self) -> Self:
-        """Require as many values in `command_um` as in `samples`, or none."""
+        """Return this body. Raises ValueError unless `command_um` is empty or as long as `samples`."""
         if self.command_um and len(self.command_um) != len(self.samples):
             raise ValueError(
                 f"command_um: {len(self.command_um)} numbers for {len(self.samples)} samples; allowed: equal lengths"

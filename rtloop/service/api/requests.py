@@ -147,7 +147,8 @@ def _play_waveform(service: Service, body: WaveformBody) -> int:
 
 
 def _measure_response(service: Service, body: ResponseBody) -> dict[str, Any]:
-    """Measure the response. Returns `LoopMeasurement.for_json`; the service stores the figures for `/status`.
+    """Measure the response of the body's axis. Returns `LoopMeasurement.for_json`; the service stores the figures for
+    `/status`.
 
     Raises Refusal unless the loop runs, and as `measure_response`.
     """

@@ -75,7 +75,7 @@ class LiveLaw:
         """Build and verify the law with other values of keys of [axis.SECTION], `changes`, and load it.
 
         Returns the tick of the load; `undo` takes the change back. Raises as `_swap`; ConfigError also for an unknown
-        axis, a section that is not in TUNABLE_SECTIONS and invalid values, which change nothing.
+        axis, a section that is not in TUNABLE_SECTIONS and invalid values: the law then stays.
         """
         with self._build_lock:
             return self._apply_change(*self._axis_with_keys(axis, section, changes), f"{section}: {', '.join(changes)}")
@@ -84,7 +84,7 @@ class LiveLaw:
         """Replace [axis.controller] as a whole: build, verify and load it. Returns the tick of the load.
 
         `controller` are all its keys with their values; `undo` takes the change back. Raises as `_swap`; ConfigError
-        also for an unknown axis and invalid keys, which change nothing.
+        also for an unknown axis and invalid keys: the law then stays.
         """
         with self._build_lock:
             return self._apply_change(
@@ -94,7 +94,7 @@ class LiveLaw:
     def preview(self, axis: str, section: str, changes: Mapping[str, Any]) -> dict[str, Figures]:
         """Return {before, after}: `loop_figures` without and with a `tune`, with steps of equal length.
 
-        Changes nothing. Raises as `tune`, except for UnconfirmedCommand.
+        The running law stays. Raises as `tune`, except for UnconfirmedCommand.
         """
         with self._build_lock:
             number, configuration = self.axis_number(axis), self.prepared.configuration
@@ -106,7 +106,7 @@ class LiveLaw:
             return {"before": before, "after": after}
 
     def undo(self, axis: str) -> tuple[int, str]:
-        """Load the options of an axis from before its last change, or before that of the controller that it shares.
+        """Undo the last change of an axis, or of the controller that it shares: load the options from before it.
 
         The reference stays; the change leaves the history. Returns the tick of the load, and the undone change in
         words. Raises ConfigError for an unknown axis, Refusal if there is no change, and as `_swap`.
@@ -136,7 +136,7 @@ class LiveLaw:
         return tick
 
     def _axis_with_keys(self, axis: str, section: str, changes: Mapping[str, Any]) -> tuple[int, AxisOptions]:
-        """Return number and options of the axis that owns the section, with the changes; nothing is loaded.
+        """Return number and options of the axis that owns the section, with the changes, for `_apply_change`.
 
         For the section "controller" that is the axis whose controller `axis` uses, else `axis` itself. Raises
         ConfigError for an unknown axis, a section that is not in TUNABLE_SECTIONS and invalid values.
@@ -269,7 +269,10 @@ class LiveLaw:
         """
         configuration = self.prepared.configuration
         if axis.feedforward != configuration.axes[number].feedforward:
-            raise Refusal("feedforward: changed; the actuator's memory depends on the feedforward; restart the service")
+            raise Refusal(
+                "feedforward: cannot change while the loop runs, because it holds the actuator's present hysteresis "
+                "state; restart the service"
+            )
         changed = _replace_axis(configuration, number, axis)
         if faults := shared_faults(changed.axes):
             raise ConfigError("change", faults)

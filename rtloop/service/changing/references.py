@@ -83,9 +83,9 @@ class LiveReferences:
     def set_waveform(self, axis: str, samples: Samples, hold_ticks: int, repeat: bool) -> int:
         """Play samples (n, 1 or 2) in µm (V in raw mode), `hold_ticks` ticks each, once or endlessly (`repeat`).
 
-        The second column, µm, is added to the command. Returns the tick of the first sample. Raises ConfigError for an
-        unknown axis, and for samples that are none, not finite, too many or beyond the limits; Refusal,
-        UnconfirmedCommand.
+        Played once, the last sample is held. The second column, µm, is added to the command. Returns the tick of the
+        first sample; does not wait for the others. Raises ConfigError for an unknown axis, and for samples that are
+        none, not finite, too many or beyond the limits; Refusal within `reserved`, and as `Desk.submit`.
         """
         if samples.size == 0 or not np.all(np.abs(samples) < USABLE_MAGNITUDE):
             raise invalid_request(
@@ -108,9 +108,9 @@ class LiveReferences:
     def play_once(self, number: int, samples: Samples, hold_ticks: int, replaces: int) -> int:
         """Play samples (n, 1 or 2) once on axis `number`, `hold_ticks` ticks each, as `set_waveform` does.
 
-        `replaces` is the entry of `client_counts` with which the reference may be replaced. Limits are not checked.
-        Returns the tick of the first sample. Raises ReferenceReplaced, Refusal, UnconfirmedCommand; ConfigError for too
-        many samples.
+        `replaces` is the axis's entry of `client_counts` when the caller decided to play; ReferenceReplaced is raised
+        if a client has set a reference since. Limits are not checked. Returns the tick of the first sample. Raises
+        Refusal, UnconfirmedCommand as `Desk.submit`; ConfigError for too many samples.
         """
         count, columns = samples.shape
         with self._service_change(number, replaces):

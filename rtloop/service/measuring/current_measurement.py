@@ -30,7 +30,7 @@ class CurrentMeasurement:
         return None if progress is None else progress._asdict()
 
     def add_cycle(self, rms_um: float) -> None:
-        """Add the rms error of a finished cycle, µm; does nothing without a measurement."""
+        """Add the rms error of a finished cycle, µm; no effect without a measurement."""
         if self._progress is not None:
             self._progress = self._progress._replace(rms_um=(*self._progress.rms_um, rms_um))
 

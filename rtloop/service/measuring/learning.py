@@ -77,10 +77,11 @@ def learn(
     request: LearnRequest,
     add_cycle: Callable[[float], None] = lambda _: None,
 ) -> LearnResult:
-    """Play a period repeatedly on an axis at a setpoint, and learn it. Returns all cycles and the best table.
+    """Play a period on an axis at a setpoint, cycle after cycle, each with a table that the error of the one before
+    has corrected. Returns all cycles and the best table, after all of them.
 
     At the end the loop plays the best table if `keep` is true, else it returns to its setpoint. `add_cycle` receives
-    the rms error of each cycle, µm, as soon as it is known.
+    the rms error of each cycle, µm, at its end.
 
     Raises ConfigError for an invalid request and for a loop in which learning would not converge, Refusal if the state
     does not allow the learning or it was aborted. After an abort the loop plays the best table if `keep` is true, or

@@ -153,8 +153,8 @@ def require_room(axis: AxisOptions, ends_um: tuple[float, float], hold_um: float
 def _line_grid(request: ResponseRequest, rate_hz: float, near_hz: float | None, half_width_hz: float) -> LineGrid:
     """Return the multisine's lines, with automatic period and band where the request has none.
 
-    `near_hz` is the expected resonance, or None, `half_width_hz` that of the model's mode, 0 without. Raises
-    ConfigError for a band or period that is not possible.
+    `near_hz` is the expected resonance, or None; `half_width_hz` is half the width of the model's mode, 0 without a
+    mode. Raises ConfigError for a band or period that is not possible.
     """
     shortest_s = MIN_MODE_PERIOD_S if request.resonance_only else MIN_PERIOD_S
     mode_period_s = MODE_LINES / half_width_hz if half_width_hz else MIN_PERIOD_S

@@ -142,7 +142,7 @@ class Recovery:
         """Begin a recovery after a new trip, also in the middle of another one; the guard must be held.
 
         Latches instead (no return before `reset`) for a reason of `_obstacle`, for an unknown mode, and if no recovery
-        is left within the hour. A trip in mode off begins nothing: there is no mode to return to.
+        is left within the hour. A trip in mode off has no effect: there is no mode to return to.
         """
         is_under_way = self._former is not None
         if self._state is RecoveryState.LATCHED or (trip.mode is Mode.OFF and not is_under_way):
@@ -181,7 +181,7 @@ class Recovery:
     def confirm(self, supervisor: Supervisor, live: LiveLaw) -> Return | None:
         """Judge the newest readings if a confirmation is due; return a Return once all confirmations have succeeded.
 
-        None before, and if something then stands against the return: the recovery latches (no return before `reset`).
+        None before. Also None if an obstacle is found then: the recovery latches (no return before `reset`).
         """
         with self._guard:
             options, former = self._options, self._former
@@ -209,7 +209,7 @@ class Recovery:
         return self._serial == serial
 
     def report(self, serial: int, step: RecoveryStep) -> None:
-        """Add a step of the return `serial`, to be sent to the loop; does nothing once that recovery has ended."""
+        """Add a step of the return `serial`, to be sent to the loop; no effect once that recovery has ended."""
         with self._guard:
             if self._serial == serial:
                 self._add_step(step)
@@ -253,10 +253,10 @@ class Recovery:
             self._own_faults.clear()
 
     def accept_end(self, outcome: str, fault: str) -> bool:
-        """Return whether the policy covers a loop that ended without a request; `outcome` is that of its RunResult.
+        """Return whether the policy covers a loop that ended without a request, with the `outcome` of its RunResult.
 
         If True, the return will remove `fault`, the text that the service latches for it, from the service's faults. If
-        False, the recovery latches until `reset`; without a policy nothing happens.
+        False, the recovery latches until `reset`; without a policy it stays as it was.
         """
         with self._guard:
             options = self._options
@@ -281,7 +281,7 @@ class Recovery:
             return self._accept(fault)
 
     def _accept(self, fault: str) -> bool:
-        """Add `fault` to those that the return removes, and count the failure; always return True."""
+        """Count a failure, and store `fault`, so that the return removes it from the service's faults. Returns True."""
         self._own_faults.add(fault)
         self._failures += 1
         return True
@@ -307,7 +307,7 @@ class Recovery:
             return self._steps[0] if self._steps else None
 
     def forget_step(self, step: Step) -> None:
-        """Remove `step`, once it is an event of the loop; does nothing if it is not the oldest step."""
+        """Remove `step`, once it is an event of the loop; no effect if it is not the oldest step."""
         with self._guard:
             if self._steps and self._steps[0] is step:
                 self._steps.popleft()
@@ -315,8 +315,8 @@ class Recovery:
     def for_json(self) -> dict[str, Any] | None:
         """Return {state, left, confirmed, confirmations, causes, reason} for `/status`; None without [service.recover].
 
-        `left` is the number of recoveries left within the hour, `confirmed` that of successive confirmations so far out
-        of `confirmations`, `causes` names those of the trip, `reason` is the last reason in words, or None.
+        `left` is the number of recoveries left within the hour; `confirmed` of the `confirmations` that are required
+        have succeeded, one after another; `causes` are the trip's; `reason` is the last reason in words, or None.
         """
         with self._guard:
             options = self._options

@@ -33,9 +33,9 @@ class RecoveryWorker:
         self._host, self._recovery = host, recovery
 
     def step(self) -> None:
-        """Do what is due: send the recovery's new steps to the loop, judge its readings, return to the former state.
+        """Send the recovery's new steps to the loop, judge its readings, and return to the former state if confirmed.
 
-        A return takes seconds. Does nothing without a loop; an RtloopError is logged.
+        A return takes seconds. No effect without a loop; an RtloopError is logged.
         """
         try:
             loop = self._running_loop()
@@ -111,7 +111,8 @@ class RecoveryWorker:
     def _fail(self, error: RtloopError, loop: RunningLoop, serial: int) -> None:
         """End the return `serial`, which `error` ended: latch it, log the error as a fault, and set mode off.
 
-        If a client took over, or after another trip, the loop stays as it is. Raises as `Desk.submit`.
+        If a client took over, the recovery ends without these; after another trip, `Recovery.observe` handles it.
+        Raises as `Desk.submit`.
         """
         is_client = isinstance(error, ReferenceReplaced)
         if not self._recovery.finish(serial, StepReason.CLIENT if is_client else StepReason.REFUSED) or is_client:
