@@ -100,6 +100,7 @@ class CanSupervision:
     """
 
     def __init__(self, service: Service, options: BusOptions, bus: Any, frames: dict[str, Any]) -> None:
+        """Prepare `send_frames` and `receive_frames` on the open `bus`; `frames` are those of the DBC, by name."""
         self._service, self._options, self._bus, self._frames = service, options, bus, frames
         self._commands: dict[int, tuple[Any, Callable[..., object]]] = {
             frames[name].identifier: (frames[name], command)

@@ -76,6 +76,7 @@ class RefusedByLoop(Refusal):
     """
 
     def __init__(self, kind: Kind | Note, tick: int) -> None:
+        """Make the message for a command of `kind`, with the reason for a refusal of this kind, and store `tick`."""
         reason = (
             "the coefficients do not fit the memory of the running loop; restart the service"
             if kind is Kind.LOAD_LAW
@@ -96,6 +97,7 @@ class Desk:
     """
 
     def __init__(self, block: SharedBlock, rate_hz: float = 1e6, names: RequesterNames | None = None) -> None:
+        """Send to the loop of `block`, whose rate is `rate_hz`; `names`, unless None, receives requesters' names."""
         self._block, self._period_s, self._names = block, 1.0 / rate_hz, names
         self._lock = threading.Lock()
         self._last_identity = 0

@@ -21,6 +21,7 @@ class Journal(logging.Handler):
     """
 
     def __init__(self, fd: int = STDERR, lines: int = MAX_LINES) -> None:
+        """Start the thread that writes lines to the descriptor `fd`; at most `lines` wait for it."""
         super().__init__()
         self._fd, self._lost_count = fd, 0
         self._lines: queue.Queue[str] = queue.Queue(lines)

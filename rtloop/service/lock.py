@@ -40,6 +40,7 @@ class Lock:
     """A lock that one name holds at a time. Thread-safe; `now_s` is a monotonic clock."""
 
     def __init__(self, now_s: Callable[[], float] = time.monotonic) -> None:
+        """Begin with a free lock; `now_s` returns a monotonic time in s."""
         self._now_s = now_s
         self._guard = threading.Lock()
         self._holder: _LockHolder | None = None

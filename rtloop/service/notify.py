@@ -15,6 +15,7 @@ class Notifier:
     """
 
     def __init__(self) -> None:
+        """Read the manager's socket and the watchdog time from the environment (NOTIFY_SOCKET, WATCHDOG_…)."""
         address = os.environ.get("NOTIFY_SOCKET", "")
         self._address = "\0" + address[1:] if address.startswith("@") else address
         watchdog_us = os.environ.get("WATCHDOG_USEC", "")

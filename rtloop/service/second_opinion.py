@@ -40,6 +40,7 @@ class SecondOpinion:
     """
 
     def __init__(self) -> None:
+        """Begin without a comparison: `require` waits until `compute` has ended."""
         self.faults: list[str] = []
         self._is_known = threading.Event()
 

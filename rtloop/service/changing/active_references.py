@@ -56,6 +56,7 @@ class ActiveReferences:
     """References of the axes in the loop of `staging`, which began with `plan`. Thread-safe."""
 
     def __init__(self, plan: Plan, staging: Staging) -> None:
+        """Begin with mode and references of `plan`; no event is read before `follow` or `newest`."""
         self._staging, self._period_s = staging, 1.0 / plan.pacing.rate_hz
         self._lock = threading.Lock()
         self._cursor = 0

@@ -45,6 +45,7 @@ class LiveLaw:
     """
 
     def __init__(self, prepared: Prepared, block: SharedBlock, desk: Desk, offsets_v: dict[int, float]) -> None:
+        """Begin with `prepared`, which the loop of `block` runs. `offsets_v` is not copied: `tare` adds to it."""
         self.prepared = prepared
         self.offsets_v = offsets_v
         self._staging = Staging(block, desk)

@@ -43,6 +43,7 @@ class ReferenceReplaced(Refusal):
     """The reference of axis `axis` was replaced by another client."""
 
     def __init__(self, axis: str) -> None:
+        """Make the message, which names `axis`."""
         super().__init__(f"reference of axis {axis}: replaced by another client")
 
 
@@ -53,6 +54,7 @@ class LiveReferences:
     """
 
     def __init__(self, prepared: Callable[[], Prepared], staging: Staging) -> None:
+        """Begin with the references of the plan; `prepared` returns the running configuration, also a changed one."""
         self._prepared, self._staging = prepared, staging
         plan = prepared().plan
         self._first_spare = plan.table.size

@@ -18,6 +18,7 @@ class Staging:
     """The shared block of a loop and the desk that announces staged data; hold `lock` while staging."""
 
     def __init__(self, block: SharedBlock, desk: Desk) -> None:
+        """Use the `block` of a loop and the `desk` that sends to it; nothing is staged yet."""
         self.block, self.desk = block, desk
         self.lock = threading.Lock()
         self._unsettled_tick: int | None = None

@@ -61,6 +61,7 @@ class RetuneSchedule:
     """
 
     def __init__(self, service: Service, socket: Path, run_command: CommandRunner = _run_at_low_priority) -> None:
+        """Prepare the schedule; `run_command` runs a command line until it ends. No axis is due before its interval."""
         self._service, self._socket, self._run = service, socket, run_command
         self._interval_start_s: dict[str, float] = {}
 

@@ -176,6 +176,7 @@ class _ExcitationRun:
     """Player of multisines about the setpoint, within a stated range of the position; `driver` is the driver's kind."""
 
     def __init__(self, player: Player, driver: str) -> None:
+        """Play by `player`, in a loop with this driver kind; the position is unlimited before `limit_motion`."""
         self._player, self._driver = player, driver
         self._lowest_um, self._highest_um = -np.inf, np.inf
 

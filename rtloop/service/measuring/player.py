@@ -34,6 +34,11 @@ class Player:
     """
 
     def __init__(self, supervisor: Supervisor, live: LiveLaw, number: int, activity: str) -> None:
+        """Store the axis's constant reference as `hold_um`, µm; messages begin with `activity`.
+
+        Waits until a change of the reference has taken effect. Raises Refusal if the loop is in another mode than
+        closed_loop or the reference is not constant, ClientDisconnected if the client has disconnected.
+        """
         require_client(activity)
         self._supervisor, self._live, self._number, self._activity = supervisor, live, number, activity
         newest = supervisor.newest(1)

@@ -70,6 +70,7 @@ class Quality:
     """
 
     def __init__(self) -> None:
+        """Begin with sums of 0, without axes; `update` adds ticks."""
         self.ticks = self.unread_ticks = self.overruns = self.periods_missed = 0
         self.limited_ticks = dict.fromkeys(LIMIT_FLAGS, 0)
         self.trips: dict[str, int] = dict.fromkeys(signals.trip_causes(signals.TRIP_MASK), 0)

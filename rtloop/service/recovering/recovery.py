@@ -94,6 +94,7 @@ class Recovery:
     """Recovery of one service. Thread-safe; `now_s` is a monotonic clock."""
 
     def __init__(self, host: Host, now_s: Callable[[], float] = time.monotonic) -> None:
+        """Begin in the state READY for the service `host`; `now_s` returns a monotonic time in s."""
         self._host, self._now_s = host, now_s
         self._guard = threading.RLock()
         self._state, self._reason, self._causes = RecoveryState.READY, StepReason.NONE, 0
