@@ -82,7 +82,7 @@ class Service:
     """
 
     def __init__(self, config: Path, duration_s: float | None = None, name: str | None = None) -> None:
-        """Load the configuration file; no loop runs before `run`, and none is armed if service.arm is set.
+        """Load the configuration file; no loop runs before `run`. The outputs are armed unless service.arm is set.
 
         `duration_s` None: until `end`. `name` None: the stem of the file's name. Raises ConfigError for an invalid file
         and for a schedule with options that exclude one, InputFileError for a file that cannot be read.
