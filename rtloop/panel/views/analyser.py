@@ -13,7 +13,10 @@ from rtloop.panel.spectrum.spectrum import Spectrum
 
 
 class Analyser:
-    """Spectrum of the subscribed signal. Raises ValueError for a signal that the loop does not have."""
+    """Spectrum of a subscription's signal, averaged over the ticks that `feed` received since the last `reset`.
+
+    The constructor raises ValueError for a signal that the loop does not have.
+    """
 
     def __init__(self, subscription: SpectrumSubscription, loop: Description) -> None:
         self._subscription, self._rate_hz = subscription, loop.rate_hz
@@ -40,7 +43,7 @@ class Analyser:
         self._rest.reset()
 
     def feed(self, stretch: Stretch) -> None:
-        """Add the next ticks; a new run discards all averages."""
+        """Add the next ticks to the averages; the first ticks of a new run discard the old run's averages."""
         if stretch.run != self._run:
             self._run = stretch.run
             self.reset()
@@ -49,10 +52,12 @@ class Analyser:
         self._average(self._batch.add(stretch))
 
     def frame(self) -> bytes:
-        """Return the binary message "spectrum" of all ticks since the last reset.
+        """Return the binary message "spectrum" of all ticks since the last reset; its arrays may be empty.
 
-        It has the centre of each band (Hz), its amplitude density (`unit`/√Hz) and number of averages; `rms` in the
-        band of the subscription, in `unit`; the number of bridged samples; whether the axis was at rest all the time.
+        The arrays have a value for each frequency band: `hz` (centre), `amplitude` (density in `unit`/√Hz), `averages`
+        (their number). The header has the subscription, `unit`, the `rms` from low_hz to high_hz, `averages_least`,
+        `averages_most`, `bridged` (missing samples that a straight line replaced), and `at_rest`: whether the signal's
+        axis rested all the time, False for a signal of no axis.
         """
         self._average(self._batch.take())
         density, subscription = self._spectrum.density(), self._subscription
@@ -72,6 +77,6 @@ class Analyser:
         )
 
     def _average(self, batch: Stretch | None) -> None:
-        """Average a batch of ticks, if there is one."""
+        """Add a batch of ticks to the averages of the spectrum; None adds nothing."""
         if batch is not None:
             self._spectrum.feed(batch[self._subscription.signal], batch.periods(self._rate_hz))

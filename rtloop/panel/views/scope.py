@@ -33,7 +33,10 @@ ROLL = "roll"
 
 
 class Scope:
-    """Screen of a subscription. Raises ValueError for signals, durations and triggers that the loop does not allow."""
+    """Scope screen of a subscription: finds its sweeps and makes their messages.
+
+    The constructor raises ValueError for signals, durations and triggers that the loop does not allow.
+    """
 
     def __init__(self, subscription: ViewSubscription, loop: Description) -> None:
         limit_s = longest_view_s(len(loop.columns), loop.rate_hz)
@@ -64,7 +67,7 @@ class Scope:
         self._shown: Any = None
 
     def arm(self) -> None:
-        """Allow one more sweep in single mode; no effect in mode roll."""
+        """Allow one more sweep in mode single; no effect in the other modes."""
         if self._trigger is not None:
             self._trigger.arm()
 
@@ -74,13 +77,14 @@ class Scope:
             self._trigger.force()
 
     def is_compatible(self, loop: Description) -> bool:
-        """Return whether the screen can show that loop: same signals and rate."""
+        """Return whether the screen can show `loop`: it has the signals and the rate of the screen's loop."""
         return self._loop.has_signals_of(loop)
 
     def update(self, subscription: ViewSubscription, loop: Description) -> bool:
         """Take a subscription that differs in signals and pixels alone, without effect on the trigger, and return True.
 
-        Returns False, unchanged, for any other subscription and for a loop with other signals or another rate.
+        `frame` then makes the newest message anew. The signals must be the loop's, which is not checked. Returns False,
+        unchanged, for any other subscription and for a loop with other signals or another rate.
         """
         current = self.subscription
         if (subscription.seconds, subscription.trigger) != (current.seconds, current.trigger):
@@ -91,7 +95,10 @@ class Scope:
         return True
 
     def feed(self, stretch: Stretch, commands: Iterable[int]) -> list[Sweep]:
-        """Process the next ticks, and the ticks `commands` at which commands took effect. Returns the ended sweeps."""
+        """Process the next ticks, and the ticks `commands` at which commands took effect.
+
+        Returns the sweeps that ended, oldest first; always [] in mode roll. `frame` shows the newest one.
+        """
         if self._trigger is None:
             return []
         self._commands.extend(commands)
@@ -102,7 +109,10 @@ class Scope:
         return sweeps
 
     def end_run(self, past: TickHistory) -> None:
-        """End the run: close the open sweep, and make its message for `frame` now, before `past` holds another run."""
+        """End the run: close the open sweep, and make the newest sweep's message now, before `past` holds another run.
+
+        The next call of `frame` returns this message.
+        """
         self._commands.clear()
         if self._trigger is not None and (sweep := self._trigger.close()) is not None and sweep.end > sweep.trigger:
             self.sweep_count += 1
@@ -111,10 +121,10 @@ class Scope:
         self._newest_sweep = self._shown = None
 
     def frame(self, past: TickHistory) -> bytes | None:
-        """Return the binary message "sweep" of the newest sweep, or of a long one that grows, with its ticks in `past`.
+        """Return the binary message "sweep" of the newest sweep, or of an open one that lasts longer than GROWING_S.
 
-        None without a sweep of the run in `past`, and if the same message was returned before. In mode roll, the sweep
-        has the last ticks.
+        The ticks are taken from `past`; in mode roll they are its last ones. After `end_run`, the message made there
+        comes first. None without a sweep of the run in `past`, and if the same message was returned before.
         """
         if self._ready_frame is not None:
             frame, self._ready_frame = self._ready_frame, None
@@ -131,9 +141,10 @@ class Scope:
         return self._pack_sweep(sweep, past, is_complete)
 
     def _pack_sweep(self, sweep: Sweep, past: TickHistory, is_complete: bool) -> bytes:
-        """Return the binary message "sweep" of a sweep: the extremes of each signal in each point of the screen.
+        """Return the binary message "sweep" of a sweep: the extremes of each signal at each point of the screen.
 
-        Each point has its `offset` in ticks from the trigger. `is_complete` is False for a sweep that still grows.
+        The array `offset` has each point's first tick, counted from the trigger. `is_complete` is False for a sweep
+        that still grows.
         """
         signals = self.subscription.signals
         points = past.points(signals, sweep.first, sweep.end, self.subscription.pixels)

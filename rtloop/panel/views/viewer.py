@@ -55,9 +55,10 @@ class Viewer:
     # The feed calls these methods under its lock.
 
     def begin(self, loop: Description) -> None:
-        """Begin a run of a loop: validate all subscriptions for it; a trigger that suits it continues.
+        """Begin a run of a loop: make the views of all subscriptions for it.
 
-        The view of an invalid subscription is removed until another run, and a message "refused" tells the client.
+        A scope continues, with its trigger, if the loop has the same signals and rate. The view of a subscription that
+        the loop does not allow is removed until another run, and a message "refused" is queued for the client.
         """
         for name, subscription in self._subscriptions.items():
             if name == "view" and self._scope is not None and self._scope.is_compatible(loop):
@@ -76,7 +77,7 @@ class Viewer:
             self._analyser.feed(stretch)
 
     def end_run(self, past: TickHistory) -> None:
-        """End the run, whose last ticks are in `past`."""
+        """End the run for the scope, which makes the message of its last sweep from the ticks in `past`."""
         if self._scope is not None:
             self._scope.end_run(past)
 
@@ -101,7 +102,10 @@ class Viewer:
                 self._refuse(name, str(error))
 
     def due_frames(self) -> list[bytes]:
-        """Return the binary messages that are due now, with refusals, and set the times of the next ones."""
+        """Return the binary messages that are due now, the queued refusals first; [] if there are none.
+
+        Removes the refusals from the queue, and sets the time from which each kind of message is due again.
+        """
         now_s = time.monotonic()
         frames, self._refusals = self._refusals, []
         for kind, make_frame in self._frame_makers.items():
@@ -115,7 +119,11 @@ class Viewer:
         return frames
 
     def _apply(self, name: str, value: Any) -> None:
-        """Apply one validated field: subscription, setting or action. Raises ValueError as `_build`."""
+        """Apply the validated `value` of a message's field `name`: a subscription, a setting or an action.
+
+        Before the first loop, a subscription is only stored. An action with the value False, or without the view that
+        it concerns, does nothing. Raises ValueError as `_build`.
+        """
         match name:
             case "view" | "spectrum" | "xy":
                 if self._feed.loop is not None:
@@ -138,9 +146,9 @@ class Viewer:
         subscription: ViewSubscription | SpectrumSubscription | XySubscription | None,
         loop: Description,
     ) -> None:
-        """Make or update the view of a subscription; None removes the view `name`.
+        """Make or update the view `name` ("view", "spectrum" or "xy") for a subscription; None removes it.
 
-        Raises ValueError for a subscription that the loop does not allow, and the old view stays.
+        Raises ValueError for a subscription that the loop does not allow; the old view then stays.
         """
         match subscription:
             case ViewSubscription():
@@ -170,7 +178,10 @@ class Viewer:
         return None if self._scope is None or self._is_held or past is None else self._scope.frame(past)
 
     def _events_frame(self) -> bytes | None:
-        """Return the binary message "events" with all rows that are new or changed since the last one, else None."""
+        """Return the binary message "events" with all rows that are new or changed since the last such message.
+
+        None without such rows.
+        """
         events = self._feed.events.events_after(self._sent_number)
         if not events:
             return None

@@ -30,7 +30,7 @@ WARM_BINS = 100
 
 
 class XyPlot:
-    """Plot of a subscription. Raises ValueError for an axis that the loop does not have."""
+    """Plot of drive against position for a subscription. Raises ValueError for an axis that the loop does not have."""
 
     def __init__(self, subscription: XySubscription, loop: Description) -> None:
         if subscription.axis not in loop.axes:
@@ -46,9 +46,9 @@ class XyPlot:
     def frame(self, past: TickHistory) -> bytes | None:
         """Return the binary message "xy" of the last seconds; None while less than 1/NEW_PART of its ticks is new.
 
-        It has drive (V) and position (µm); `loop_percent`, the relative height 100·h/H of the measured loop, None at
-        rest and without motion; and with a hysteresis model its curve, moved by `offset_um` to the mean of the measured
-        one.
+        It has drive (V) and position (µm), empty if all ticks were lost; `loop_percent`, the relative height 100·h/H of
+        the measured loop, None at rest, without motion and without a whole loop; and with a hysteresis model its curve,
+        moved by `offset_um` to the mean of the measured one.
         """
         first, end = past.end - self._ticks, past.end
         if self._shown[0] == past.run and end < self._shown[1] + self._ticks / NEW_PART:
@@ -82,7 +82,11 @@ class XyPlot:
         return model_output(model, np.concatenate([earlier_drive, drive]))[earlier_drive.size :]
 
     def _earlier_drive(self, past: TickHistory, first: int) -> Real:
-        """Return the drive before tick `first`, V (m,): extremes of whole blocks, then the ticks after the last."""
+        """Return the drive before tick `first`, V (m,), oldest first, over at most four times the shown duration.
+
+        It has the extremes of whole blocks, then the ticks after the last block, without lost ticks; empty before
+        tick 1.
+        """
         if first <= 0:
             return np.zeros(0)
         block_tick = first // BLOCK * BLOCK
@@ -103,7 +107,10 @@ def order_extremes(low: Real, high: Real) -> Real:
 
 
 def play_model(axis: dict[str, Any]) -> PlayModel | None:
-    """Return the hysteresis model of a configured axis's feedforward; None for another kind or invalid options."""
+    """Return the hysteresis model of the feedforward in the table [axis] of a configuration.
+
+    None for a feedforward of another kind or with invalid options.
+    """
     feedforward = axis.get("feedforward") or {}
     if feedforward.get("kind", KIND) != KIND:
         return None

@@ -53,20 +53,23 @@ class Pages(StaticFiles):
 
 
 def application(service: Service, sessions: Sessions, viewers_token: str | None = None) -> Starlette:
-    """Return the panel of a service; with `viewers_token` it also serves viewers of the Foxglove protocol."""
+    """Return the panel's web application for a service; its threads read the loop while the server runs.
+
+    With `viewers_token` it also serves viewers of the Foxglove protocol whose address contains this token.
+    """
     feed, state, login_rates = Feed(service), StateListener(service.client), ClientRateLimits(per_s=5.0, burst=20)
     mimetypes.add_type("text/javascript", ".js")
 
     @asynccontextmanager
     async def lifespan(_: Starlette) -> AsyncIterator[None]:
-        """Read the loop while the server runs."""
+        """Start the threads that read ticks and state before the server runs; stop the reader of ticks after it."""
         feed.start()
         state.start()
         yield
         await anyio.to_thread.run_sync(feed.stop)
 
     async def index(_: Request) -> Response:
-        """Respond with the page."""
+        """Respond with the page `index.html`."""
         return FileResponse(PAGE / "index.html", headers={"cache-control": "no-cache"})
 
     @with_error_responses

@@ -55,7 +55,7 @@ class Live:
         self._limiter = CapacityLimiter(BUILDERS)
 
     async def serve(self, socket: WebSocket) -> None:
-        """Serve one client until it disconnects or stops reading; refuse it beyond MAX_STREAMS."""
+        """Serve one client until it disconnects or stops reading; beyond MAX_STREAMS, refuse it with code 1013."""
         if self._streams >= MAX_STREAMS:
             await socket.close(1013)
             return
@@ -76,13 +76,16 @@ class Live:
             self._streams -= 1
 
     async def _run_until_end(self, work: Work, socket: WebSocket, viewer: Viewer, tasks: CancelScope) -> None:
-        """Run one task of a client; its end, also by the client's disconnection, cancels the other task."""
+        """Run `work`, one of a client's two tasks; its end, also by the client's disconnection, cancels both tasks."""
         with suppress(*DISCONNECT_ERRORS):
             await work(socket, viewer)
         tasks.cancel()
 
     async def _listen(self, socket: WebSocket, viewer: Viewer) -> None:
-        """Pass each message to `viewer`, then wait 1/MESSAGES_PER_S, until the client disconnects; more wait unread."""
+        """Pass the client's messages to `viewer`, one each 1/MESSAGES_PER_S, until the client disconnects.
+
+        Messages that come faster wait unread.
+        """
         while True:
             message = await socket.receive()
             if message["type"] == "websocket.disconnect":
@@ -91,7 +94,10 @@ class Live:
             await anyio.sleep(1 / MESSAGES_PER_S)
 
     async def _send_frames(self, socket: WebSocket, viewer: Viewer) -> None:
-        """Send due messages every FRAME_S, for ever. Raises TimeoutError if one is not taken within SEND_TIMEOUT_S."""
+        """Send the viewer's due messages to the client every FRAME_S, for ever.
+
+        Raises TimeoutError if the client does not take a message within SEND_TIMEOUT_S.
+        """
         clock = anyio.current_time
         due_s = clock()
         while True:

@@ -15,10 +15,11 @@ MAX_SIGNALS = 8
 
 
 def signal_figures(feed: Feed, run: int, first: int, end: int, signals: list[str]) -> dict[str, dict[str, float]]:
-    """Return {signal: {rms, mean, std, low, high, peak_to_peak}} over ticks `first` … `end` − 1, without lost ones.
+    """Return {signal: {rms, mean, std, low, high, peak_to_peak}} over ticks `first` … `end` − 1, in the signal's unit.
 
-    Raises RequestRefused (410) for ticks that are no longer or not yet kept, or all lost, and for a signal without a
-    finite value in them, ValueError for an invalid request.
+    Lost ticks are left out. Raises RequestRefused (410) for ticks that are no longer or not yet in memory, of another
+    run, or all lost, and for a signal without a finite value in them; ValueError for no signal, more than MAX_SIGNALS
+    or an unknown one, and for an `end` that is not above `first`.
     """
     if not 0 < len(signals) <= MAX_SIGNALS:
         raise ValueError(f"signals: {len(signals)} names; allowed: 1 to {MAX_SIGNALS}")
@@ -55,7 +56,7 @@ def signal_figures(feed: Feed, run: int, first: int, end: int, signals: list[str
 
 @with_error_responses
 async def measure(feed: Feed, request: Request) -> Response:
-    """Respond to `/api/measure?run=R&first=TICK&end=TICK&signals=a,b` with `signal_figures`."""
+    """Respond to `/api/measure?run=R&first=TICK&end=TICK&signals=a,b` with `signal_figures`; errors become JSON."""
     query = request.query_params
     run, first, end = (_integer(name, query.get(name, "")) for name in ("run", "first", "end"))
     signals = query.get("signals", "").split(",")

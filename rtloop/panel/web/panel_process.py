@@ -16,7 +16,7 @@ def run_panel_process(socket: Path, port: int) -> Iterator[None]:
     """Run a panel of the service at `socket` during the block, without waiting for service or panel.
 
     The panel has a separate process group, so that Ctrl-C reaches the loop alone, and it ends with its stdin, also if
-    this process is killed.
+    this process is killed. After the block, a panel that has not ended within EXIT_TIMEOUT_S is killed.
     """
     command = [sys.executable, "-m", "rtloop", "panel", str(socket), "--port", str(port), "--until-stdin-ends"]
     process = subprocess.Popen(command, stdin=subprocess.PIPE, process_group=0)

@@ -40,7 +40,7 @@ class Proxy:
         self._rate = RateLimit(per_s=50.0, burst=100)
 
     def routes(self) -> Sequence[BaseRoute]:
-        """Return the routes that are forwarded."""
+        """Return a route below /api for each request of the control API that pages may send, and /api/openapi.json."""
         entries = [entry for entry in REQUESTS if entry.page_bytes is not None]
         return [
             Route("/api/openapi.json", self._read),
@@ -48,18 +48,19 @@ class Proxy:
         ]
 
     def _handler(self, entry: ApiRequest) -> Handler:
-        """Return the handler that forwards the requests of one entry of the table."""
+        """Return the handler for the requests that `entry` describes: `_read` for GET, else `_command`."""
         return self._read if entry.method == "GET" else with_error_responses(partial(self._command, entry))
 
     @with_error_responses
     async def _read(self, request: Request) -> Response:
-        """Forward a request for information, without a rate limit."""
+        """Forward a GET request, without a rate limit, and return its response; errors become JSON responses."""
         return await self._forward(request, Lane.ORDINARY, b"")
 
     async def _command(self, entry: ApiRequest, request: Request) -> Response:
-        """Forward a command.
+        """Forward a command and return its response.
 
-        Raises RequestRefused beyond the limits of rate (429; not for a stop or a reset) and size (413).
+        Raises RequestRefused beyond the limits of rate (429; not for a stop or a reset) and size (413), and the errors
+        of `_forward`.
         """
         lane = entry.lane or Lane.ORDINARY
         if lane is not Lane.SAFETY and not self._rate.allows():
@@ -67,10 +68,10 @@ class Proxy:
         return await self._forward(request, lane, await limited_body(request, entry.page_bytes or 0))
 
     async def _forward(self, request: Request, lane: Lane, body: bytes) -> Response:
-        """Send a request to the service and return its response, also a refusal.
+        """Send a request with `body` to the service in a thread of `lane`; return its response, also a refusal.
 
-        Raises RequestRefused (503) for a service that does not answer or is not trusted, TooManyRequests for a full
-        lane.
+        A measurement is cancelled if the page disconnects. Raises RequestRefused (503) for a service that does not
+        answer in time or is not trusted, TooManyRequests if too many requests of the lane run or wait.
         """
         resource = request.url.path.removeprefix("/api")
         if request.url.query:

@@ -63,7 +63,10 @@ class Recordings:
 
     @with_error_responses
     async def download(self, request: Request) -> Response:
-        """Respond with a file; with the present content of a file that still grows. 404 for a file that has gone."""
+        """Respond with the recording in the address, of a file that still grows with its present content.
+
+        404 for a file that is not in the folder of recordings, or was removed meanwhile.
+        """
         path = await self._recording_path(request)
         name = shown_name(path.name)
         try:
@@ -78,14 +81,17 @@ class Recordings:
 
     @with_error_responses
     async def info(self, request: Request) -> Response:
-        """Respond with the JSON of `rtloop info --json`."""
+        """Respond with the JSON of `rtloop info --json` for the recording in the address."""
         return PlainJSONResponse(
             await self._processes.run("rtloop", "info", await self._recording_path(request), "--json")
         )
 
     @with_error_responses
     async def plot(self, request: Request) -> Response:
-        """Respond with the PNG of `rtloop plot`; the query gives `from` and `until` in s since the start of the run."""
+        """Respond with the PNG of `rtloop plot` for the recording in the address.
+
+        The query may give `from` and `until`, in s since the start of the run.
+        """
         path = await self._recording_path(request)
         span_request = validate_request(Span, dict(request.query_params))
         span = [
@@ -99,7 +105,7 @@ class Recordings:
 
     @with_error_responses
     async def sweep(self, request: Request) -> Response:
-        """Respond with a sweep from a recording, as the scope's binary message "sweep".
+        """Respond with a sweep from the recording in the address, as the scope's binary message "sweep".
 
         The query has the fields of SweepRequest, with commas between the signals.
         """
@@ -111,9 +117,9 @@ class Recordings:
 
     @with_error_responses
     async def capture(self, request: Request) -> Response:
-        """Save ticks of the run that pages show as a recording, replay it, respond with the report of `tick_capture`.
+        """Save ticks of the running loop as a recording, replay it, and respond with the report of `tick_capture`.
 
-        410 if the loop was started again since.
+        The body is a CaptureBody. 410 if the loop was started again since the run that it names.
         """
         body = validate_request(CaptureBody, await limited_body(request, MAX_BODY_BYTES))
         if body.run not in (None, self._current_run()):
@@ -128,10 +134,10 @@ class Recordings:
         )
 
     def _tick_range(self, body: CaptureBody, run: RecordedRun) -> tuple[int, int]:
-        """Return the first tick of a capture and the tick after its last.
+        """Return the first tick of a capture, at least 0, and the tick after its last one.
 
-        Raises ValueError for more than LONGEST_S, or an end more than AHEAD_S in the future; UnavailableError without a
-        loop.
+        Without ticks in `body` they are the last `seconds` up to the newest tick of `run`. Raises ValueError for more
+        than LONGEST_S, or an end more than AHEAD_S in the future; UnavailableError without a loop.
         """
         rate_hz = self._service.describe().rate_hz
         if body.first is None or body.end is None:
@@ -145,7 +151,10 @@ class Recordings:
         return max(body.first, 0), body.end
 
     def _recording_folder(self) -> RecordingFolder:
-        """Return the service's folder of recordings, or the last known one. Raises UnavailableError without either."""
+        """Return the service's folder of recordings; without a running loop, the last known one.
+
+        Raises UnavailableError without either.
+        """
         try:
             folder = self._service.describe().recordings
         except UnavailableError:
@@ -168,7 +177,7 @@ class Recordings:
         return path
 
     async def _run_in_thread(self, action: Callable[[], Any]) -> Any:
-        """Run an action in one of MAX_READERS threads and return its result."""
+        """Run an action in one of MAX_READERS threads, once one is free, and return its result or raise its error."""
         return await anyio.to_thread.run_sync(action, limiter=self._readers)
 
 
@@ -181,13 +190,15 @@ class OpenFileResponse(FileResponse):
         self._file = file
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Send the file or the requested ranges."""
+        """Send the file or the ranges of bytes that the request names, then close the file."""
         with self._file:
             await super().__call__(scope, receive, send)
 
 
 def _blocks(file: IO[bytes], size: int) -> Iterator[bytes]:
-    """Yield the first `size` bytes of a file in blocks, then close it."""
+    """Yield the first `size` bytes of a file in blocks of at most BLOCK_BYTES, fewer bytes if the file ends, then
+    close it.
+    """
     with file:
         while size > 0 and (block := file.read(min(size, BLOCK_BYTES))):
             size -= len(block)

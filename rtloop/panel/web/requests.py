@@ -13,7 +13,10 @@ LONGEST_S = 600.0
 
 
 class CaptureBody(BaseModel):
-    """Body of a capture: ticks `first` … `end` − 1 of the run with number `run`, or the last `seconds`."""
+    """Body of a capture: ticks `first` … `end` − 1 of the run with number `run`, or its last `seconds`.
+
+    `run` None is the present run.
+    """
 
     model_config = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
 
@@ -26,14 +29,14 @@ class CaptureBody(BaseModel):
     def _check(self) -> Self:
         """Require either `seconds`, or both `first` and `end` with first < end."""
         if (self.first is None) != (self.end is None) or (self.seconds is None) == (self.first is None):
-            raise ValueError("span: not clear; allowed: either `seconds` alone, or `first` with `end`")
+            raise ValueError("ticks to capture: not clear; allowed: either `seconds` alone, or `first` with `end`")
         if self.first is not None and self.end is not None and self.end <= self.first:
             raise ValueError(f"end: {self.end}; allowed: above first = {self.first}")
         return self
 
 
 class Span(BaseModel):
-    """Time span of a picture, in s since the start of the run."""
+    """Time span of a picture, in s since the start of the run; `until` None is the end of the recording."""
 
     model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
 
@@ -42,7 +45,10 @@ class Span(BaseModel):
 
 
 def validate_request(model: type[Any], data: Any) -> Any:
-    """Return a validated request from JSON bytes or a mapping. Raises ValueError that names each invalid value."""
+    """Return an instance of the pydantic class `model` with the fields in `data`, JSON bytes or a mapping.
+
+    Raises ValueError that names each invalid value.
+    """
     try:
         return model.model_validate_json(data) if isinstance(data, bytes) else model.model_validate(data)
     except ValidationError as error:

@@ -28,19 +28,20 @@ class PlainJSONResponse(JSONResponse):
     """JSON in ASCII, in which any file name can be sent, also one that is not UTF-8."""
 
     def render(self, content: Any) -> bytes:
-        """Encode `content`, in which all numbers are finite."""
+        """Return `content` as JSON in ASCII. Raises ValueError for NaN and infinity."""
         return json.dumps(content, allow_nan=False).encode("ascii")
 
 
 def with_error_responses(handler: Handler) -> Handler:
-    """Wrap a handler so that its errors become JSON responses {error}; a client that disconnected gets none.
+    """Wrap a handler so that its errors become JSON responses {error}, with the HTTP status of `status_code`.
 
-    The errors are RequestRefused, TooManyRequests, RtloopError and ValueError; any other is raised.
+    The errors are RequestRefused, TooManyRequests, RtloopError and ValueError; any other is raised. A client that
+    disconnected gets an empty response.
     """
 
     @wraps(handler)
     async def respond(*arguments: Any, **options: Any) -> Response:
-        """Call the handler, or respond with its error."""
+        """Return the handler's response, or a response that states its error."""
         try:
             return await handler(*arguments, **options)
         except ClientDisconnect:
@@ -61,7 +62,10 @@ def status_code(error: Exception) -> int:
 
 
 async def limited_body(request: Request, max_bytes: int) -> bytes:
-    """Return the body. Raises RequestRefused (413) for a larger one, whose rest is not read, and ClientDisconnect."""
+    """Return the body of a request.
+
+    Raises RequestRefused (413) above `max_bytes`, without reading the rest, and ClientDisconnect if the client leaves.
+    """
     data = bytearray()
     async for part in request.stream():
         data += part
@@ -71,7 +75,7 @@ async def limited_body(request: Request, max_bytes: int) -> bytes:
 
 
 def decode_json(data: bytes) -> object:
-    """Return decoded JSON. Raises ValueError for invalid or too deeply nested JSON."""
+    """Return the value in JSON bytes. Raises ValueError for invalid or too deeply nested JSON."""
     try:
         return json.loads(data)
     except RecursionError:

@@ -71,7 +71,7 @@ class Retuning:
         ]
 
     async def _retune(self, request: Request) -> Response:
-        """Respond with a proposal; the measurement ends with the page."""
+        """Measure, design and respond with a proposal of new taps; the measurement ends if the page disconnects."""
         return await self._respond(request, RetuneBody, ends_with_page=True)
 
     async def _swap(self, request: Request) -> Response:

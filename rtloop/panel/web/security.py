@@ -77,7 +77,10 @@ class Guard:
         self._app, self._sessions, self._is_admitted = app, sessions, is_admitted
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Refuse a request with 403 or 401 (a WebSocket by closing it), or forward it; responses get the HEADERS."""
+        """Refuse a request with 403 or 401 (a WebSocket by closing it), or forward it; responses get the HEADERS.
+
+        A message that is neither a request nor a WebSocket, such as the server's start, is forwarded unchecked.
+        """
         if scope["type"] not in ("http", "websocket"):
             return await self._app(scope, receive, send)
 
@@ -123,7 +126,7 @@ class Guard:
 
 
 def is_public(path: str) -> bool:
-    """Return whether a path needs no session: pages contain no data."""
+    """Return whether a path needs no session: the pages, which contain no data, the log-in and the icon."""
     return path in ("/", "/session", "/favicon.ico") or path.startswith("/page/")
 
 

@@ -64,7 +64,7 @@ def serve(control: Path, port: int, token_file: Path | None, print_address: Call
     server = uvicorn.Server(_server_config(application(Service(control), Sessions(token, port), viewers)))
 
     def end(*_: object) -> None:
-        """Let the server end, also if it has not begun."""
+        """Handle a signal: let the server end, also if it has not begun."""
         server.should_exit = True
 
     for number in (signal.SIGINT, signal.SIGTERM):  # uvicorn handles them while it serves, and raises them again.
