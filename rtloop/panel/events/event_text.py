@@ -28,7 +28,7 @@ class RunState:
     """References and mode of a run after its events so far, so that a change is shown with its old value."""
 
     def __init__(self, axes: dict[str, dict[str, Any]], mode: str | None = None) -> None:
-        """Begin with the references of configured `axes`, by name, and the text of the first mode (None: unknown)."""
+        """Begin with the references of `axes`, tables [axis] by name, and the text of the first mode; None: unknown."""
         self.references = {name: _configured_reference(axis.get("reference") or {}) for name, axis in axes.items()}
         """Reference of each axis whose reference is known. Replaced as a whole: other threads read it."""
         self._mode = mode
@@ -74,7 +74,10 @@ def _started_reference(values: list[Any], text: str) -> PlayedReference:
 
 
 def reference_text(reference: dict[str, Any]) -> str:
-    """Return the text of a table [axis.reference], in µm; empty for other kinds than hold, sine and triangle."""
+    """Return the text of a configuration's table [axis.reference], with values in µm.
+
+    Empty for other kinds than hold, sine and triangle; a missing kind is hold, a missing value 0.
+    """
     match reference.get("kind", "hold"):
         case "hold":
             return _generator_text([Generator.HOLD, float(reference.get("value", 0.0)), *[0.0] * 4], UM)
@@ -85,9 +88,9 @@ def reference_text(reference: dict[str, Any]) -> str:
 
 
 def event_text(event: Event, unit: str = "") -> str:
-    """Return the text of an event of `event_from_message` or `LateEpisodes`; empty if its kind is enough.
+    """Return the text of an event of `event_from_message` or `LateEpisodes`.
 
-    `unit` follows each value of a reference, such as " µm".
+    Empty for a kind that needs no text, such as a reset. `unit`, such as " µm", follows each value of a reference.
     """
     details = event["what"]
     match event["kind"]:

@@ -41,7 +41,9 @@ class OperatorAnswer(NamedTuple):
 
 
 class Events:
-    """The last MAX_ROWS rows. Each version of a row has a number, from 1; a changed row gets a new one."""
+    """The last MAX_ROWS rows of the list of events. Each version of a row has a number, from 1; a changed row gets a
+    new one.
+    """
 
     def __init__(self, service: Service) -> None:
         self._service = service
@@ -89,7 +91,10 @@ class Events:
                 self._pending_rows.append((self._rows[-1], identity))
 
     def _complete_pending(self) -> bool:
-        """Ask the service for operators and changes of pending rows, oldest first. Returns whether it answered."""
+        """Ask the service for operators and changes of the pending rows, oldest first, and add them to the rows.
+
+        Returns False at the first question that it does not answer; True also without pending rows.
+        """
         while self._pending_rows:
             row, identity = self._pending_rows[0]
             try:
@@ -103,12 +108,15 @@ class Events:
         return True
 
     def events_after(self, number: int) -> list[tuple[int, Event]]:
-        """Return (number, event) of the rows with a number above `number`, oldest first, in their newest version."""
+        """Return (number, event) of the newest version of each row whose number is above `number`, in the list's order.
+
+        A changed row keeps its place, so that the numbers need not ascend.
+        """
         with self._lock:
             return [(row.number, row.event) for row in self._rows if row.number > number]
 
     def _append_event(self, event: Event, rate_hz: float) -> None:
-        """Add an event as a new row, or to the row of late ticks that it belongs to."""
+        """Add an event with its text as a new row, or to the row of late ticks that it belongs to."""
         if event["kind"] not in (LATE_KIND, LATE_END_KIND):
             self._renew(EventRow(0, event), add_text(event, self._run_state.describe_change(event)))
             return
@@ -136,7 +144,7 @@ class Events:
         return self._late_row if event["kind"] == LATE_END_KIND or self._late_row[0] is self._rows[-1] else None
 
     def _query_operator(self, identity: int) -> OperatorAnswer:
-        """Ask the service about a command; None in both fields if it does not know it or refuses.
+        """Ask the service about the command with this identity; None in both fields if it does not know it or refuses.
 
         Raises UnavailableError without an answer within QUERY_TIMEOUT_S, HostRefusal for a server that is not trusted.
         """

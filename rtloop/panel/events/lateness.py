@@ -46,7 +46,7 @@ class LateEpisodes:
 
     @property
     def total(self) -> Episode:
-        """Counts of all episodes together."""
+        """Counts of all episodes together: sums of `periods` and `late_ticks`, and the largest `largest`."""
         a, b = self._ended, self._last
         return Episode(a.periods + b.periods, a.late_ticks + b.late_ticks, max(a.largest, b.largest))
 

@@ -69,7 +69,7 @@ class Feed:
         self._thread = threading.Thread(target=self._read_until_ended, name="feed", daemon=True)
 
     def start(self) -> None:
-        """Start the reading thread."""
+        """Start the thread that reads ticks until `stop`."""
         self._thread.start()
 
     def stop(self) -> None:
@@ -87,7 +87,7 @@ class Feed:
 
     @property
     def lost_ticks(self) -> int:
-        """Ticks that the loop overwrote before they were read."""
+        """Number of ticks that the loop overwrote before they were read, in all runs."""
         return 0 if self._reader is None else self._reader.lost_ticks
 
     @property
@@ -96,19 +96,19 @@ class Feed:
         return None if self._newest_tick_s is None else time.monotonic() - self._newest_tick_s
 
     def add_viewer(self, viewer: Follower) -> None:
-        """Hand every tick to a viewer from now on; with a loop its `begin` is called at once."""
+        """Hand every tick that is read from now on to a viewer; if a loop is read already, call its `begin` at once."""
         with self.lock:
             self._viewers.append(viewer)
             if self.loop is not None:
                 viewer.begin(self.loop)
 
     def remove_viewer(self, viewer: Follower) -> None:
-        """Hand no more ticks to a viewer."""
+        """Hand no more ticks to a viewer that `add_viewer` added; ValueError for any other."""
         with self.lock:
             self._viewers.remove(viewer)
 
     def _read_until_ended(self) -> None:
-        """Read ticks until `stop`; an error is logged once and stored in `fault`."""
+        """Read ticks until `stop`; the reason why they cannot be read is logged once and stored in `fault`."""
         while not self._end_event.wait(self._pause_s()):
             try:
                 self._read_all()

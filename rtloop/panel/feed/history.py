@@ -26,7 +26,10 @@ class History:
         """Number of the tick after the newest one."""
 
     def append(self, stretch: Stretch) -> None:
-        """Add ticks; ticks of a new run replace all others. Raises ValueError for a missing signal."""
+        """Add the next ticks in place of the oldest; lost ticks before them become NaN.
+
+        Ticks of a new run replace all others. Raises ValueError if the stretch lacks a signal of the history.
+        """
         columns = [stretch[name] for name in self.signals]
         if stretch.run != self.run:
             self._values[:] = np.nan

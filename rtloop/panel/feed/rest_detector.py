@@ -39,13 +39,13 @@ class RestDetector:
         self.reset()
 
     def reset(self) -> None:
-        """Forget all ticks; the axis counts as at rest."""
+        """Discard all ticks; until the next ones the axis counts as at rest."""
         self.at_rest = True
         self._last: Real = np.zeros((2, 0))
         """Reference and mode of the newest tick, (2, 1); (2, 0) before the first."""
 
     def feed(self, reference: Real, mode: Real) -> None:
-        """Add the reference and mode, each (n,), of the next ticks."""
+        """Add the reference and mode, each (n,), NaN for lost ticks, of the next ticks to `at_rest`."""
         samples = np.hstack([self._last, [reference, mode]])
         self.at_rest = self.at_rest and is_at_rest(*samples)
         self._last = samples[:, -1:]

@@ -71,7 +71,10 @@ class TickHistory:
         return max(self.end - self._blocks * BLOCK, 0)
 
     def append(self, stretch: Stretch) -> None:
-        """Add ticks; ticks of a new run replace all others. Raises ValueError for a missing signal."""
+        """Add the next ticks in place of the oldest, and update the extremes of their blocks.
+
+        Ticks of a new run replace all others. Raises ValueError if the stretch lacks a signal of the history.
+        """
         history = self.history
         previous_end = history.end if stretch.run == history.run else stretch.first
         history.append(stretch)
@@ -82,7 +85,9 @@ class TickHistory:
         self._low[:, indices], self._high[:, indices] = np.fmin.reduce(values, -1), np.fmax.reduce(values, -1)
 
     def values(self, signals: Sequence[str], first: int, end: int) -> Real:
-        """Return ticks `first` … `end` − 1, (signals, end − first), in the order of `signals`; NaN for missing ones.
+        """Return a copy of ticks `first` … `end` − 1, (signals, end − first), in the order of `signals`.
+
+        NaN for lost, too old and future ticks.
 
         Raises ValueError for an unknown signal.
         """

@@ -51,11 +51,11 @@ class Timing:
         self._batch = Batch(loop.rate_hz)
 
     def feed(self, stretch: Stretch) -> None:
-        """Add the next ticks; they are counted in batches."""
+        """Add the next ticks of the run; they are collected and counted in batches, at the latest by `frame`."""
         self._count(self._batch.add(stretch))
 
     def _count(self, stretch: Stretch | None) -> None:
-        """Count each tick of a stretch in its second; None counts nothing."""
+        """Add each tick of a stretch to the figures of the second in which it was due; None adds nothing."""
         if stretch is None:
             return
         seconds = (stretch[_DEADLINE] // 1_000_000_000).astype(np.int64)
@@ -129,7 +129,10 @@ class Timing:
 
 
 def quantile_us(counts: Real, fraction: float) -> float | None:
-    """Return a quantile in µs of a histogram over EDGES_US, linear within a bin; None without ticks (virtual time)."""
+    """Return the quantile `fraction` (0 … 1), in µs, of a histogram `counts` (bins,) over EDGES_US.
+
+    It is linear within a bin; None if all counts are 0, as in virtual time.
+    """
     cumulative = np.concatenate([[0.0], np.cumsum(counts)])
     return float(np.interp(fraction * cumulative[-1], cumulative, EDGES_US)) if cumulative[-1] else None
 
@@ -142,5 +145,5 @@ def _histogram(values_us: Real) -> Real:
 
 
 def _sum(histograms: Iterable[Real]) -> Real:
-    """Return the sum of histograms (bins,)."""
+    """Return the sum of histograms (bins,); zeros if there are none."""
     return sum(histograms, np.zeros(EDGES_US.size - 1))

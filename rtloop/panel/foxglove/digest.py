@@ -15,9 +15,9 @@ from rtloop.signals import COMMON_SIGNALS, TICK
 
 
 class SignalDigest(NamedTuple):
-    """Extremes (signals, 3) of the last `ticks` ticks up to `tick`: min, max, last; NaN without a number.
+    """Extremes (signals, 3) of `ticks` ticks, the newest of them `tick`: min, max, last; NaN without a finite value.
 
-    `lost` more ticks before `tick` were overwritten before they could be read.
+    `lost` further ticks between them were overwritten before they could be read.
     """
 
     tick: int
@@ -27,9 +27,10 @@ class SignalDigest(NamedTuple):
 
 
 class Digest:
-    """Digest of the ticks of the feed.
+    """Collector of the extremes and last values of all ticks since the last `take`.
 
-    `names` are the signals except tick; `generation` grows by one whenever they change, from 0 without signals.
+    `names` are the signals except tick; `generation` is 0 before the first loop, and grows by one whenever `names`
+    changes.
     """
 
     def __init__(self) -> None:
@@ -39,7 +40,10 @@ class Digest:
         self._current: SignalDigest | None = None
 
     def begin(self, loop: Description) -> None:
-        """Begin a run of the described loop: discard ticks that were not taken; other signals begin a generation."""
+        """Begin a run of the described loop: discard ticks that were not taken.
+
+        If its signals differ from the ones before, `names` is replaced and `generation` grows by one.
+        """
         names = tuple(name for name in loop.names if name != COMMON_SIGNALS[TICK].name)
         if names != self.names:
             self.names, self._columns = names, [loop.names.index(name) for name in names]

@@ -70,7 +70,10 @@ class Foxglove:
         return len(tokens) == 1 and hmac.compare_digest(tokens[0].encode(errors="replace"), self._token.encode())
 
     async def serve(self, socket: WebSocket) -> None:
-        """Serve one viewer until its end; refuse it beyond MAX_VIEWERS, or without one of PROTOCOLS."""
+        """Serve one viewer until it disconnects or stops reading.
+
+        Refuse it with code 1013 beyond MAX_VIEWERS, with code 1002 without one of PROTOCOLS.
+        """
         protocol = next((offered for offered in socket.scope["subprotocols"] if offered in PROTOCOLS), None)
         if protocol is None or self._viewers >= MAX_VIEWERS:
             await socket.close(1002 if protocol is None else 1013)
@@ -114,7 +117,10 @@ class _Viewer:
             self._feed.remove_viewer(self._digest)
 
     async def _listen(self) -> None:
-        """Carry out each message, then wait 1/REQUESTS_PER_S, until the viewer disconnects; faster ones wait unread."""
+        """Carry out the viewer's messages, one each 1/REQUESTS_PER_S, until it disconnects; report invalid ones to it.
+
+        Messages that come faster wait unread.
+        """
         while True:
             message = await self._socket.receive()
             if message["type"] == "websocket.disconnect":
@@ -124,7 +130,11 @@ class _Viewer:
             await asyncio.sleep(1 / REQUESTS_PER_S)
 
     async def _send_messages(self) -> None:
-        """Send the digest RATE_HZ times a second, and events, for ever; announce a new channel for other signals."""
+        """Send the digest of new ticks RATE_HZ times a second, and events, for ever.
+
+        Announces a new channel /live whenever the loop has other signals. Raises TimeoutError if the viewer does not
+        take a message within SEND_TIMEOUT_S.
+        """
         due_s = self._clock()
         while True:
             names, generation, digest = await anyio.to_thread.run_sync(self._take_digest)
@@ -167,7 +177,10 @@ class _Viewer:
         await self._send_json({"op": "advertise", "channels": [channel._asdict()]})
 
     async def _send(self, channel: Channel, stamp_ns: int, message: bytes) -> None:
-        """Send a message to all subscriptions of a channel. Raises TimeoutError after SEND_TIMEOUT_S."""
+        """Send the CDR `message`, with the UNIX time `stamp_ns`, to each of the viewer's subscriptions to a channel.
+
+        Raises TimeoutError after SEND_TIMEOUT_S.
+        """
         for number in self._subscriptions.numbers_for_channel(channel.id):
             data = MESSAGE_DATA.pack(1, number, stamp_ns) + message
             await asyncio.wait_for(self._socket.send_bytes(data), SEND_TIMEOUT_S)

@@ -26,17 +26,20 @@ class Subscriptions:
         """Channel by the number of the subscription."""
 
     def numbers_for_channel(self, channel: int) -> list[int]:
-        """Return the numbers of the subscriptions to a channel."""
+        """Return the numbers of the subscriptions to the channel with the id `channel`."""
         return [number for number, subscribed_channel in self._channels.items() if subscribed_channel == channel]
 
     def withdraw(self, channel: int) -> None:
-        """Remove a channel that is no longer advertised, and its subscriptions."""
+        """Remove the channel with the id `channel`, which is no longer advertised, and all subscriptions to it."""
         self.channel_ids.remove(channel)
         for number in self.numbers_for_channel(channel):
             del self._channels[number]
 
     def handle_message(self, text: str | None) -> str | None:
-        """Carry out a message: subscribe or unsubscribe. Returns the fault of an invalid message, else None."""
+        """Carry out the JSON message of a viewer, subscribe or unsubscribe; unknown subscriptions to end are ignored.
+
+        Returns the fault of an invalid message as a sentence, else None; `text` None is invalid.
+        """
         try:
             message = json.loads(text or "")
             match message["op"]:
@@ -53,7 +56,10 @@ class Subscriptions:
             return "message: not valid in the Foxglove protocol; allowed: subscribe, unsubscribe"
 
     def _subscribe(self, requests: list[tuple[int, int]]) -> str | None:
-        """Add subscriptions, (number, channel) each, up to the first invalid one. Returns its fault, or None."""
+        """Add subscriptions, (number, channel id) each, up to the first invalid one.
+
+        Returns the fault of that one, None if all are valid.
+        """
         for number, channel in requests:
             if channel not in self.channel_ids:
                 return f"channel {channel}: unknown; allowed: {', '.join(map(str, sorted(self.channel_ids)))}"

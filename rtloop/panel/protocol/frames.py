@@ -15,7 +15,10 @@ SEND_TIMEOUT_S = 10.0
 
 
 def pack_frame(kind: str, header: Mapping[str, Any], arrays: Mapping[str, npt.NDArray[Any]] | None = None) -> bytes:
-    """Return a binary message of a kind: finite JSON values in `header`; arrays (n,) as Float32, NaN is "missing"."""
+    """Return a binary message with `kind`, the JSON values of `header`, and the arrays (n,) as Float32, by their names.
+
+    NaN in an array marks a missing value. Raises ValueError for NaN or infinity in `header`.
+    """
     arrays = arrays or {}
     message_header = {"kind": kind, **header, "arrays": [[name, len(values)] for name, values in arrays.items()]}
     text = json.dumps(message_header, allow_nan=False, ensure_ascii=False).encode()

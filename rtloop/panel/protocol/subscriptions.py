@@ -75,7 +75,10 @@ FIELD_TYPES: dict[str, TypeAdapter[Any]] = {
 
 
 def read_message(text: str) -> dict[str, Any]:
-    """Return the fields of a JSON message, not yet validated. Raises ValueError unless it is a JSON object."""
+    """Return the fields of a JSON message by name, not yet validated.
+
+    Raises ValueError unless it is a JSON object without NaN and infinity.
+    """
     fields = from_json(text, allow_inf_nan=False)
     if not isinstance(fields, dict):
         raise ValueError(f"not a JSON object; allowed: an object with keys from {', '.join(FIELD_TYPES)}")
@@ -83,7 +86,10 @@ def read_message(text: str) -> dict[str, Any]:
 
 
 def validate_field(name: str, value: Any) -> Any:
-    """Return the validated value of one field of a message. Raises ValueError that names value and allowed values."""
+    """Return the validated value of a message's field, of its type in FIELD_TYPES.
+
+    Raises ValueError that names value and allowed values, also for an unknown field.
+    """
     if name not in FIELD_TYPES:
         raise ValueError(f"field {name[:100]!r} of the message: unknown; allowed: {', '.join(FIELD_TYPES)}")
     try:

@@ -101,7 +101,10 @@ class RecordingFolder:
 
 
 def _summary(path: Path, size: int) -> dict[str, Any]:
-    """Return values for the keys of UNKNOWN_SUMMARY, from a file's beginning and end; all None if it is unreadable."""
+    """Return the values of UNKNOWN_SUMMARY's keys, as `RecordingFolder.listing` describes them, from a recording.
+
+    All are None if it is unreadable; `trips` is None for a `size` (bytes) above MAX_COUNTED_BYTES.
+    """
     try:
         with Reader(path, tolerant=True, opener=open_without_link) as reader:
             seeker, header, ticks, span_s, offset_s = ChunkSeeker(reader), reader.header, 0, 0.0, 0.0

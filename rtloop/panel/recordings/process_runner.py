@@ -30,9 +30,9 @@ class ProcessFailed(RtloopError):
 
 
 class ProcessRunner:
-    """Runs Python modules as processes: `max_running` at a time, `max_unfinished` with those that wait.
+    """Runs Python modules as processes: at most `max_running` at a time, `max_unfinished` with those that wait.
 
-    Each has `timeout_s` seconds.
+    Each is killed after `timeout_s` seconds, not counting its wait.
     """
 
     def __init__(
@@ -46,7 +46,7 @@ class ProcessRunner:
         """Run `python -m module arguments` with the input `stdin` and return the JSON object that it prints.
 
         The process is killed if this call is cancelled. Raises TooManyRequests if `max_unfinished` run or wait, and
-        ProcessFailed for the key `error` in its output, for other output, and after `timeout_s`.
+        ProcessFailed for an object with the key `error`, for output that is no JSON, and after `timeout_s`.
         """
         if self._pending >= self._max_unfinished:
             raise TooManyRequests(

@@ -39,9 +39,10 @@ class SweepRequest(BaseModel):
 
 
 def sweep_frame(path: Path, request: SweepRequest) -> bytes:
-    """Return a recording's sweep as the binary message "sweep" of the scope, with run −1.
+    """Return a recording's sweep as the binary message "sweep" of the scope, with run −1 and the name of the file.
 
-    Raises ValueError for missing ticks or signals and for too many values, RecordingError for an unreadable file.
+    Raises ValueError for ticks or signals that are not in the recording and for more than MAX_VALUES values,
+    RecordingError for an unreadable file.
     """
     with Reader(path, tolerant=True, opener=open_without_link) as reader:
         seeker = ChunkSeeker(reader)
@@ -57,7 +58,10 @@ def sweep_frame(path: Path, request: SweepRequest) -> bytes:
 
 
 def _tick_range(seeker: ChunkSeeker, request: SweepRequest) -> tuple[int, int]:
-    """Return the first tick of a sweep and the tick after its last. Raises ValueError for missing or too many ticks."""
+    """Return the first tick of the requested sweep and the tick after its last one.
+
+    Raises ValueError for ticks that are not in the recording, and for more than MAX_VALUES values.
+    """
     first_span, last_span, cut = seeker.first_span(), seeker.last_span(), seeker.reader.header.get("cut")
     if first_span is None or last_span is None:
         raise ValueError("the recording holds no ticks")

@@ -34,7 +34,7 @@ class Description:
 
     @property
     def axes(self) -> dict[str, dict[str, Any]]:
-        """Configuration of each axis by its name."""
+        """Table [axis] of the running configuration for each axis, by the axis's name."""
         return {axis["name"]: axis for axis in self.values["axis"]}
 
     def unit(self, name: str) -> str:
@@ -47,7 +47,7 @@ class Description:
 
 
 class Service:
-    """The service behind the control socket at `path`, which may be stopped."""
+    """Access to the service whose control socket is at `path`; the service may be stopped or start later."""
 
     def __init__(self, path: Path) -> None:
         self.client = Client(path)
@@ -63,7 +63,7 @@ class Service:
     def refresh_description(self) -> Description:
         """Request, cache and return the description of the running loop.
 
-        Raises UnavailableError without a loop, and for a service that refuses or is of another version.
+        Raises UnavailableError without a loop, and for a service that refuses, is not trusted or has another version.
         """
         try:
             configuration = self.client.get("/configuration")

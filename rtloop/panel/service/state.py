@@ -33,8 +33,10 @@ class StateListener:
 
     @property
     def status(self) -> dict[str, Any]:
-        """The newest state; `state` is "unreachable", with `error` and `remedy` (may be empty), without a connection or
-        after SILENT_S.
+        """The newest state, as `Client.watch` yields it.
+
+        Without a connection, or SILENT_S after the newest one: {state: "unreachable", lock: None, error, remedy (may be
+        empty)}.
         """
         if time.monotonic() - self._heard_s > SILENT_S:
             return {"state": UNREACHABLE, "lock": None, "error": self._fault, "remedy": self._remedy}

@@ -12,7 +12,7 @@ from rtloop.foundation.arrays import Real
 
 
 class EvenGrid:
-    """Puts samples on their grid; a straight line bridges holes of up to `longest_hole` samples."""
+    """Puts samples on an even grid of time; a straight line bridges holes of up to `longest_hole` samples."""
 
     def __init__(self, longest_hole: int) -> None:
         self._longest_hole = longest_hole
@@ -22,10 +22,11 @@ class EvenGrid:
         """Samples that a straight line replaced."""
 
     def add(self, values: Real, grid_indices: Real) -> list[tuple[bool, Real]]:
-        """Add samples. Returns the new stretches of evenly spaced samples: (True if it continues the one before, (m,)).
+        """Add samples. Returns the new pieces of evenly spaced samples, oldest first: (is_continuation, samples (m,)).
 
         `values` (n,) stand at the whole numbers `grid_indices` (n,); values that are not finite are holes. Samples on a
-        line over a hole are part of their stretch, and counted in `bridged_count`.
+        line over a short hole are part of their piece, and counted in `bridged_count`. `is_continuation` is True for
+        a piece that follows the last sample of the call before; it may be empty. [] without a finite value.
         """
         finite = np.isfinite(values)
         values, grid_indices = values[finite], grid_indices[finite]

@@ -33,7 +33,10 @@ FINER_UNITS = {"µm": ("nm", 1e3)}
 
 
 class Power(NamedTuple):
-    """Power of one stage `below` each edge of its bins, (edges,), in the density's unit squared."""
+    """Power of one stage of the cascade below each edge of its frequency bins.
+
+    `below` (edges,) is that power, in the density's unit squared, `edges_hz` (edges,) the edges, ascending.
+    """
 
     edges_hz: Real
     below: Real
@@ -131,7 +134,10 @@ class Spectrum:
         return Density(*columns, unit=self._unit, powers=tuple(powers))
 
     def _feed_stages(self, samples: Real) -> None:
-        """Feed even samples (n,) to the first stage, and the decimated ones to the next; adds stages as needed."""
+        """Feed evenly spaced samples (n,) to the first stage, and what each stage decimates to the next one.
+
+        Adds stages as needed.
+        """
         number = 0
         while samples.size:
             if number == len(self._stages):
@@ -156,11 +162,14 @@ class _Stage:
 
     @property
     def density(self) -> Real:
-        """Power density (segment/2 + 1,), one-sided, for a rate of 1; the last bin has half the others' width."""
+        """Mean power density (segment/2 + 1,), one-sided, for a sampling rate of 1; needs `averages` ≥ 1.
+
+        The last bin has half the others' width.
+        """
         return 2 * self._power / (self.averages * np.sum(self._window**2))
 
     def feed(self, samples: Real) -> Real:
-        """Average samples (n,) and return the decimated ones (m,), which begin at the first sample.
+        """Average samples (n,), n ≥ 1, and return the decimated ones (m,), m ≥ 0, which begin at the first sample.
 
         Before the first sample the filter sees that sample held: the window hardly weighs this start, and the segments
         of all stages begin together.
@@ -177,7 +186,7 @@ class _Stage:
         return decimated
 
     def _average(self, samples: Real) -> None:
-        """Add the periodograms of all complete segments; the rest waits for more samples."""
+        """Add the periodograms of all complete segments of samples to the averages; the rest waits for more samples."""
         step, segment = self._segment // 2, self._segment
         pending = np.concatenate([self._pending, samples])
         count = 1 + (pending.size - segment) // step
