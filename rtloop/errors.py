@@ -29,7 +29,7 @@ LOW_SPACE = 1 << 16
 
 
 def fault_list(source: str, faults: Sequence[str]) -> str:
-    """Return the text of all faults of a file or request: `source` and their count, then one line for each fault."""
+    """Return a text of all faults in a file or request: its name `source`, their count, then a line for each fault."""
     count = "1 fault" if len(faults) == 1 else f"{len(faults)} faults"
     return "\n  ".join([f"{source}: {count}", *faults])
 
@@ -57,7 +57,7 @@ class ConfigError(RtloopError):
 
 
 class UnavailableError(RtloopError):
-    """Hardware or a service is not available."""
+    """Hardware, a service or a system resource is not available."""
 
     exit_code = 69
 
@@ -74,7 +74,7 @@ class OutputError(RtloopError):
 
 @contextmanager
 def output_errors(target: object) -> Iterator[None]:
-    """Convert an OSError inside the block to an OutputError that names `target` and the cause."""
+    """Convert an OSError inside the block to an OutputError that names `target`, such as a path, and the cause."""
     try:
         yield
     except OSError as error:

@@ -144,7 +144,10 @@ TRIP_MASK = ~0xFF & 0xFFFFFFFF
 
 
 def column_names(axes: Sequence[str], observed: Sequence[str], extras: Sequence[str] = ()) -> tuple[str, ...]:
-    """Return the names of a record's columns in order: `tick`, …, `x_adc_v`, …, `extras`, `observed`."""
+    """Return the names of a record's columns in order: the common signals, those of each axis, `extras`, `observed`.
+
+    `axes` are names such as "x", whose signals are `x_adc_v`, …; `extras` and `observed` are whole names.
+    """
     return (
         *(signal.name for signal in COMMON_SIGNALS),
         *(f"{axis}_{signal.name}" for axis in axes for signal in AXIS_SIGNALS),
@@ -154,7 +157,7 @@ def column_names(axes: Sequence[str], observed: Sequence[str], extras: Sequence[
 
 
 def axis_column(axis: int, signal: int) -> int:
-    """Return the index of the column of a per-axis signal (ADC … FEED) of axis number `axis`."""
+    """Return the column of a record with the signal number `signal` (ADC … FEED) of axis number `axis`, both from 0."""
     return COMMON_COUNT + axis * PER_AXIS_COUNT + signal
 
 

@@ -10,7 +10,7 @@ from typing import Any
 
 
 def dataclass_fields(value: Any) -> dict[str, Any]:
-    """Return the values of a dataclass's fields by name, not converted and not copied."""
+    """Return {name: value} of the fields of a dataclass instance; the values are neither converted nor copied."""
     return {name: getattr(value, name) for name in value.__dataclass_fields__}
 
 
@@ -49,9 +49,10 @@ def count_text(number: int, singular: str, plural: str = "") -> str:
 
 
 def render_page(package: str | None, **values: Any) -> str:
-    """Return a package's jinja2 template `page.html`, filled in. Text is escaped; the filter `png` embeds PNG bytes.
+    """Return the jinja2 template `page.html` in the folder of `package` (its `__package__`), filled in with `values`.
 
-    Raises jinja2's UndefinedError for a value that the template needs and `values` lacks.
+    Text is escaped for HTML; the template's filter `png` turns PNG bytes into a data URL. Raises jinja2's
+    UndefinedError for a value that the template needs and `values` lacks.
     """
     from jinja2 import Environment, PackageLoader, StrictUndefined
 

@@ -95,7 +95,10 @@ class Connection:
         return self._command("/reset")
 
     def reload(self) -> dict[str, Any]:
-        """Let the service read its configuration file again and apply it. Returns {changed: ["axis.NAME", …]}."""
+        """Let the service read its configuration file again and apply it to the running loop.
+
+        Returns {changed: ["axis.NAME", …]}, the parts that changed.
+        """
         return self._client.post("/reload")
 
     def setpoint(self, axis: str, um: float) -> int:
@@ -187,8 +190,9 @@ class Connection:
         """Measure resonance and gain of an axis; return a proposal of taps for them. The taps stay until `swap`.
 
         Options, as in `rtloop.client.retuning.RetuneRequest`: `amplitude_um`, `gain_um`, `bound_percent`,
-        `within_percent` and `spec`. Raises LoopFault if resonance or gain is missing or too far from the model's,
-        NoDesign if no taps meet the specification.
+        `within_percent` and `spec`. The loop moves for the measurement. A gain that is not measured, or not precisely
+        enough, is replaced by the model's. Raises ConfigError for an axis or model that does not allow it, LoopFault if
+        no resonance is found or a used value is too far from the model's, NoDesign if no taps meet the specification.
         """
         from rtloop.client.retuning import RetuneRequest, propose_taps
 
@@ -198,7 +202,7 @@ class Connection:
         """Replace the prefilter's taps of an axis by those of a proposal of `retune`, interpolated in several steps.
 
         Returns the tick of the last step. Raises LoopFault if the taps in force changed since the proposal, RtloopError
-        for a refusal; the steps before it stay.
+        if the service refuses a step; the steps before that one then stay in force.
         """
         from rtloop.client.retuning import swap_in
 
@@ -231,7 +235,7 @@ class Connection:
         return capture_span(self._client, seconds, trigger, at, pre_percent, timeout_s, folder)
 
     def _command(self, resource: str, **body: Any) -> int:
-        """Post a command and return the tick at which it took effect."""
+        """Post a command with the JSON fields `body` to `resource`, and return the tick at which it took effect."""
         return int(self._client.post(resource, body)["tick"])
 
 
@@ -266,5 +270,5 @@ def read_controller(config: Path, axis: str) -> dict[str, Any]:
 
 
 def _floats(values: Iterable[float]) -> list[float]:
-    """Return the values of a sequence or array (n,) as a list for JSON."""
+    """Return the values of an iterable or array (n,) as a list of floats for JSON; an iterator is consumed."""
     return [float(value) for value in values]

@@ -43,8 +43,8 @@ class _UnixConnection(http.client.HTTPConnection):
 def _open_connection(path: Path) -> socket.socket:
     """Connect to the socket at `path` if a trusted user serves it: this user, root, or the owner of its folder.
 
-    Returns the connected socket. Raises OSError if no process listens, HostRefusal for a server or folder that is not
-    trusted.
+    Returns the connected socket, with the timeout TIMEOUT_S. Raises OSError if no process listens or the system
+    refuses, HostRefusal for a server or folder that is not trusted.
     """
     try:
         trusted_users = trusted_owners(path.parent)
@@ -96,7 +96,9 @@ class UnansweredRequest(UnavailableError):
 
 
 class Cancellation:
-    """Ends one request from another thread: the service then ends the motion that it made for this client."""
+    """Handle by which another thread ends a request of `Client.exchange`: the service then ends the motion that it made
+    for this client.
+    """
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -132,14 +134,15 @@ class Client:
         self.path, self._name = path, name
 
     def get(self, resource: str) -> Any:
-        """Return the response of GET: decoded JSON, or text. Raises the errors of `post`."""
+        """Send GET and return the response: decoded JSON, or text if it is not JSON. Raises the errors of `post`."""
         return self._request("GET", resource, None)
 
     def post(self, resource: str, body: Mapping[str, Any] | None = None, timeout_s: float | None = None) -> Any:
-        """Send POST with a JSON body and return the response.
+        """Send POST with a JSON body, {} for None, and return the response: decoded JSON, or text if it is not JSON.
 
-        Without `timeout_s` it waits TIMEOUT_S for the response, BUILD_TIMEOUT_S where the service builds a law.
-        Raises UnavailableError if no service answers, RtloopError with the service's message if it refuses.
+        Without `timeout_s` it waits TIMEOUT_S for the response, BUILD_TIMEOUT_S where the service builds a law. Raises
+        UnavailableError if no service answers, HostRefusal for one that is not trusted, RtloopError with the service's
+        message if it refuses.
         """
         if timeout_s is None:
             timeout_s = BUILD_TIMEOUT_S if resource in BUILD_RESOURCES else TIMEOUT_S
@@ -156,7 +159,8 @@ class Client:
     def measure(self, resource: str, body: Mapping[str, Any], timeout_s: float = LONGEST_MEASUREMENT_S) -> Any:
         """Post a measurement that moves `body["axis"]` and return the response.
 
-        After Ctrl-C the axis is set to its old reference, and LoopFault is raised. Raises the errors of `post`.
+        After Ctrl-C the axis is set to the constant reference that it had before, in µm, and LoopFault is raised; its
+        message says if the reference is not restored. Raises the errors of `post`.
         """
         axis = body["axis"]
         held_um = self.get("/status").get("axes", {}).get(axis, {}).get("reference_um")
@@ -164,7 +168,7 @@ class Client:
             return self.post(resource, body, timeout_s)
         except KeyboardInterrupt:
             if held_um is None:
-                raise LoopFault("interrupted") from None
+                raise LoopFault(f"interrupted; the old reference of axis {axis} is unknown and not restored") from None
             try:
                 self.post("/setpoint", {"axis": axis, "value": held_um})
             except RtloopError as error:
@@ -177,7 +181,8 @@ class Client:
         """Yield state, faults, lock, measurement and newest signals, about 20 times a second, until the service ends
         the connection.
 
-        Raises UnavailableError if no service answers, HostRefusal for one that is not trusted.
+        Raises UnavailableError if no service answers or the connection breaks, HostRefusal for a service that is not
+        trusted.
         """
         from websockets.exceptions import WebSocketException
         from websockets.sync.client import connect
@@ -197,10 +202,10 @@ class Client:
         timeout_s: float = TIMEOUT_S,
         cancellation: Cancellation | None = None,
     ) -> tuple[int, str, bytes]:
-        """Send one request and return status, content type and body, also of a refusal.
+        """Send one request and return (HTTP status, content type, body), also of a refusal.
 
         `cancellation` lets another thread end the request. Raises UnavailableError if no service answers within
-        `timeout_s`, HostRefusal for one that is not trusted.
+        `timeout_s` or the request is cancelled, HostRefusal for a service that is not trusted.
         """
         connection = _UnixConnection(self.path, timeout_s)
         try:

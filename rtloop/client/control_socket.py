@@ -10,9 +10,9 @@ from rtloop.supervision import paths
 
 
 def find_control_socket(name: str | None) -> Path:
-    """Return the path of the control socket of the service `name`, which may have died; None means the only service.
+    """Return the path of the control socket of the service `name`; None means the only service.
 
-    Raises UnavailableError if no socket matches, or if several match.
+    The service may have died and left its socket. Raises UnavailableError if no socket matches, or if several match.
     """
     folders = paths.client_folders()
     pattern = "*" if name is None else glob.escape(name)

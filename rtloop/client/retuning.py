@@ -207,14 +207,20 @@ def _is_better(subject: Subject, before: StepMeasures, after: StepMeasures) -> b
 
 
 def _running_configuration(client: Client) -> Configuration:
-    """Return the running configuration, with the changes since its start. Raises RtloopError without a loop."""
+    """Return the configuration of the service's running loop, with the changes since its start.
+
+    Raises RtloopError without a loop or service, ConfigError if the configuration is not valid here.
+    """
     response = client.get("/configuration")
     text = write_section("", response["values"])
     return parse(text, "running", Path(response["folder"]), "the running configuration")
 
 
 def _read_taps(values: dict[str, list[float]]) -> Taps:
-    """Return the taps that `taps_values` wrote. Raises KeyError, TypeError, ValueError for other values."""
+    """Return the taps in the rows `taps` and `command_taps` of `values`, as `taps_values` makes them; overshoot 0.
+
+    Raises KeyError, TypeError or ValueError for other values.
+    """
     reference, command = (np.array(values[key], float) for key in ("taps", "command_taps"))
     if reference.ndim != 1 or command.shape != reference.shape:
         raise ValueError("taps: the rows differ in length; allowed: two rows of the same length")
@@ -229,7 +235,10 @@ def _taps_in_force(axis: AxisOptions) -> Taps:
 
 
 def _interpolate_taps(old: Taps, new: Taps, part: float) -> Taps:
-    """Return (1 − part)·old + part·new, with the weight `part` from 0 to 1."""
+    """Return (1 − part)·old + part·new, with the weight `part` from 0 to 1 and the overshoot of `new`.
+
+    Shorter rows count as continued with zeros.
+    """
     rows = (
         (1 - part) * old_row + part * new_row
         for old_row, new_row in (_pad_rows(old.reference, new.reference), _pad_rows(old.command, new.command))
@@ -245,7 +254,10 @@ def _pad_rows(*rows: np.ndarray) -> list[np.ndarray]:
 
 
 def _step_at_gain_bounds(stage: MeasuredStage, subject: Subject, taps: Taps) -> StepMeasures | None:
-    """Return the larger value of each figure in two steps, the gain ± its deviation; None for the model's gain."""
+    """Return the larger value of each figure in two steps with `taps`, the gain off by ± its standard deviation.
+
+    None if the model's gain is used.
+    """
     if stage.gain is None or stage.gain_percent is None:
         return None
     off_percent, nominal = 100 * stage.gain["std"] / stage.gain["value"], subject.family().nominal

@@ -37,11 +37,17 @@ class Condition(Protocol):
     source: str
 
     def find(self, values: Real, gap: bool) -> Indices:
-        """Return the indices in `values` (n,), n > 0, that meet the condition; `gap`: ticks before them were lost."""
+        """Return the indices in `values` (n,), n > 0, that meet the condition, ascending; [] if none does.
+
+        `values` follow those of the call before. `gap`: ticks between the two were lost.
+        """
         ...
 
     def is_exact(self, index: int, gap: bool) -> bool:
-        """Return whether the change at `index` happened at that very tick, and not in lost ticks before it."""
+        """Return whether the change at `index` of a batch happened at that very tick.
+
+        False if it may have happened in ticks that were lost before the batch (`gap`).
+        """
         return not (gap and index == 0)
 
 
@@ -192,7 +198,7 @@ class Stepped(ChangeCondition):
 
 
 class CommandCondition(Condition):
-    """Trigger at the ticks in `ticks`, at which commands took effect; `find` removes them from that queue."""
+    """Trigger at the ticks in the queue `ticks`, at which commands took effect; `find` removes them from the queue."""
 
     source = COMMON_SIGNALS[TICK].name
 
@@ -201,9 +207,10 @@ class CommandCondition(Condition):
         self._ticks = ticks
 
     def find(self, values: Real, gap: bool) -> Indices:
-        """Return the indices of the command ticks among the tick numbers `values`, and remove them from the queue.
+        """Return the indices of the command ticks among the ascending tick numbers `values`.
 
-        With `gap`, index 0 stands for commands at lost ticks.
+        They and earlier command ticks are removed from the queue; with `gap`, index 0 stands for the earlier ones, as
+        their ticks were lost.
         """
         indices: list[int] = []
         while self._ticks and self._ticks[0] <= values[-1]:
@@ -214,13 +221,13 @@ class CommandCondition(Condition):
 
 
 def _require_finite(name: str, value: float) -> None:
-    """Raise ValueError unless the value is finite."""
+    """Raise ValueError unless the value is finite; `name` is the setting's name in the message."""
     if not math.isfinite(value):
         raise ValueError(f"{name}: {value}; allowed: finite numbers")
 
 
 def _require_not_negative(name: str, value: float) -> None:
-    """Raise ValueError unless the value is finite and at least 0."""
+    """Raise ValueError unless the value is finite and at least 0; `name` is the setting's name in the message."""
     _require_finite(name, value)
     if value < 0:
         raise ValueError(f"{name}: {value:g}; allowed: 0 or more")

@@ -48,7 +48,11 @@ class RecordedRun(NamedTuple):
 
 
 def current_run(client: Client) -> RecordedRun:
-    """Return the run that the service records. Raises UnavailableError if it records none, or not at present."""
+    """Return the run that the service records now.
+
+    Raises UnavailableError if no loop is recorded, also while the recording of a running loop is interrupted, and if no
+    service answers.
+    """
     status = client.get("/status")
     recording = status["recording"]
     if "file" not in recording or "rate_hz" not in status:
@@ -84,9 +88,10 @@ def capture_ticks(client: Client, file: Path, first: int, end: int, folder: Path
 
 
 def _await_written(client: Client, file: Path, end: int) -> None:
-    """Wait until the ticks before `end` are written, or the run is over.
+    """Wait until the ticks before `end` of the run with the recording `file` are written, or the run is over.
 
-    Raises UnavailableError if the run is no longer recorded, or GRACE_S after the tick was due.
+    Raises UnavailableError if the run's recording has stopped without being finished, or if the ticks are not written
+    GRACE_S after the last one was due.
     """
     deadline_s = None
     while True:
@@ -108,10 +113,11 @@ def _await_written(client: Client, file: Path, end: int) -> None:
 
 
 def _files_with_ticks(file: Path, first: int, end: int) -> list[Path]:
-    """Return the run's files, in order, with the ticks `first` … `end` − 1, and the file before: a replay may need it.
+    """Return the files of the run with the recording `file` that hold the ticks `first` … `end` − 1, in their order.
 
-    Files that begin at `end` or later are left out: the recorder may rename them meanwhile. Returns all files up to
-    `end` for a `first` before the run, [file] without any.
+    The file before them is included, because a replay may need it. Files that begin at `end` or later are left out: the
+    recorder may rename them meanwhile. For a `first` before the run these are all files up to `end`; [file] if the run
+    has no file. Raises RecordingError for a file that cannot be read.
     """
     paths = {*run_files(file, ".mcap"), *run_files(file, ".mcap.part")}
     files = sorted(paths, key=lambda path: (path.name.removesuffix(".part") != file.name, path.name))
@@ -137,7 +143,9 @@ def _unused_path(file: Path, tick: int, folder: Path | None) -> Path:
 
 
 def _replay_verdict(path: Path) -> str:
-    """Replay a recording and return the verdict: "identical", or a text with the first difference or the obstacle."""
+    """Replay a recording and return the verdict: "identical", or a text that states the first difference, the parts
+    that were not verified, or the reason why no replay is possible.
+    """
     try:
         report = replay(load(path))
     except RtloopError as error:

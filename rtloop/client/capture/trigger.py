@@ -55,7 +55,8 @@ class Sweep(NamedTuple):
 @dataclass(frozen=True)
 class Settings:
     """Settings of a trigger: sweeps of `ticks` ticks, `pre_percent` of them before the trigger (0 puts the trigger at
-    the first tick, 100 at the last). Raises ValueError for a value outside its range.
+    the first tick, 100 at the last). A trigger counts `holdoff_ticks` after the trigger before it or later; in mode
+    auto a sweep begins after `auto_ticks` without a trigger. Raises ValueError for a value outside its range.
     """
 
     ticks: int
@@ -82,7 +83,7 @@ class Trigger:
     """Finds sweeps in stretches of ticks, fed in order; `make_condition` returns a new condition for each run."""
 
     def __init__(self, settings: Settings, make_condition: Callable[[], Condition]) -> None:
-        """Begin armed and without an open sweep; `make_condition` returns a new condition for each run."""
+        """Begin armed and without an open sweep; call `make_condition` now and for each run that `feed` meets."""
         self._settings, self._make_condition = settings, make_condition
         self._condition = make_condition()
         self._is_armed, self._is_forced = True, False
@@ -92,7 +93,7 @@ class Trigger:
         """The sweep that has begun but not ended; None if there is none."""
 
     def arm(self) -> None:
-        """Allow one more sweep in single mode."""
+        """Allow one more sweep in mode single; no effect in the other modes."""
         self._is_armed = True
 
     def force(self) -> None:
@@ -105,9 +106,10 @@ class Trigger:
         return None if sweep is None else sweep._replace(end=self._next_tick)
 
     def feed(self, stretch: Stretch) -> list[Sweep]:
-        """Process the next ticks and return the sweeps that end in them.
+        """Process the next ticks and return the sweeps that end in them, oldest first; [] if there are none.
 
-        A new run discards the open sweep; call `close` before to get it. Raises ValueError if the run lacks the signal.
+        The first ticks of a new run discard the open sweep; call `close` before to get it. Raises ValueError if the
+        stretch lacks the condition's signal.
         """
         values = stretch[self._condition.source]
         if len(stretch) == 0:

@@ -31,8 +31,9 @@ def capture_span(
 ) -> Recording:
     """Save a span of the running loop as a recording and return it, as `Connection.capture` describes it.
 
-    It ends when its last tick is written. Raises ValueError for both `condition` and `center_tick` and for values out
-    of range, RtloopError for a tick or trigger later than `timeout_s`, UnavailableError if the run is not recorded.
+    The call returns once the span's last tick is written. Raises ValueError for both `condition` and `center_tick`, for
+    values out of range and an unknown signal; RtloopError for a tick or trigger later than `timeout_s`;
+    UnavailableError if the run is not recorded, or the loop is started again meanwhile.
     """
     _require(
         condition is None or center_tick is None, "capture: both a trigger and `at` are given; allowed: one of them"
@@ -57,10 +58,10 @@ def capture_span(
 def _await_trigger(
     configuration: Mapping[str, Any], begin: int, settings: Settings, condition: Condition, timeout_s: float
 ) -> int:
-    """Wait for the first tick from `begin` on that meets the condition; returns the first tick of the span about it.
+    """Wait for the first tick from `begin` on that meets the condition; return the first tick of the span about it.
 
-    `configuration` is the response of `/configuration`. Raises ValueError for an unknown signal, RtloopError after
-    `timeout_s`, UnavailableError if the loop starts again.
+    The span of `settings` may begin before `begin`, even below 0. `configuration` is the response of `/configuration`.
+    Raises ValueError for an unknown signal, RtloopError after `timeout_s`, UnavailableError if the loop starts again.
     """
     names = [column["name"] for column in configuration["columns"]]
     _require(condition.source in names, f"trigger source: {condition.source!r}; allowed: {', '.join(names)}")
@@ -85,6 +86,6 @@ def _await_trigger(
 
 
 def _require(condition: bool, message: str) -> None:
-    """Raise ValueError unless the condition holds."""
+    """Raise ValueError with `message` unless `condition` is True."""
     if not condition:
         raise ValueError(message)

@@ -35,14 +35,17 @@ class BlockMapping:
         return Ring(head, marks, self._array("events_slots", MESSAGE))
 
     def _array(self, name: str, dtype: np.dtype | None = None) -> np.ndarray:
-        """Return a view of an array of the block, by its name; `dtype` replaces the type that the block states."""
+        """Return a read-only view of the block's array `name`; `dtype` replaces the type that the block states.
+
+        Raises KeyError for a name that the block does not have.
+        """
         offset, type_name, shape = self._directory[name]
         array_dtype = np.dtype(type_name) if dtype is None else dtype
         return np.frombuffer(self._map, array_dtype, int(np.prod(shape)), offset).reshape(shape)
 
 
 def open_mapping(path: Path) -> BlockMapping | None:
-    """Map the block at `path`; returns None if it is missing or still empty.
+    """Map the shared block in the file `path` and return the mapping; None if the file is missing or still empty.
 
     Raises HostRefusal for a file that another user may have written, UnavailableError if it cannot be opened.
     """
@@ -67,5 +70,5 @@ def is_current(mapping: BlockMapping, path: Path) -> bool:
 
 
 def _identity(status: os.stat_result) -> tuple[int, int]:
-    """Return device and inode of a file."""
+    """Return the numbers of device and inode in a file's status."""
     return status.st_dev, status.st_ino

@@ -44,9 +44,9 @@ class Reader:
     def read(self) -> Stretch | None:
         """Return the next ticks, at most MAX_TICKS, without waiting; None if there are none.
 
-        Once the mapped block has no more ticks and another one lies at the path, a new run begins. Raises HostRefusal,
-        UnavailableError for a block that cannot be opened or does not suit the signals, and the errors of
-        `read_columns`.
+        Once the mapped block has no more ticks and another one lies at the path, a new run begins. Raises HostRefusal
+        for a block that another user may have written, UnavailableError for one that cannot be opened or has another
+        number of signals than `read_columns` returns, and the errors of `read_columns`.
         """
         stretch = self._read_mapped()
         if stretch is not None or (self._mapping is not None and is_current(self._mapping, self._path)):
@@ -54,9 +54,10 @@ class Reader:
         return self._read_mapped() if self._switch_block() else None
 
     def read_messages(self) -> np.ndarray[Any, np.dtype[np.void]]:
-        """Return the run's next events, (n,) of MESSAGE, n ≤ MAX_EVENTS; an event precedes its tick.
+        """Return the run's next events, (n,) of MESSAGE, oldest first, 0 ≤ n ≤ MAX_EVENTS, without waiting.
 
-        Events that were overwritten before they could be read are skipped.
+        An event may come before `read` returns its tick. Events that were overwritten before they could be read are
+        skipped.
         """
         ready_count = 0 if self._events is None else int(self._events.head[0]) - self._event_cursor
         messages = np.zeros(min(ready_count, MAX_EVENTS), MESSAGE)
@@ -67,9 +68,9 @@ class Reader:
         return messages[:copied_count]
 
     def _switch_block(self) -> bool:
-        """Map the block that lies at the path now and begin a run; returns False if there is none.
+        """Map the block that lies at the path now and begin a run; returns False, without a change, if there is none.
 
-        Raises UnavailableError if its records have another number of signals than `read_columns` names.
+        The first run begins with the oldest ticks in the ring, a later one with tick 0. Raises as `read`.
         """
         mapping = open_mapping(self._path)
         if mapping is None:
@@ -88,7 +89,10 @@ class Reader:
         return True
 
     def _read_mapped(self) -> Stretch | None:
-        """Return the next ticks of the mapped block, at most MAX_TICKS, and count lost ones; None if there are none."""
+        """Return a copy of the next ticks of the mapped block, at most MAX_TICKS, and add lost ones to `lost_ticks`.
+
+        None if there are none, or no block is mapped.
+        """
         if self._ring is None:
             return None
         ready_count = int(self._ring.head[0]) - self._cursor

@@ -16,7 +16,9 @@ BATCH_S = 0.25
 
 @dataclass(frozen=True, slots=True)
 class Stretch:
-    """Records `rows` (n, columns) of the n ticks from `first` on; `stretch["x_position_um"]` is one signal (n,)."""
+    """Records `rows` (n, columns) of n consecutive ticks from tick `first` on; `stretch["x_position_um"]` is one
+    signal (n,).
+    """
 
     columns: Sequence[str]
     first: int
@@ -57,7 +59,10 @@ class Batch:
         return self.take() if sum(map(len, self._stretches)) >= self._ticks else None
 
     def take(self) -> Stretch | None:
-        """Remove and return all collected ticks as one stretch, which may have gaps; None without ticks."""
+        """Remove and return all collected ticks as one stretch; None without ticks.
+
+        Lost ticks between them are left out and counted in `lost`: `end` and the numbers of its ticks are then wrong.
+        """
         stretches, self._stretches = self._stretches, []
         if not stretches:
             return None
@@ -69,7 +74,7 @@ class Batch:
 
 
 def column_index(name: str, columns: Sequence[str]) -> int:
-    """Return the index of a signal in `columns`. Raises ValueError for an unknown signal."""
+    """Return the index of the signal `name` in `columns`. Raises ValueError for a name that is not among them."""
     try:
         return columns.index(name)
     except ValueError:
