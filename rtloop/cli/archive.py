@@ -91,7 +91,12 @@ def _examine(
     out: Path | None,
     as_json: bool,
 ) -> int:
-    """Examine the recordings and print their rows; return the exit code."""
+    """Examine the recordings that `patterns` name, print the table of verdicts, and return the exit code.
+
+    The code is STOPPED after Ctrl-C, 1 if a recording's verdict is not the good one, else 0. `jobs` is the number of
+    worker processes, `scheduler` the address of a Dask scheduler in place of them, `out` the folder that stores the
+    verdicts; each may be None. Raises UsageError for both `jobs` and `scheduler`, and RtloopError as `examine`.
+    """
     if jobs and scheduler:
         raise click.UsageError("--jobs: not allowed with --scheduler, whose workers are counted")
     from rtloop.supervision.interruption import Interruption
@@ -120,9 +125,9 @@ def _examine(
 
 
 def _print_report(report: dict[str, Any], columns: tuple[str, ...], good_verdict: str) -> None:
-    """Print the rows, then the counts by verdict, the duration and the rate.
+    """Print a row for each recording, then the number of recordings by verdict, the duration and the rate.
 
-    Of a replay, which has the column `tick`, good recordings without a note are counted alone.
+    For a replay, whose `columns` include "tick", a recording with `good_verdict` and without a reason has no row.
     """
     out = console()
     rows = [
@@ -144,7 +149,10 @@ def _print_report(report: dict[str, Any], columns: tuple[str, ...], good_verdict
 
 
 def _path_text(row: dict[str, Any]) -> str:
-    """Return the path of a recording, relative below the present folder, and its number of files."""
+    """Return the path of a row's recording as text for rich, with its number of files if there are several.
+
+    The path is relative if it lies below the present folder.
+    """
     path = os.path.relpath(row["path"])
     path = row["path"] if path.startswith("..") else path
     path = "".join(letter if letter.isprintable() else "?" for letter in path)
@@ -152,7 +160,7 @@ def _path_text(row: dict[str, Any]) -> str:
 
 
 def _cell(value: Any) -> str:
-    """Return a value of a row as text; trips by tick and causes."""
+    """Return a value of a row as text for rich: a list of trips as `tick 5: causes; …`, "" for None."""
     if isinstance(value, list):
         return "; ".join(f"tick {trip['tick']}: {', '.join(trip['causes'])}" for trip in value)
     if isinstance(value, float):

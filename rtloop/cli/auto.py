@@ -112,8 +112,8 @@ def write_robust_design(
 ) -> RobustChain:  # fmt: skip
     """Write a configuration as `write_design` does, with a controller that damps the resonance, and with taps.
 
-    `progress` receives lines of text. Returns and raises as `write_design`; where a controller exists and taps do not,
-    it writes the configuration without taps, and raises NoDesign.
+    The parameters are those of `write_design`; `progress` receives lines of text. Returns and raises as `write_design`;
+    where a controller exists and taps do not, it writes the configuration without taps, and raises NoDesign.
     """
     from rtloop.design.chain import identify_stage
     from rtloop.design.identification.axis_recording import read_axis_recording
@@ -142,7 +142,10 @@ def write_robust_design(
 
 
 def _check_and_write(text: str, out: Path) -> None:
-    """Write a new configuration once `prepare` accepts it. Raises ConfigError, OutputError for an existing file."""
+    """Write a configuration to the new file `out`, once `prepare` accepts it.
+
+    Raises ConfigError for a configuration that cannot run, OutputError for a file that exists or cannot be written.
+    """
     from rtloop.configuration.file import parse
     from rtloop.configuration.prepare import prepare
     from rtloop.design.identification.model_sections import write_new_file

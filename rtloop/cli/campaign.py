@@ -52,7 +52,10 @@ def worker_options(command: Callable[..., Any]) -> Callable[..., Any]:
 
 @contextmanager
 def choose_workers(jobs: int | None, scheduler: str | None) -> Iterator[Workers]:
-    """Start worker processes, or use a scheduler's workers, for a block. Raises UsageError for both."""
+    """Start `jobs` worker processes, None: one for each processor, or use the workers of a Dask scheduler, for a block.
+
+    Raises UsageError for both. At the end of the block the workers are closed.
+    """
     if jobs and scheduler:
         raise click.UsageError("--jobs: not allowed with --scheduler, whose workers are counted")
     from rtloop.campaigns.workers import DaskWorkers, ProcessWorkers
@@ -132,7 +135,10 @@ def run(
 @JSON
 @report_errors
 def report(folder: Path, worst_count: int, page: Path | None, as_json: bool) -> int:
-    """Report from the results in FOLDER alone. Exit 1 if a rig failed, tripped or crashed its worker."""
+    """Report from the results in FOLDER alone.
+
+    Exit 1 if a rig failed, tripped or crashed its worker, and if no rig passed.
+    """
     if folder.is_file():
         require_readable(folder)
     return _report(folder, worst_count, as_json, page)
@@ -206,7 +212,10 @@ def write_page(page: Path, html: str) -> None:
 
 
 def _report(folder: Path, worst_count: int, as_json: bool, page: Path | None) -> int:
-    """Print the summary of a folder, and write it to a page if one is given; return 1 if a rig failed or crashed."""
+    """Print the summary of a campaign's results in `folder`, with `worst_count` rigs; write it to `page` if given.
+
+    Returns the exit code: 1 if a rig failed or crashed its worker, or none passed, else 0.
+    """
     from rtloop.campaigns.summary import summarise_campaign
 
     summary = summarise_campaign(folder, worst_count)
@@ -223,7 +232,7 @@ def _report(folder: Path, worst_count: int, as_json: bool, page: Path | None) ->
 
 
 def _print_summary(summary: CampaignSummary, folder: Path) -> None:
-    """Print yield, figures, causes of failures and the worst rigs."""
+    """Print yield, figures, causes of failures and the worst rigs, and where their recordings are in `folder`."""
     out, estimate = console(), summary.yield_of_rigs
     out.print(
         f"{escape(summary.name)}: {estimate.passed:,} of {count_text(estimate.rigs, 'rig')} pass, yield "
@@ -263,5 +272,5 @@ def _print_summary(summary: CampaignSummary, folder: Path) -> None:
 
 
 def value_text(value: Any) -> str:
-    """Return a value of a key as text."""
+    """Return the value of a configuration's key as text for rich: a float with four digits, brackets escaped."""
     return f"{value:.4g}" if isinstance(value, float) else escape(value)

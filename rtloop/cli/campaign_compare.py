@@ -51,7 +51,7 @@ def compare(first: Path, second: Path, page: Path | None, as_json: bool) -> None
 
 
 def _print_comparison(comparison: Comparison) -> None:
-    """Print yields, the rigs that one alone passes, and the differences of the figures."""
+    """Print both yields, the numbers of rigs that only one configuration passes, and the differences of the figures."""
     out, (first, second) = console(), map(escape, comparison.names)
     for name, estimate in zip((first, second), comparison.yields, strict=True):
         out.print(

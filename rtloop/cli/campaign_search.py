@@ -106,7 +106,10 @@ def boundary(
 
 
 def _print_worst(result: SearchResult, figure: str) -> None:
-    """Print values, figures and missed limits of the worst rig."""
+    """Print values, figures and missed limits of the worst rig.
+
+    `figure` is the figure that was maximised; "" is the largest figure in parts of its limit.
+    """
     case, out = result.worst, console()
     rows = [(escape(name), value_text(value)) for name, value in {**case.values, **case.figures}.items()]
     out.print(f"worst of {result.rigs} rigs: {escape(figure or 'figure / limit')} {result.figure:.4g}")
@@ -115,7 +118,7 @@ def _print_worst(result: SearchResult, figure: str) -> None:
 
 
 def _print_boundary(result: Boundary) -> None:
-    """Print both ends of the range and the limits that are missed beyond them."""
+    """Print both ends of the range in which rigs pass, the limits missed beyond them, and the number of rigs tried."""
     ends = [
         "no failure down to the end of the range" if result.low is None else f"{result.low:.6g} ({result.low_cause})",
         "no failure up to the end of the range" if result.high is None else f"{result.high:.6g} ({result.high_cause})",

@@ -57,8 +57,9 @@ def compensation_report(
 
     Returns the JSON report. Its `bounds` have a row for each choice of the gain ρ: ρ, the bound ξ (µm) and the largest
     simulated |Ω| = |y − ρ v| (µm), y being the output for a command v. `command_um` is the largest |v| (None: the
-    axis's limit). Writes a picture to `plot`, if given. Raises RtloopError, ConfigError for a compensator whose loading
-    curve does not increase.
+    axis's limit). Writes a picture to `plot`, if given. Raises ConfigError for a file without a hysteresis model of the
+    axis and for a compensator whose loading curve does not increase, InputFileError for an unreadable file, OutputError
+    and MissingExtra for the picture.
     """
     import numpy as np
 

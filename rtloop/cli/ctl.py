@@ -43,9 +43,9 @@ def ctl(context: click.Context, name: str | None, socket_path: Path | None, as_n
 
 
 def make_client(context: click.Context) -> Any:
-    """Return a client of the service that the options of `ctl` name.
+    """Return a client of the service that the options of `ctl` name; no request is sent yet.
 
-    Raises UnavailableError if there is no socket of that name, or without a name not exactly one.
+    Raises UnavailableError if no control socket has that name; without a name, if there is none or more than one.
     """
     from rtloop.client import Client
     from rtloop.client.control_socket import find_control_socket
@@ -55,7 +55,7 @@ def make_client(context: click.Context) -> Any:
 
 
 def print_response(response: Any, sentence: str) -> None:
-    """Print a response as JSON; on a terminal, an empty one as `sentence`."""
+    """Print a response as JSON; on a terminal, an empty response {} as `sentence`, unless that is empty."""
     if response == {} and sentence and sys.stdout.isatty():
         click.echo(sentence)
     else:
@@ -63,9 +63,10 @@ def print_response(response: Any, sentence: str) -> None:
 
 
 def post(resource: str, sentence: str = "") -> Callable[[Callable[..., Any]], Callable[..., None]]:
-    """Turn a function that makes a body into a command that posts it to `resource` and prints the response.
+    """Return a decorator: it turns a function that makes a request's body from a command's options into a command that
+    posts this body to `resource` and prints the response.
 
-    `sentence` stands for an empty response, as in `print_response`.
+    `sentence` is printed for an empty response, as in `print_response`.
     """
 
     def decorate(make_body: Callable[..., Any]) -> Callable[..., None]:
@@ -268,7 +269,10 @@ def read_numbers(file: Any) -> list[list[float]]:
 
 
 def _parse_inline_table(text: str) -> dict[str, Any]:
-    """Return the inside of a TOML inline table as a dict. Raises click.UsageError, without TOML's line and column."""
+    """Return `key = value, key = value`, the inside of a TOML inline table, as a dict.
+
+    Raises click.UsageError for any other text.
+    """
     from rtloop.configuration.text_files import parse_toml
 
     try:
@@ -280,7 +284,7 @@ def _parse_inline_table(text: str) -> dict[str, Any]:
 
 
 def print_preview(axis: str, answer: dict[str, Any]) -> None:
-    """Print a response of `/preview`: figures of the running loop and after the change, and problems of the change."""
+    """Print `answer`, a response of `/preview`: figures of the running loop and after the change, and its problems."""
     out, before, after = console(), answer["before"], answer["after"]
     rows = table(f"axis {axis}, on the model", "now", "after the change", "")
     for label, key, unit in FIGURES:
@@ -291,6 +295,9 @@ def print_preview(axis: str, answer: dict[str, Any]) -> None:
 
 
 def _format_shift(figures: dict[str, Any]) -> str:
-    """Return the range of shifts of the resonance that a loop tolerates, in %, as text; "–" where it is unknown."""
+    """Return the range of shifts of the resonance that a loop tolerates, in %, as text; "–" where it is unknown.
+
+    `figures` are the loop's figures in a response of `/preview`.
+    """
     shift = figures["tolerated_shift_percent"]
     return "–" if shift is None else f"{shift[0]:+.1f} … {shift[1]:+.1f}"

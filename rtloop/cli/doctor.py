@@ -82,7 +82,10 @@ def doctor(config: Path | None, seconds: float, change: bool, png: Path | None, 
 
 
 def _examine(pacing: Pacing, seconds: float, line: NetworkLine | SerialLine | None) -> Examination:
-    """Examine the host, and the line to a node, with a status line while the loop's clock runs."""
+    """Examine the host, with `seconds` of the loop's clock, and the line to a node if there is one; return the result.
+
+    A status line is shown meanwhile.
+    """
     from rtloop.doctor.examine import examine
 
     with StatusLine(f"the loop's clock runs for {seconds:g} s at {pacing.rate_hz:g} Hz", sys.stderr):
@@ -96,7 +99,10 @@ def _print_examination(
     objections: list[str],
     writes: list[SettingWrite],
 ) -> None:
-    """Print settings that were written, findings, lateness, its cost for each axis, and the verdict for loop `name`."""
+    """Print settings that were written, findings, lateness, its cost for each axis, and the verdict for loop `name`.
+
+    `objections` are the reasons why the host is not suitable; it is suitable if there are none.
+    """
     out, latency = console(), examination.latency
     for write in writes:
         outcome = f"[red]refused, {escape(write.refused)}[/]" if write.refused else "done, until the next restart"
@@ -142,7 +148,7 @@ def _print_latency(latency: Latency) -> None:
 
 
 def _histogram_classes(latency: Latency) -> list[dict[str, Any]]:
-    """Return the count of ticks in each class of lateness, [{below_us, count}, …], ascending."""
+    """Return the number of ticks in each class of lateness, [{below_us, count}, …], ascending by the upper limit."""
     from rtloop.recording.views.histogram import TimeHistogram
 
     histogram = TimeHistogram()
@@ -158,7 +164,10 @@ def _format_time(time_us: float) -> str:
 def _report(
     examination: Examination, delays: list[AxisDelay], objections: list[str], writes: list[SettingWrite]
 ) -> dict[str, Any]:
-    """Return the JSON report of an examination."""
+    """Return the JSON report of an examination, as `rtloop doctor --json` prints it.
+
+    `objections` are the reasons why the host is not suitable.
+    """
     from rtloop.doctor.software import library_versions
 
     latency = examination.latency

@@ -62,9 +62,10 @@ def drivers(
 
 
 def list_drivers() -> list[dict[str, Any]]:
-    """Return a dict for each registered kind: kind, defined_in, real, max_rate_hz (None: no limit), problem.
+    """Return a dict for each registered kind of driver: kind, defined_in, real, max_rate_hz, problem.
 
-    The facts are those with default options; `problem` is the reason that prevents its use, and they are then None.
+    `defined_in` is its module. With default options, `real` is whether it moves hardware, `max_rate_hz` its highest
+    rate (None: any). `problem` is the reason that prevents its use, else None; with a problem, those two are None.
     """
     from rtloop.drivers.errors import DriverError
     from rtloop.drivers.registry import driver_class, kinds
@@ -84,7 +85,7 @@ def list_drivers() -> list[dict[str, Any]]:
 
 
 def _print_drivers(entries: list[dict[str, Any]]) -> None:
-    """Print the registered kinds as a table."""
+    """Print the entries of `list_drivers` as a table."""
     rows = table("kind", "moves hardware", "clock", "highest rate", "defined in")
     for entry in entries:
         if entry["problem"]:
@@ -101,7 +102,7 @@ def _print_report(report: dict[str, Any]) -> None:
     for row in report["axes"]:
         delay = "does not follow" if row["delay_ticks"] is None else f"{row['delay_ticks']}"
         failure = "no loopback" if report["tolerances"] else "wrong sign"
-        verdict = {None: "", True: "holds", False: f"[red]{failure}[/]"}[row["passed"]]
+        verdict = {None: "", True: "within tolerance", False: f"[red]{failure}[/]"}[row["passed"]]
         rows.add_row(f"{row['axis']}: {row['output']} → {row['input']}", f"{row['gain']:.5f}",
                      f"{row['offset_v'] * 1e3:.3f} mV", f"{row['noise_v'] * 1e3:.3f} mV", delay, verdict)  # fmt: skip
     out.print(rows)

@@ -14,10 +14,11 @@ from rtloop.cli.output import echo_json
 
 
 def report_errors(command: Callable[..., int | None]) -> Callable[..., None]:
-    """Wrap a command: it ends the process, after an error of the project with one message in place of a traceback.
+    """Wrap a command so that it ends the process with an exit code, after an RtloopError or DriverError with a message
+    on stderr in place of a traceback.
 
-    The command returns its exit code, or None for 0; with `as_json` the error is printed as JSON too. An error's exit
-    code is its class's, for a DriverError that of UnavailableError.
+    `command` returns its exit code, or None for 0; with its option `as_json` the error is printed as JSON too. An
+    error's exit code is its class's, for a DriverError that of UnavailableError. Other errors are raised.
     """
 
     @wraps(command)
@@ -40,14 +41,14 @@ def report_errors(command: Callable[..., int | None]) -> Callable[..., None]:
 
 
 def require_readable(file: Path) -> None:
-    """Raise InputFileError for an unreadable file, before imports take a second."""
+    """Raise InputFileError if `file` cannot be read as text. To be called before slow imports."""
     from rtloop.configuration.text_files import read_text
 
     read_text(file)
 
 
 def _message_with_lines(error: Any) -> str:
-    """Return a text that lists the faults of a ConfigError, with their lines in its file."""
+    """Return a text that lists the faults of a ConfigError, each with its line in the file if that can be found."""
     from rtloop.configuration.toml_lines import numbered
     from rtloop.errors import fault_list
 

@@ -149,7 +149,8 @@ def run_experiments(
     Returns the exit code: 0, or 1 if a run failed, was interrupted, or the report is incomplete. `settings` are
     EXPERIMENT.KEY=VALUE; `out` is the folder for recordings and report. `comparison` is a configuration that does the
     same experiments with the same parameters; `paced` runs in real time even a driver that allows virtual time. Raises
-    ConfigError, LoopFault if no experiment can be done or nothing was recorded, and the errors of the first run.
+    ConfigError for unknown names, settings or an invalid configuration; LoopFault if no experiment can be done, nothing
+    was recorded, or Ctrl-C ends the report; and the errors of the first run.
     """
     from rtloop.experiments.planning import plan_runs
     from rtloop.experiments.registry import parse_parameters, select_experiments
@@ -193,7 +194,8 @@ def run_experiments(
 def _load_stage(config: Path, axis: str | None) -> Stage:
     """Load a configuration and print its warnings. Returns the stage of `axis`, None: the only one.
 
-    Raises ConfigError for an invalid configuration, InputFileError for one that cannot be read.
+    Raises ConfigError for an invalid configuration, an unknown axis, and several axes without a choice; InputFileError
+    for a file that cannot be read, DriverError for a missing library.
     """
     from rtloop.experiments.planning import load_stage
 
@@ -207,7 +209,9 @@ def _record_all(
 ) -> tuple[list[Path], list[str]]:
     """Record run after run until one fails or the user interrupts. Returns recordings and problems, one sentence each.
 
-    Runs that a finished run leads to follow it at once. Raises the error of the first run.
+    A run that is planned from the recording of a finished one follows it at once. An error of a run is raised if
+    nothing is recorded yet, else it becomes a problem. The errors of planning such a run, as of a full disk, are
+    raised.
     """
     from rtloop.drivers.errors import DriverError
 
@@ -237,9 +241,9 @@ def _record_all(
 def _record(
     planned: PlannedRun, folder: Path, paced: bool, interruption: Interruption, progress: RunsProgress
 ) -> RunResult:
-    """Recover recordings of killed runs in `folder`, record one run of the loop, and return its result.
+    """Recover recordings of killed runs in `folder`, record one run of the loop there, and return its result.
 
-    Raises RtloopError, DriverError if it could not start.
+    Shows the run's progress, and lets `interruption` stop it. Raises RtloopError or DriverError if it cannot start.
     """
     from rtloop.configuration.prepare import prepare
     from rtloop.supervision.recording_path import new_recording_path
@@ -313,7 +317,7 @@ class RunsProgress(StatusLine):
         self._start_s = time.monotonic()
 
     def show(self, label: str, ticks: int, planned_ticks: int) -> None:
-        """Show `ticks` of the present run's `planned_ticks`."""
+        """Show that `ticks` of the `planned_ticks` of the present run, named `label`, are done."""
         ticks = min(ticks, planned_ticks)
         done_ticks = self._done_ticks + ticks
         remaining = ""
@@ -324,11 +328,11 @@ class RunsProgress(StatusLine):
         self.update(f"{label}: {100 * ticks // planned_ticks} %   all: {total_percent} %   {remaining}")
 
     def add_run(self, ticks: int) -> None:
-        """Count a further run, which was not planned at the start."""
+        """Add a further run of `ticks` ticks, which was not planned at the start, to the total."""
         self._total_ticks += ticks
 
     def finish_run(self, planned_ticks: int) -> None:
-        """Count the present run as finished."""
+        """Count the present run, of `planned_ticks` ticks, as finished."""
         self._done_ticks += planned_ticks
 
 
@@ -339,7 +343,7 @@ def _duration_text(seconds: float) -> str:
 
 
 def _print_report(content: Mapping[str, Any], skipped: Mapping[str, str]) -> None:
-    """Print the verdicts of every experiment, and the reasons for skipped ones."""
+    """Print the verdicts of every experiment in a report's `content`, and the reasons for skipped ones, by name."""
     from rtloop.experiments.page import HEADINGS, comparison_cell, comparison_keys, format_number, second_value_cell
 
     out = console()

@@ -107,11 +107,11 @@ def import_command(
 def import_file(
     file: Path, selection: ColumnSelection, mapping: Path | None, output: Path | None, progress: Callable[[int], None]
 ) -> dict[str, Any]:
-    """Import a file by `selection`, then by a mapping file. Returns the report of the new recording.
+    """Make a recording of a file by `selection` and a mapping file, and return its report.
 
-    The options of `selection` override the mapping file.
-    Returns a `ColumnListing`, without a recording, where neither names a column. `mapping` None: a mapping file beside
-    the data, unless there is a selection. `output` None: FILE with .mcap. `progress` receives the ticks so far. Raises
+    The options of `selection` override the mapping file. Where neither names a column, no recording is made and a
+    `ColumnListing` is returned, unless `file` is an export of a recording. `mapping` None: a mapping file beside the
+    data, unless there is a selection. `output` None: FILE with .mcap. `progress` receives the ticks so far. Raises
     UnreadableData, OutputError, MissingExtra as `import_data`; InputFileError, ConfigError for the mapping file.
     """
     from rtloop.interchange.columns import find_mapping, read_mapping
@@ -134,7 +134,10 @@ def import_file(
 
 
 def _merge_selections(options: ColumnSelection, mapping: ColumnSelection) -> ColumnSelection:
-    """Return both selections as one; those options that are given have priority over the mapping file."""
+    """Return both selections as one; `options`, where they are set, have priority over those of the mapping file.
+
+    A time or a rate in `options` replaces both of the mapping file.
+    """
     overrides_time = options.time is not None or options.rate_hz is not None
     from rtloop.interchange.columns import ColumnSelection
     from rtloop.interchange.mapping import signal_name
@@ -191,9 +194,10 @@ def _print_listing(report: Mapping[str, Any]) -> None:
 
 
 def _suggest_mapping(columns: list[dict[str, Any]], time: str | None) -> list[tuple[str, str]]:
-    """Return (signal, `COLUMN [UNIT]`) for EXAMPLE_SIGNALS, each with a column of its own while there are enough.
+    """Return (signal, `COLUMN [UNIT]`) for each of EXAMPLE_SIGNALS, with another column each; fewer without columns.
 
-    A column is chosen by its unit, else it is the first that is no clock; `time` is the column of times.
+    The column is the first whose unit converts to the signal's, else the first of the others; the column `time` and
+    other clocks are left out. `columns` are those of a `ColumnListing`.
     """
     from rtloop.interchange.mapping import name_without_unit
 
@@ -207,7 +211,7 @@ def _suggest_mapping(columns: list[dict[str, Any]], time: str | None) -> list[tu
 
 
 def _is_clock(column: dict[str, Any]) -> bool:
-    """Whether a column has a unit of time, or no unit and grows evenly."""
+    """Whether a column of a `ColumnListing` has a unit of time, or no unit and values that grow evenly."""
     return _converts(column["unit"], "s") or (not column["unit"] and column["grows_evenly"])
 
 
@@ -222,12 +226,12 @@ def _converts(unit: str | None, target: str) -> bool:
 
 
 def _range_cells(column: Mapping[str, Any]) -> tuple[str, str]:
-    """Return the texts of a column's least and largest value."""
+    """Return the texts of a column's least and largest value; "–" for a value that is None."""
     return format_number(column["least"], ".6g"), format_number(column["largest"], ".6g")
 
 
 def _print_description(out: Console, about: Mapping[str, str]) -> None:
-    """Print the facts that a file states about itself."""
+    """Print the facts that a file states about itself, `about` by their names, one a line."""
     for name, text in about.items():
         out.print(f"{escape(name)}: {escape(text)}")
 

@@ -79,7 +79,10 @@ def init(folder: Path, kind: str, name: str | None, config: Path | None, **figur
 
 
 def _require_in_folder(config: Path, folder: Path, kind: str) -> None:
-    """Raise UsageError for a configuration in another folder, from which its relative paths would point elsewhere."""
+    """Raise UsageError unless `kind` is "law" and the configuration lies in `folder`.
+
+    From another folder, its relative paths would point elsewhere.
+    """
     if kind != "law":
         raise click.UsageError(f"--config: not allowed with --kind {kind}; allowed with --kind law")
     if config.resolve().parent != folder.resolve():
@@ -87,9 +90,11 @@ def _require_in_folder(config: Path, folder: Path, kind: str) -> None:
 
 
 def _starter(kind: str, name: str | None, config: Path | None, figures: dict[str, float]) -> Starter:
-    """Return the files of a kind. Raises UsageError for an option that belongs to another kind, or is out of range.
+    """Return the files of a kind, not yet written, and the commands that come next.
 
-    `config` is the configuration for a law, or None. Raises RtloopError where it is unreadable or invalid.
+    `name` is that of a law or driver, None: the default; `config` is the configuration for a law, None: the paper's;
+    `figures` are the given options of a stage. Raises UsageError for an option that belongs to another kind or is out
+    of range, RtloopError for a configuration that is unreadable or invalid.
     """
     from rtloop.starters import folder
     from rtloop.starters.stage_figures import stage_figures

@@ -55,8 +55,9 @@ def new(name: str, out: Path) -> None:
 def list_laws() -> list[dict[str, Any]]:
     """Return for each registered kind {kind, slot, about (the docstring's first line), shipped, problem, defined_in}.
 
-    `problem` is the reason that prevents its use; slot and about are then None. Laws of other packages run first in the
-    limited process, which is killed if a law does not return.
+    `slot` is "controller" or "feedforward", `defined_in` the module. `problem` is the reason that prevents the law's
+    use, else None; with a problem, slot and about are None. Laws of other packages run first in the limited process,
+    which is killed if a law does not return.
     """
     from rtloop.laws.limited.trial import try_limited
     from rtloop.laws.registry import BUILT_IN, find_law, kinds, law_class
@@ -80,7 +81,7 @@ def list_laws() -> list[dict[str, Any]]:
 
 
 def _print_laws(entries: Sequence[dict[str, Any]]) -> None:
-    """Print the registered kinds as a table."""
+    """Print the entries of `list_laws` as a table, and how to write a law."""
     rows = table("kind", "slot", "what it is", "comes with", words=(1, 2, 3))
     for entry in entries:
         about = f"[red]{escape(entry['problem'])}[/]" if entry["problem"] else escape(entry["about"] or "")

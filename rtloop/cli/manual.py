@@ -50,7 +50,7 @@ def commands(context: click.Context) -> Iterator[click.Context]:
 
 
 def man_page(context: click.Context) -> str:
-    """Return the man page of a command in troff."""
+    """Return the man page of the command in a click context, in troff."""
     command, path = context.command, context.command_path
     sections = {
         "NAME": f"{_escape(path.replace(' ', '-'))} \\- {_escape(command.get_short_help_str(limit=200).rstrip('.'))}",
@@ -65,14 +65,14 @@ def man_page(context: click.Context) -> str:
 
 
 def _option_records(context: click.Context) -> list[tuple[str, str]]:
-    """Return (option, help) of each option of a command that is not hidden."""
+    """Return (option with its value, help) of each option of a command, without hidden options."""
     options = (part for part in context.command.get_params(context) if isinstance(part, click.Option))
     records = (option.get_help_record(context) for option in options)
     return [record for record in records if record is not None]
 
 
 def _command_records(context: click.Context) -> list[tuple[str, str]]:
-    """Return (name, short help) of each command of a group; [] for another command."""
+    """Return (name, short help) of each command in a group, without hidden ones; [] for a command that is no group."""
     if not isinstance(context.command, click.Group):
         return []
     children = ((name, context.command.get_command(context, name)) for name in context.command.list_commands(context))
@@ -87,7 +87,7 @@ def _see_also(context: click.Context) -> str:
 
 
 def _definitions(records: list[tuple[str, str]]) -> str:
-    """Return a list of terms with their texts in troff."""
+    """Return a troff list of `records`, (term, text) each; "" without records."""
     return "\n".join(f".TP\n\\fB{_escape(term)}\\fR\n{_escape(text)}" for term, text in records)
 
 

@@ -34,7 +34,7 @@ class InputFile(click.File):
         super().__init__(encoding="utf-8", errors="replace")
 
     def convert(self, value: Any, param: Any, ctx: Any) -> Any:
-        """Return the open file. Raises UnreadableInput if it cannot be opened."""
+        """Return the file at the path `value`, open for reading text. Raises UnreadableInput if it cannot be opened."""
         try:
             return super().convert(value, param, ctx)
         except click.BadParameter as error:
@@ -82,7 +82,7 @@ class NumberList(click.ParamType):
     name = "numbers"
 
     def convert(self, value: Any, param: Any, ctx: Any) -> tuple[float, ...]:
-        """Return the numbers. Fails with a usage error for any other text."""
+        """Return the numbers in a text; a tuple is returned as it is. Fails with a usage error for any other text."""
         if isinstance(value, tuple):
             return value
         try:
@@ -95,6 +95,6 @@ class PositiveFloat(click.FloatRange):
     """A number above 0; NaN is refused."""
 
     def convert(self, value: Any, param: Any, ctx: Any) -> float:
-        """Return the number. Fails with a usage error for any other value."""
+        """Return `value` as a number. Fails with a usage error for NaN and for a number outside the type's range."""
         number = super().convert(value, param, ctx)
         return self.fail(f"value is {value}; allowed: a number above 0", param, ctx) if math.isnan(number) else number

@@ -38,9 +38,10 @@ def panel_options(command: Any) -> Any:
 
 
 def panel_process(config: Path, enabled: bool, port: int, name: str | None = None) -> AbstractContextManager[None]:
-    """Return a context with the panel of a configuration's service in a second process, if `enabled`; else without.
+    """Return a context that runs the panel of the service of a configuration in a second process.
 
-    `name` replaces the service's name. Raises ConfigError for an invalid configuration.
+    Without `enabled`, the context does nothing. `name` replaces the name that the configuration gives the service.
+    Raises ConfigError for an invalid configuration, InputFileError for one that cannot be read.
     """
     if not enabled:
         return nullcontext()

@@ -79,7 +79,7 @@ def cut(
 
 
 def _print_recovery(report: dict[str, Any]) -> None:
-    """Print the extent of the recovered file, and its missing ticks."""
+    """Print the number of recovered ticks, the missing ticks and problems; or that nothing had to be recovered."""
     out, original, output = console(), escape(report["recording"]), escape(report["output"])
     if report["complete"] and not report["gaps"] and not report["problems"]:
         out.print(f"{original} is complete, nothing had to be recovered; {output} is a copy")
@@ -91,7 +91,7 @@ def _print_recovery(report: dict[str, Any]) -> None:
 
 
 def _print_cut(report: dict[str, Any]) -> None:
-    """Print the stretch in the new file, and its missing ticks."""
+    """Print the range of ticks in the new recording, its missing ticks and problems."""
     out = console()
     span = f"{report['first']} to {report['end'] - 1}"
     if report["begin"] < report["first"]:

@@ -139,9 +139,10 @@ def recording_resonance(run: Path, axis: str | None, near_hz: float | None, as_j
 
 
 def _measure(context: click.Context, request: Mapping[str, Any]) -> dict[str, Any]:
-    """Let the service measure, without options that are None, and return its response.
+    """Let the service measure a closed loop, and return its response to `/response`.
 
-    After Ctrl-C the reference is restored and LoopFault is raised. Raises as `Client.measure`.
+    `request` are the command's options; those that are None are left out. After Ctrl-C the reference is restored and
+    LoopFault is raised. Raises as `Client.measure`.
     """
     body = {name: value for name, value in request.items() if value is not None}
     return make_client(context).measure("/response", body, TIMEOUT_FACTOR * body["duration_s"] + TIMEOUT_EXTRA_S)
@@ -198,7 +199,7 @@ def _print_response(content: dict[str, Any], files: Sequence[Path]) -> None:
 
 
 def _print_resonance(content: dict[str, Any]) -> None:
-    """Print frequency and damping of the lightly damped mode with their uncertainty, and whether it is linear."""
+    """Print frequency and damping of the lightly damped mode with their uncertainty; warn if it is not linear."""
     from rtloop.analysis.measured.mode import LARGEST_MISFIT, NOT_LINEAR
 
     mode = content["resonance"]

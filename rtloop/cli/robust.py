@@ -121,7 +121,10 @@ def shape(config: Path, spec: Path | None, out: Path | None, axis: str, plot: Pa
 
 
 def _robust_as_dict(robust: RobustDesign, out: Path | None) -> dict[str, Any]:
-    """Return the JSON report of a controller with its worst figures over all certified plants."""
+    """Return the JSON report of a controller with its worst figures over all certified plants.
+
+    `out` is the configuration that was written, None if there is none.
+    """
     from rtloop.workbench.design import controller_fields
 
     controller, proof = robust.controller, robust.certificate
@@ -137,7 +140,7 @@ def _robust_as_dict(robust: RobustDesign, out: Path | None) -> dict[str, Any]:
 
 
 def _taps_as_dict(tap_design: TapDesign, files: list[Path]) -> dict[str, Any]:
-    """Return the JSON report of both rows of taps."""
+    """Return the JSON report of both rows of taps; `files` are the files that were written."""
     return {
         "taps": tap_design.taps.reference.tolist(),
         "command_taps": tap_design.taps.command.tolist(),
@@ -152,7 +155,7 @@ def _taps_as_dict(tap_design: TapDesign, files: list[Path]) -> dict[str, Any]:
 
 
 def _print_robust(robust: RobustDesign) -> None:
-    """Print the worst of each certified figure on stderr; stdout is for the section."""
+    """Print the worst value of each certified figure on stderr, which leaves stdout to the section."""
     from rtloop.design.robust.section import certified_values
 
     click.echo(

@@ -104,7 +104,10 @@ class TerminalObserver:
 
     @contextmanager
     def watch(self, prepared: Prepared) -> Iterator[Callable[[Supervisor], None]]:
-        """Show a status line while the loop runs; before the first start on a machine, a line that it compiles."""
+        """Show a status line while the loop runs; the context gives the function that updates it.
+
+        Before the first start on a machine, a line first states that code is compiled.
+        """
         from rtloop.starters.first_start import FIRST_START, is_first_start
 
         if is_first_start():

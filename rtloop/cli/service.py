@@ -80,7 +80,7 @@ def hil_serve(config: Path, on_can: bool, on_udp: bool, on_serial: bool, tied: b
     axes = [axis for axis, _ in sorted(configuration.wiring.items(), key=lambda item: item[1].output)]
     options = {"can": on_can, "udp": on_udp, "serial": on_serial}
     if sum(options.values()) > 1:
-        raise click.UsageError("--can, --udp and --serial: allowed is one of them")
+        raise click.UsageError("--can, --udp and --serial: more than one is given; allowed: one of them")
     line = next((name for name, is_chosen in options.items() if is_chosen), None)
     is_stopped = _watch_stop_signals()
     if tied:
@@ -124,8 +124,9 @@ def _serve_board(configuration: Configuration, axes: list[str], is_stopped: Call
 def _serve_node(configuration: Configuration, line: str, axes: list[str], is_stopped: Callable[[], bool]) -> None:
     """Be the node of a configuration's [driver], with `axes` in the order of outputs, until `is_stopped()`.
 
-    `line` is the driver's kind: "can", "udp" or "serial". Raises ConfigError for a driver of another kind or invalid
-    options, DriverError for a line that cannot be opened.
+    `line` is the driver's kind: "can", "udp" or "serial". Takes real-time priority for this process, prints the start
+    and the node's counts at the end, and tells systemd when it is ready. Raises ConfigError for a driver of another
+    kind or invalid options, DriverError for a line that cannot be opened or fails, and for another node on a CAN bus.
     """
     from rtloop.drivers.can.options import CanOptions
     from rtloop.drivers.node.options import NodeOptions
@@ -154,7 +155,10 @@ def _serve_node(configuration: Configuration, line: str, axes: list[str], is_sto
 
 
 def _node_program(options: CanOptions | NodeOptions) -> Callable[..., str]:
-    """Return the function that runs a node with such options until its caller stops it."""
+    """Return the function `serve(options, axes, is_stopped, on_ready)` that runs a node with options of this class.
+
+    It returns a sentence with the node's counts.
+    """
     from rtloop.drivers.can.options import CanOptions
 
     if isinstance(options, CanOptions):
@@ -169,7 +173,7 @@ def _watch_stop_signals() -> Callable[[], bool]:
     has_stopped = False
 
     def stop(*_: object) -> None:
-        """Record that a signal has come."""
+        """Handle a signal: store that it has come."""
         nonlocal has_stopped
         has_stopped = True
 

@@ -48,8 +48,9 @@ def verify_configuration(config: Path, spec: Path | None, out: Path | None, as_j
     """Judge and print every axis that has a controller; write a report to the folder `out`, if given.
 
     Returns the exit code: 1 where a loop is unstable or misses its specification, else 0. `spec` replaces the axes' own
-    specifications. Raises ConfigError for an invalid configuration, without a controller, or where python-control
-    computes other figures; OutputError, MissingExtra.
+    specifications. Raises ConfigError for an invalid configuration or specification, without a controller, or where
+    python-control computes other figures; InputFileError for a file that cannot be read, OutputError for a report that
+    cannot be written, MissingExtra for a report without matplotlib.
     """
     from rtloop.configuration.checks import Findings, check_axes
     from rtloop.configuration.file import load
@@ -102,9 +103,10 @@ def _require_second_opinion(
 
 
 def _write_report(folder: Path, name: str, verifications: Verifications, report: dict[str, Any]) -> list[Path]:
-    """Write verify.json, verify.html and the pictures of each axis to `folder`. Returns their paths.
+    """Write verify.json (`report`), verify.html and the pictures of each axis to `folder`, also over existing files.
 
-    Raises OutputError, MissingExtra without matplotlib.
+    `name` is the configuration's name in headings. Returns the paths, in this order. Raises OutputError if the system
+    refuses, MissingExtra without matplotlib.
     """
     from rtloop.design.verification.page import page
     from rtloop.design.verification.plots import draw_pictures
@@ -126,7 +128,7 @@ def _write_report(folder: Path, name: str, verifications: Verifications, report:
 
 
 def _print_verification(name: str, verification: Verification) -> None:
-    """Print every table of one axis, notes, the verdict and, on stderr, warnings."""
+    """Print every table of the axis `name`, notes, the verdict and, on stderr, warnings."""
     from rtloop.design.verification import text
 
     out = console()
@@ -156,7 +158,7 @@ def _print_verification(name: str, verification: Verification) -> None:
 
 
 def _table(lines: Sequence[Sequence[str]]) -> Table:
-    """Return a table of `lines`, headings first, all to the left, with failures in red."""
+    """Return a table of `lines`, the headings first, with all columns to the left and the verdicts in RED in red."""
     headings, *rows = lines
     cells = [[f"[red]{cell}[/]" if cell in RED else cell for cell in row] for row in rows]
     return table(*headings, rows=cells, words=range(len(headings)))

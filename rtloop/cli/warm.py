@@ -11,7 +11,9 @@ MAX_CACHES = 8
 
 
 def main() -> int:
-    """Compile all code that runs in real time for this version and processor, and print its folder. Returns 0.
+    """Compile all code that runs in real time into the cache of this version and processor. Returns 0.
+
+    Prints the cache's folder on stderr.
 
     Deletes quarantined files of the cache, and all but the newest MAX_CACHES caches.
     """

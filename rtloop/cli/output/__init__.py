@@ -17,7 +17,7 @@ def echo_json(content: Any, indent: int | None = None) -> None:
 
 
 def print_result(result: dict[str, Any], as_json: bool, print_text: Callable[[dict[str, Any]], None]) -> None:
-    """Print a result as one JSON object, or as text."""
+    """Print a result as one JSON object if `as_json`, else by `print_text`."""
     if as_json:
         echo_json(result)
     else:
