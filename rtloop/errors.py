@@ -93,18 +93,20 @@ class MissingExtra(RtloopError):
 
 
 class NoDesign(RtloopError):
-    """No controller meets the specification; the message names the failing condition and a remedy."""
+    """No controller or no taps meet the specification; the message names the failing condition and a remedy."""
 
     exit_code = 1
 
 
 class HostRefusal(RtloopError):
-    """The host refuses a privilege or resource that the configuration requires."""
+    """The host refuses a privilege or resource that the configuration requires, or a file, folder or socket is not
+    trusted, because another user made it or may change it.
+    """
 
     exit_code = 77
 
 
 class LoopFault(RtloopError):
-    """The loop tripped, lost data or failed."""
+    """The loop tripped, lost data or failed, or a measurement or change of the running loop did not succeed."""
 
     exit_code = 1

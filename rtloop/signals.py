@@ -157,7 +157,7 @@ def column_names(axes: Sequence[str], observed: Sequence[str], extras: Sequence[
 
 
 def axis_column(axis: int, signal: int) -> int:
-    """Return the column of a record with the signal number `signal` (ADC … FEED) of axis number `axis`, both from 0."""
+    """Return the index of the record's column with signal number `signal` (ADC … FEED) of axis number `axis`."""
     return COMMON_COUNT + axis * PER_AXIS_COUNT + signal
 
 

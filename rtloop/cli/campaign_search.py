@@ -58,7 +58,7 @@ def search(
 
     loaded = load_campaign(campaign, None, config)
     runner = CaseRunner(loaded)
-    with choose_workers(jobs, scheduler) as workers, StatusLine("searching", sys.stderr):
+    with choose_workers(jobs, scheduler) as workers, StatusLine("searching for the worst rig", sys.stderr):
         result = find_worst(runner, evaluate_on(workers, loaded), rigs, figure, target)
     folder = (out or default_folder(loaded)) / "worst"
     recordings = (
@@ -97,7 +97,7 @@ def boundary(
     from rtloop.campaigns.search import evaluate_on, find_boundary
 
     loaded = load_campaign(campaign, None, config)
-    with choose_workers(jobs, scheduler) as workers, StatusLine("searching", sys.stderr):
+    with choose_workers(jobs, scheduler) as workers, StatusLine(f"searching the range of {key}", sys.stderr):
         result = find_boundary(CaseRunner(loaded), key, evaluate_on(workers, loaded), tolerance)
     if as_json:
         echo_json(result)

@@ -56,10 +56,10 @@ def compensation_report(
     """Bound and simulate the hysteresis that the inverse in `config` leaves in the identified `actuator`.
 
     Returns the JSON report. Its `bounds` have a row for each choice of the gain ρ: ρ, the bound ξ (µm) and the largest
-    simulated |Ω| = |y − ρ v| (µm), y being the output for a command v. `command_um` is the largest |v| (None: the
-    axis's limit). Writes a picture to `plot`, if given. Raises ConfigError for a file without a hysteresis model of the
-    axis and for a compensator whose loading curve does not increase, InputFileError for an unreadable file, OutputError
-    and MissingExtra for the picture.
+    simulated |Ω| = |y − ρ v| (µm), y being the output for a command v. `axis` None is the first axis. `command_um` is
+    the largest |v| (None: the axis's limit). Writes a picture to `plot`, if given. Raises ConfigError for a file
+    without a hysteresis model of the axis and for a compensator whose loading curve does not increase, RecordingError
+    for an unreadable file, OutputError and MissingExtra for the picture.
     """
     import numpy as np
 

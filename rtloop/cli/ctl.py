@@ -279,12 +279,14 @@ def _parse_inline_table(text: str) -> dict[str, Any]:
         return parse_toml(f"table = {{ {text} }}")["table"]
     except ValueError:
         raise click.UsageError(
-            f"value is {text!r}; allowed: `key = value, key = value`, with values as in TOML"
+            f"{text!r} is no list of keys; allowed: `key = value, key = value`, with values as in TOML"
         ) from None
 
 
 def print_preview(axis: str, answer: dict[str, Any]) -> None:
-    """Print `answer`, a response of `/preview`: figures of the running loop and after the change, and its problems."""
+    """Print `answer`, a response of `/preview`: figures of the running loop and after the change, and the problems of
+    the change.
+    """
     out, before, after = console(), answer["before"], answer["after"]
     rows = table(f"axis {axis}, on the model", "now", "after the change", "")
     for label, key, unit in FIGURES:

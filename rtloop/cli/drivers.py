@@ -43,7 +43,7 @@ def drivers(
 
     The test measures gain, offset, noise, delay and the highest rate, and the exchange with a node.
 
-    The self-test moves outputs: disconnect fragile loads first.
+    The self-test moves outputs: disconnect fragile loads first. Exit 1 where it fails.
     """
     if config is None:
         entries = list_drivers()

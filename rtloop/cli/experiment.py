@@ -83,7 +83,7 @@ def list_experiments() -> None:
         out.print(f"  {entry.description}")
         for name, field in entry.options.model_fields.items():
             value = list(field.default) if isinstance(field.default, tuple) else field.default
-            text = "…  (follows the axis)" if value is None else value
+            text = "…  (by default fitted to the axis)" if value is None else value
             out.print(f"  --set {entry.name}.{name}={text}", style="dim", markup=False)
 
 

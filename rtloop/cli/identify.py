@@ -59,6 +59,8 @@ def hysteresis(runs: tuple[Path, ...], out: Path | None, plot: Path | None, as_j
     Other recordings are accepted too, also a part of a loop from any start. Samples before the actuator's memory is
     known are then left out, and so are plays that no later stroke has moved. The error is stated for data held out of
     the fit.
+
+    Exit 1 where the model has no inverse, unless --weights free allows it.
     """
     from rtloop.design.identification.model_sections import require_new
     from rtloop.workbench.hysteresis import fit_hysteresis

@@ -13,9 +13,8 @@ MAX_CACHES = 8
 def main() -> int:
     """Compile all code that runs in real time into the cache of this version and processor. Returns 0.
 
-    Prints the cache's folder on stderr.
-
-    Deletes quarantined files of the cache, and all but the newest MAX_CACHES caches.
+    Deletes quarantined files of the cache, and all but the newest MAX_CACHES caches. Prints the cache's folder on
+    stderr.
     """
     from rtloop.engine.assembly import rehearse
     from rtloop.foundation.native import cache_files as stored
@@ -35,7 +34,7 @@ def main() -> int:
 
 
 def _rehearse_other_processes() -> None:
-    """Compile the functions that recorder, service, board and replay use besides the loop."""
+    """Compile the functions that recorder, service, board and replay use besides the loop, mostly by calling them."""
     import numpy as np
 
     from rtloop.drivers.comedi import comedi_read, comedi_write

@@ -171,7 +171,8 @@ def _measure_stage(client: Client, request: RetuneRequest, subject: Subject) -> 
     mode, gain = content["resonance"], content["gain"]
     if mode is None:
         raise LoopFault(
-            "retune: no lightly damped mode stands out near the model's frequency; the taps stay as they are"
+            f"retune: no lightly damped mode stands out near the model's {model_hz[0]:.4g} Hz; the taps stay as they "
+            "are; use a larger amplitude, or identify the model again"
         )
     percent = 100 * (mode["hz"] / model_hz[0] - 1)
     _require_near(f"resonance is at {mode['hz']:.2f} Hz", percent, request.bound_percent)
@@ -195,8 +196,8 @@ def _require_near(quantity_text: str, percent: float, bound_percent: float) -> N
 
 
 def _is_better(subject: Subject, before: StepMeasures, after: StepMeasures) -> bool:
-    """Return whether new taps settle sooner by more than 1/PROOF_POINTS of a tick, or keep a limit that the old ones
-    break: the specification's overshoot, or the limits of the command v.
+    """Return whether the new taps are better: they settle sooner by more than 1/PROOF_POINTS of a tick, or the old ones
+    exceed the specification's overshoot or the limits of the command v, and the new ones do so less or not at all.
     """
     point_ms = 1e3 * subject.controller.period_s / PROOF_POINTS
     return (

@@ -6,7 +6,7 @@ from typing import IO, Self
 
 
 class StatusLine:
-    """A line that states the present activity."""
+    """A line on the terminal that states the present activity while a `with` block runs."""
 
     def __init__(self, text: str, stream: IO[str]) -> None:
         """Make the line, which a `with` block shows; without a terminal on `stream`, no line is shown."""

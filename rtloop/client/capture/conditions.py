@@ -52,16 +52,18 @@ class Condition(Protocol):
 
 
 class Crossing:
-    """Detector of the first fired sample after a ready one; samples that are neither may lie between them."""
+    """Detector for conditions with hysteresis: a sample that is "fired" meets the condition if the last sample before
+    it that was "ready" or "fired" was "ready".
+    """
 
     def __init__(self) -> None:
         self._ready = False
 
     def find(self, is_ready: Mask, is_fired: Mask, gap: bool) -> Indices:
-        """Return the indices where `is_fired` first holds after `is_ready` did; the two never hold together.
+        """Return the indices at which `is_fired` is True for the first time after `is_ready` was True, ascending.
 
-        Both masks are (n,); the detector continues from the batch before. With `gap`, ticks before this batch were
-        lost: the state before them counts only if `is_fired` holds at index 0.
+        Both masks are (n,) and never True together; the detector continues from the batch before. With `gap`, ticks
+        before this batch were lost: the state before them counts only if `is_fired` holds at index 0.
         """
         indices = np.flatnonzero(is_ready | is_fired)
         if gap and not is_fired[0]:

@@ -55,8 +55,8 @@ class Sweep(NamedTuple):
 @dataclass(frozen=True)
 class Settings:
     """Settings of a trigger: sweeps of `ticks` ticks, `pre_percent` of them before the trigger (0 puts the trigger at
-    the first tick, 100 at the last). A trigger counts `holdoff_ticks` after the trigger before it or later; in mode
-    auto a sweep begins after `auto_ticks` without a trigger. Raises ValueError for a value outside its range.
+    the first tick, 100 at the last). No sweep is triggered within `holdoff_ticks` after a sweep's trigger; in mode auto
+    one begins after `auto_ticks` without a trigger. Raises ValueError for a value outside its range.
     """
 
     ticks: int

@@ -78,7 +78,10 @@ class Reader:
         ring, columns = mapping.tick_ring(), tuple(self._read_columns())
         capacity, width = ring.slots.shape
         if len(columns) != width:
-            raise UnavailableError(f"{self._path}: ticks have {width} signals, but the service names {len(columns)}")
+            raise UnavailableError(
+                f"{self._path}: ticks have {width} signals, but the service names {len(columns)}; if the service was "
+                "just started again, try again; else use the same version of rtloop as the service"
+            )
         if self._mapping is None:
             self._cursor = max(int(ring.head[0]) - capacity + capacity // CLEARANCE, 0)
         else:

@@ -136,8 +136,10 @@ class Events:
             row.number, row.event = self.newest, event
 
     def _matching_late_row(self, event: Event) -> tuple[EventRow, LateEpisodes] | None:
-        """Return the row for an event of late ticks: the newest row if it is one of late ticks, and for the end of an
-        episode the row of its beginning; None if there is none.
+        """Return the row of late ticks that an event of the kind LATE_KIND or LATE_END_KIND extends, with its episodes.
+
+        For LATE_END_KIND it is the newest row of late ticks in the event's run; for LATE_KIND only if no other row came
+        after it. None if there is no such row.
         """
         if self._late_row is None or self._late_row[0].event["run"] != event["run"]:
             return None

@@ -18,7 +18,7 @@ def find_axis(signal: str, axes: Iterable[str]) -> str | None:
 
 
 def reference_signal(axis: str) -> str:
-    """Return the name of an axis's reference signal."""
+    """Return the name of the signal with the reference of the axis of this name."""
     return f"{axis}_reference_um"
 
 

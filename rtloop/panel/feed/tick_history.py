@@ -87,9 +87,7 @@ class TickHistory:
     def values(self, signals: Sequence[str], first: int, end: int) -> Real:
         """Return a copy of ticks `first` … `end` − 1, (signals, end − first), in the order of `signals`.
 
-        NaN for lost, too old and future ticks.
-
-        Raises ValueError for an unknown signal.
+        NaN for lost, too old and future ticks. Raises ValueError for an unknown signal.
         """
         return self.history.values_between(first, end, self._rows(signals))
 

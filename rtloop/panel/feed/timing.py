@@ -101,7 +101,10 @@ class Timing:
         )
 
     def _current_second(self, number: int) -> TimingSecond:
-        """Return the figures of a second, new ones if it has just begun; a clock that went back clears the others."""
+        """Return the figures of second `number` of the run, new ones if it has just begun.
+
+        A number below the newest one, of a clock that went back, discards all other figures.
+        """
         if self._seconds and number < self._seconds[-1].number:
             self._seconds.clear()
         if not self._seconds or self._seconds[-1].number != number:

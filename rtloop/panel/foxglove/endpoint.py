@@ -63,7 +63,7 @@ class Foxglove:
         return WebSocketRoute(PATH, self.serve)
 
     def admits(self, scope: Scope) -> bool:
-        """Return whether a request comes from a viewer with the token; its origin does not matter."""
+        """Return whether a request is a WebSocket to PATH with the token in its address, whatever its origin."""
         if scope["type"] != "websocket" or scope["path"] != PATH:
             return False
         tokens = parse_qs(scope["query_string"].decode("latin-1"), max_num_fields=8).get("token", [""])
@@ -153,7 +153,9 @@ class _Viewer:
             return self._digest.names, self._digest.generation, self._digest.take()
 
     async def _send_event(self, now_ns: int) -> None:
-        """Send the oldest unsent event, if there is one, stamped `now_ns` (UNIX); at most EVENTS_HZ a second."""
+        """Send the oldest unsent event with the UNIX time `now_ns`; nothing without one, or within 1/EVENTS_HZ of the
+        last.
+        """
         if self._clock() < self._event_due_s:
             return
         if not (events := self._feed.events.events_after(self._sent_number)):

@@ -55,7 +55,7 @@ def with_error_responses(handler: Handler) -> Handler:
 
 
 def status_code(error: Exception) -> int:
-    """Return the HTTP status for an error: its own code, 503 for an absent or busy service, else 422."""
+    """Return the HTTP status for an error: a RequestRefused's code, 503 for an absent or busy service, else 422."""
     if isinstance(error, RequestRefused):
         return error.code
     return 503 if isinstance(error, TooManyRequests | UnavailableError) else 422

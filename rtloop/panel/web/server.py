@@ -45,9 +45,9 @@ def serve(control: Path, port: int, token_file: Path | None, print_address: Call
           foxglove: bool = False) -> int:  # fmt: skip
     """Serve the panel of the service at `control` on 127.0.0.1:`port` until SIGINT or SIGTERM. Returns 0.
 
-    `print_address` receives the address with the token, and with `foxglove` that for viewers. The process gets a low
-    CPU priority. Raises UnavailableError for a used port, OutputError for a token file that cannot be read or made,
-    HostRefusal for an untrusted one.
+    `port` 0 is any free one. `token_file` None: a new token for each start. `print_address` receives the address with
+    the token, and with `foxglove` that for viewers. The process gets a low CPU priority, and handles both signals.
+    Raises UnavailableError for a used port, and OutputError and HostRefusal as `read_or_make_token`.
     """
     token = secrets.token_urlsafe(TOKEN_BYTES) if token_file is None else read_or_make_token(token_file)
     listener = _listen(port)
