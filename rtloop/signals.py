@@ -144,7 +144,7 @@ TRIP_MASK = ~0xFF & 0xFFFFFFFF
 
 
 def column_names(axes: Sequence[str], observed: Sequence[str], extras: Sequence[str] = ()) -> tuple[str, ...]:
-    """Return the names of a record's columns in order: the common signals, those of each axis, `extras`, `observed`.
+    """Return the names of a record's columns in order: common signals, signals of each axis, `extras`, `observed`.
 
     `axes` are names such as "x", whose signals are `x_adc_v`, …; `extras` and `observed` are whole names.
     """

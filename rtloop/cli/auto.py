@@ -112,7 +112,7 @@ def write_robust_design(
 ) -> RobustChain:  # fmt: skip
     """Write a configuration as `write_design` does, with a controller that damps the resonance, and with taps.
 
-    The parameters are those of `write_design`; `progress` receives lines of text. Returns and raises as `write_design`;
+    Takes the parameters of `write_design`, and `progress`, which receives lines of text. Returns and raises as it does;
     where a controller exists and taps do not, it writes the configuration without taps, and raises NoDesign.
     """
     from rtloop.design.chain import identify_stage

@@ -149,7 +149,7 @@ def run_experiments(
     Returns the exit code: 0, or 1 if a run failed, was interrupted, or the report is incomplete. `settings` are
     EXPERIMENT.KEY=VALUE; `out` is the folder for recordings and report. `comparison` is a configuration that does the
     same experiments with the same parameters; `paced` runs in real time even a driver that allows virtual time. Raises
-    ConfigError for unknown names, settings or an invalid configuration; LoopFault if no experiment can be done, nothing
+    ConfigError for unknown names, settings or an invalid configuration; LoopFault if no experiment can be done, no run
     was recorded, or Ctrl-C ends the report; and the errors of the first run.
     """
     from rtloop.experiments.planning import plan_runs
@@ -209,8 +209,8 @@ def _record_all(
 ) -> tuple[list[Path], list[str]]:
     """Record run after run until one fails or the user interrupts. Returns recordings and problems, one sentence each.
 
-    A run that is planned from the recording of a finished one follows it at once. An error of a run is raised if
-    nothing is recorded yet, else it becomes a problem. The errors of planning such a run, as of a full disk, are
+    A run that is planned from the recording of a finished one follows it at once. An error of a run is raised if no
+    run is recorded yet, else it becomes a problem. The errors of planning such a run, as of a full disk, are
     raised.
     """
     from rtloop.drivers.errors import DriverError

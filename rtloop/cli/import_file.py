@@ -134,9 +134,9 @@ def import_file(
 
 
 def _merge_selections(options: ColumnSelection, mapping: ColumnSelection) -> ColumnSelection:
-    """Return both selections as one; `options`, where they are set, have priority over those of the mapping file.
+    """Return both selections as one; `options`, where they are set, have priority over `mapping`.
 
-    A time or a rate in `options` replaces both of the mapping file.
+    A time or a rate in `options` replaces both of `mapping`.
     """
     overrides_time = options.time is not None or options.rate_hz is not None
     from rtloop.interchange.columns import ColumnSelection
@@ -197,7 +197,7 @@ def _suggest_mapping(columns: list[dict[str, Any]], time: str | None) -> list[tu
     """Return (signal, `COLUMN [UNIT]`) for each of EXAMPLE_SIGNALS, with another column each; fewer without columns.
 
     The column is the first whose unit converts to the signal's, else the first of the others; the column `time` and
-    other clocks are left out. `columns` are those of a `ColumnListing`.
+    other clocks are left out. `columns` is the key of a `ColumnListing`.
     """
     from rtloop.interchange.mapping import name_without_unit
 

@@ -92,7 +92,7 @@ def _require_in_folder(config: Path, folder: Path, kind: str) -> None:
 def _starter(kind: str, name: str | None, config: Path | None, figures: dict[str, float]) -> Starter:
     """Return the files of a kind, not yet written, and the commands that come next.
 
-    `name` is that of a law or driver, None: the default; `config` is the configuration for a law, None: the paper's;
+    `name` names a law or driver, None: the default; `config` is the configuration for a law, None: the paper's;
     `figures` are the given options of a stage. Raises UsageError for an option that belongs to another kind or is out
     of range, RtloopError for a configuration that is unreadable or invalid.
     """

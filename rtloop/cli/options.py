@@ -82,7 +82,7 @@ class NumberList(click.ParamType):
     name = "numbers"
 
     def convert(self, value: Any, param: Any, ctx: Any) -> tuple[float, ...]:
-        """Return the numbers in a text; a tuple is returned as it is. Fails with a usage error for any other text."""
+        """Return the numbers in a text; a tuple is returned unchanged. Fails with a usage error for any other text."""
         if isinstance(value, tuple):
             return value
         try:

@@ -40,7 +40,7 @@ def panel_options(command: Any) -> Any:
 def panel_process(config: Path, enabled: bool, port: int, name: str | None = None) -> AbstractContextManager[None]:
     """Return a context that runs the panel of the service of a configuration in a second process.
 
-    Without `enabled`, the context does nothing. `name` replaces the name that the configuration gives the service.
+    Without `enabled`, the context has no effect. `name` replaces the name that the configuration gives the service.
     Raises ConfigError for an invalid configuration, InputFileError for one that cannot be read.
     """
     if not enabled:

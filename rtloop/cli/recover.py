@@ -79,7 +79,7 @@ def cut(
 
 
 def _print_recovery(report: dict[str, Any]) -> None:
-    """Print the number of recovered ticks, the missing ticks and problems; or that nothing had to be recovered."""
+    """Print the number of recovered ticks, the missing ticks and problems; or that the recording was complete."""
     out, original, output = console(), escape(report["recording"]), escape(report["output"])
     if report["complete"] and not report["gaps"] and not report["problems"]:
         out.print(f"{original} is complete, nothing had to be recovered; {output} is a copy")

@@ -39,7 +39,7 @@ class Condition(Protocol):
     def find(self, values: Real, gap: bool) -> Indices:
         """Return the indices in `values` (n,), n > 0, that meet the condition, ascending; [] if none does.
 
-        `values` follow those of the call before. `gap`: ticks between the two were lost.
+        `values` follow the values of the call before. `gap`: ticks between the two were lost.
         """
         ...
 

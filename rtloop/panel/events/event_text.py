@@ -36,7 +36,7 @@ class RunState:
     def describe_change(self, event: Event) -> str:
         """Return the text of the run's next event, and store its reference or mode for the next change.
 
-        The text is such as `0 µm → 12.5 µm` or `closed loop → off`; without a known old value, that of `event_text`.
+        The text is such as `0 µm → 12.5 µm` or `closed loop → off`; without a known old value, as by `event_text`.
         """
         kind, text = event["kind"], event_text(event, unit=" V" if self._mode == RAW else UM)
         if kind == "set_reference":

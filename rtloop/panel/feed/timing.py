@@ -55,7 +55,7 @@ class Timing:
         self._count(self._batch.add(stretch))
 
     def _count(self, stretch: Stretch | None) -> None:
-        """Add each tick of a stretch to the figures of the second in which it was due; None adds nothing."""
+        """Add each tick of a stretch to the figures of the second in which it was due; None has no effect."""
         if stretch is None:
             return
         seconds = (stretch[_DEADLINE] // 1_000_000_000).astype(np.int64)

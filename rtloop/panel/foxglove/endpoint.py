@@ -153,9 +153,7 @@ class _Viewer:
             return self._digest.names, self._digest.generation, self._digest.take()
 
     async def _send_event(self, now_ns: int) -> None:
-        """Send the oldest unsent event with the UNIX time `now_ns`; nothing without one, or within 1/EVENTS_HZ of the
-        last.
-        """
+        """Send the oldest unsent event, if there is one, with the UNIX time `now_ns`; at most EVENTS_HZ a second."""
         if self._clock() < self._event_due_s:
             return
         if not (events := self._feed.events.events_after(self._sent_number)):

@@ -30,7 +30,7 @@ class ProcessFailed(RtloopError):
 
 
 class ProcessRunner:
-    """Runs Python modules as processes: at most `max_running` at a time, `max_unfinished` with those that wait.
+    """Runs Python modules as processes: at most `max_running` at a time, `max_unfinished` including the waiting ones.
 
     Each is killed after `timeout_s` seconds, not counting its wait.
     """

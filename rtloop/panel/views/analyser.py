@@ -77,6 +77,6 @@ class Analyser:
         )
 
     def _average(self, batch: Stretch | None) -> None:
-        """Add a batch of ticks to the averages of the spectrum; None adds nothing."""
+        """Add a batch of ticks to the averages of the spectrum; None has no effect."""
         if batch is not None:
             self._spectrum.feed(batch[self._subscription.signal], batch.periods(self._rate_hz))

@@ -122,7 +122,7 @@ class Viewer:
         """Apply the validated `value` of a message's field `name`: a subscription, a setting or an action.
 
         Before the first loop, a subscription is only stored. An action with the value False, or without the view that
-        it concerns, does nothing. Raises ValueError as `_build`.
+        it concerns, has no effect. Raises ValueError as `_build`.
         """
         match name:
             case "view" | "spectrum" | "xy":
