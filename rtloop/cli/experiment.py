@@ -105,7 +105,10 @@ def run(names: tuple[str, ...], **options: Any) -> int:
 @run_options
 @report_errors
 def run_all(**options: Any) -> int:
-    """Run every experiment that the driver of CONFIG allows."""
+    """Run every experiment that the driver of CONFIG allows.
+
+    Records and reports as `rtloop experiment run`. Exit 1 where an experiment could not be finished.
+    """
     from rtloop.experiments.registry import EXPERIMENTS
 
     return run_experiments(tuple(EXPERIMENTS), **options)
@@ -124,7 +127,7 @@ experiment.add_command(
 def report(runs: tuple[Path, ...], out: Path | None, as_json: bool) -> int:
     """Analyse recordings of experiments again.
 
-    RUN is a recording or a folder of them. Exit 1 where the report is not complete.
+    Writes and prints the report. RUN is a recording or a folder of them. Exit 1 where the report is not complete.
     """
     from rtloop.recording.errors import RecordingError
 

@@ -74,7 +74,10 @@ def export(
 def plot(
     files: tuple[Path, ...], out: Path | None, start_s: float, end_s: float | None, html: bool, as_json: bool
 ) -> None:
-    """Draw signals, timing and events of a recording."""
+    """Draw signals, timing and events of a recording.
+
+    Writes a picture, or with --html a page, and prints its path; problems of the recording are printed on stderr.
+    """
     from rtloop.recording.load import load
     from rtloop.recording.views.page import write_page
     from rtloop.recording.views.plot import plot as plot_recording
