@@ -89,8 +89,8 @@ def test_check_prints_the_line_of_a_fault(tmp_path: Path, old: str, new: str, at
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (("tune", "x", "limits", "drive_v="), "value is 'drive_v='; allowed: `key = value, key = value`"),
-        (("tune", "x", "limits", "{"), "value is '{'; allowed: `key = value, key = value`"),
+        (("tune", "x", "limits", "drive_v="), "'drive_v=' is no list of keys; allowed: `key = value, key = value`"),
+        (("tune", "x", "limits", "{"), "'{' is no list of keys; allowed: `key = value, key = value`"),
     ],
 )
 def test_a_usage_error_quotes_the_argument(arguments: tuple[object, ...], message: str) -> None:
