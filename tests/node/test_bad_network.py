@@ -154,6 +154,7 @@ DRIVE_5, SAMPLE_5 = ("drive", 5), ("sample", 5)
         ({DRIVE_5: (Copy(), Copy())}, [0, 0, 0, 0, 0, 0]),
         ({DRIVE_5: (Copy(), Copy(2))}, [0, 0, 0, 0, 0, 0]),
         ({SAMPLE_5: (Copy(), Copy())}, [0, 0, 1, 0, 0, 0]),
+        ({SAMPLE_5: (Copy(), Copy(), Copy())}, [0, 0, 2, 0, 0, 0]),
         ({SAMPLE_5: (Copy(3), Copy(4))}, [0, 1, 1, 0, 0, 1]),
         ({DRIVE_5: (Copy(0, "bits"),)}, [1, 0, 0, 0, 0, 1]),
         ({SAMPLE_5: (Copy(0, "bits"),)}, [1, 0, 0, 1, 0, 1]),
