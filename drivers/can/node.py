@@ -67,7 +67,9 @@ class RigNode:
                 message.arbitration_id == self._exchange.sample.identifier
                 or self._foreign_node_state(message) is not None
             ):
-                raise DriverError(f"{self._options.label}: another node answers on this bus already")
+                raise DriverError(
+                    f"{self._options.label}: another rtloop node is on this bus already; stop it, or use another bus"
+                )
         self._serving = True
 
     def _foreign_node_state(self, message: can.Message) -> float | None:

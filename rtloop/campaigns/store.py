@@ -45,7 +45,7 @@ def arrow() -> Any:
         import pyarrow
         import pyarrow.parquet
     except ImportError:
-        raise MissingExtra("a campaign needs pyarrow; install rtloop with the extra 'campaign'") from None
+        raise MissingExtra("a campaign needs pyarrow; install it with pip install 'rtloop[campaign]'") from None
     return pyarrow
 
 

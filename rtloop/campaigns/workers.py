@@ -125,7 +125,9 @@ class DaskWorkers:
         try:
             from distributed import Client
         except ImportError:
-            raise MissingExtra("a scheduler needs dask.distributed; install rtloop with the extra 'campaign'") from None
+            raise MissingExtra(
+                "a scheduler needs dask.distributed; install it with pip install 'rtloop[campaign]'"
+            ) from None
         self._owns_client = not isinstance(scheduler, Client)
         if self._owns_client:
             _require_reachable(scheduler)

@@ -115,7 +115,9 @@ def swap_proposal(client: Client, axis: str, proposal: str, as_json: bool) -> in
 def _print_proposal(proposal: Proposal) -> None:
     """Print measured resonance and gain, and figures of a step with the old taps and the new ones."""
     mode, percent, gain, gain_percent = proposal.stage
-    click.echo(f"resonance {mode['hz']:.2f} ± {mode['hz_std']:.2f} Hz, {percent:+.2f} % from the model's")
+    click.echo(
+        f"resonance {mode['hz']:.2f} ± {mode['hz_std']:.2f} Hz (standard deviation), {percent:+.2f} % from the model's"
+    )
     if gain is None:
         click.echo("gain not measured; the model's gain is used")
     else:
@@ -123,7 +125,9 @@ def _print_proposal(proposal: Proposal) -> None:
         if gain_percent is not None:
             distance = f"{gain_percent:+.2f} % from the model's"
         span = f"between {gain['from_um']:.4g} and {gain['to_um']:.4g} µm"
-        click.echo(f"static gain of the plant {gain['value']:.4f} ± {gain['std']:.4f} {span}, {distance}")
+        click.echo(
+            f"static gain of the plant {gain['value']:.4f} ± {gain['std']:.4f} (standard deviation) {span}, {distance}"
+        )
     step_table = table("step from the held reference", "settling / ms", "overshoot / %", "largest v per unit")
     rows = {
         "with the taps in force": proposal.before,

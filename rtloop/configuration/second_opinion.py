@@ -243,7 +243,8 @@ def disagreements(loop: Loop, opinion: Opinion) -> list[str]:
     difference = float(np.abs(position - opinion.position).max())
     if not difference <= STEP_TOLERANCE:
         faults.append(
-            f"step: differs by {difference:.3g} of its height from python-control's; allowed: {STEP_TOLERANCE:g}"
+            f"step response: rtloop and python-control differ by {difference:.3g} of the step's height; allowed: "
+            f"{STEP_TOLERANCE:g}"
         )
     return faults
 

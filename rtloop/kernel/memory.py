@@ -183,7 +183,9 @@ def _rules(record: np.dtype[Any], allowed: Rules) -> npt.NDArray[Any]:
     rules = np.zeros(len(allowed), RULE)
     for rule, (name, limits) in zip(rules, allowed.items(), strict=True):
         if isinstance(limits, Bits):
-            raise ValueError(f"the rule for the coefficient {name} is {limits}; allowed: a range")
+            raise ValueError(
+                f"coefficient {name}: its allowed values are given as bits ({limits}); allowed: a range, as Allowed"
+            )
         kind, offset, *_ = record.fields[str(name)]  # type: ignore[index]
         rule["offset"], rule["octets"], rule["count"] = offset, kind.base.itemsize, max(int(np.prod(kind.shape)), 1)
         rule["low"], rule["high"], rule["step"] = limits
@@ -198,7 +200,8 @@ def require_owners(controller_axes: Sequence[int]) -> None:
     owned_axes = 0
     for number, count in enumerate(controller_axes):
         if (count == 0) != (number < owned_axes):
-            raise ValueError(f"controller_axes of axis {number} is {count}; each axis needs exactly one controller")
+            owners = "no controller" if count == 0 else "two controllers"
+            raise ValueError(f"axis {number} has {owners} (controller_axes is {count}); allowed: exactly one")
         owned_axes = max(owned_axes, number + count)
 
 

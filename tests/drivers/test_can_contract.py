@@ -176,5 +176,5 @@ def test_a_bus_that_fails_at_its_closing_is_closed(node, monkeypatch: pytest.Mon
 
 
 def test_a_second_node_is_refused(node):
-    with pytest.raises(DriverError, match="another node answers on this bus already"):
+    with pytest.raises(DriverError, match="another rtloop node is on this bus already"):
         serve(options_on(node.port), ["x"], lambda: True)

@@ -38,7 +38,7 @@ def test_a_valid_header_is_accepted(tmp_path: Path):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"columns": ["deadline_ns", "tick", "u"]}, "allowed: tick and deadline_ns first"),
+        ({"columns": ["deadline_ns", "tick", "u"]}, "must be tick and deadline_ns"),
         ({"imported": IMPORTED | {"units": {"v": "V"}}}, "imported.units: there is no column"),
         ({"imported": IMPORTED | {"units": {"u": 3}}}, "imported.units.u: 3"),
         ({"imported": IMPORTED | {"notes": ["\x1b[2J"]}}, "imported.notes.0"),

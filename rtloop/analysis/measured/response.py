@@ -69,7 +69,10 @@ def measure_response(grid: LineGrid, signals: PeriodSignals) -> MeasuredResponse
     direct = 0.0 if signals.direct is None else grid.amplitudes(signals.direct)
     mean_x, mean_v, mean_e = (signal.mean(axis=0) for signal in (x, v, e))
     if not (np.all(mean_v) and np.all(mean_e) and np.all(mean_x)):
-        raise ValueError("the loop does not respond: command, error or position lacks a frequency of the multisine")
+        raise ValueError(
+            "the loop does not respond: the excitation does not reach the command, the error or the position. Check "
+            "that the loop is closed and not at a limit"
+        )
     variance = (np.abs(x - mean_x) ** 2).sum(axis=0) / (periods - 1)
     noise = _smooth_power(variance / periods)
     total = np.maximum(_silent_line_power(grid, signals.position.mean(axis=0)), noise)

@@ -43,7 +43,9 @@ def first_unequal(recorded: Real, replayed: Real) -> tuple[int, int] | None:
     """
     count, columns = recorded.shape
     if replayed.shape[0] < count or replayed.shape[1] != columns or columns <= FLAGS:
-        raise ValueError(f"replayed: {replayed.shape} values; allowed: at least {count} rows of {columns} values")
+        raise ValueError(
+            f"replayed: an array of shape {replayed.shape}; allowed: at least {count} rows of {columns} values"
+        )
     place = _first_unequal(*Strided.of(recorded), *Strided.of(replayed), count, columns) if count else -1
     return None if place < 0 else divmod(place, columns)
 

@@ -278,7 +278,7 @@ def require_columns(header: dict[str, Any]) -> None:
     """
     if "imported" in header:
         if header["columns"][:2] != ["tick", "deadline_ns"]:
-            raise MalformedText(f"columns: {_shorten(header['columns'])}; allowed: tick and deadline_ns first")
+            raise MalformedText(f"columns: {_shorten(header['columns'])}; the first two must be tick and deadline_ns")
         if unknown := header["imported"]["units"].keys() - header["columns"]:
             raise MalformedText(
                 f"imported.units: there is no column {_shorten(sorted(unknown))}; allowed: names of columns"
@@ -323,7 +323,7 @@ def parse_event(payload: bytes, axes: Sequence[str]) -> Event:
         raise MalformedText(f"axis: {_shorten(event['axis'])}; allowed: null, {', '.join(axes)}")
     if (model := _RECORDER_DETAILS.get(kind)) is not None:
         if event["who"] != RECORDER:
-            raise MalformedText(f"who: {_shorten(event['who'])}; allowed for {kind}: {RECORDER}")
+            raise MalformedText(f"event {kind}: its field who is {_shorten(event['who'])}; allowed: {RECORDER}")
         _validate(model, details, "what.")
         return event
     if not is_kind_name(kind):
