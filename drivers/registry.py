@@ -32,8 +32,8 @@ def kinds() -> dict[str, str]:
 def driver_class(kind: str) -> type[Driver]:
     """Return the driver class of a kind, importing its module.
 
-    Raises ValueError, listing the kinds, for an unknown one; MissingLibrary if its module, its class, or a package that
-    it imports is missing.
+    Raises ValueError, listing the kinds, for an unknown one; MissingLibrary if its module cannot be imported, for any
+    reason, or lacks the class.
     """
     location = BUILT_IN.get(kind) or kinds().get(kind)  # Searching the installed packages takes time.
     if location is None:
@@ -44,7 +44,7 @@ def driver_class(kind: str) -> type[Driver]:
     module, _, name = location.partition(":")
     try:
         return getattr(import_module(module), name)
-    except (ImportError, AttributeError) as error:
+    except Exception as error:  # any code may stand in an installed module
         lacking = error.name if isinstance(error, ModuleNotFoundError) and error.name != module else None
         advice = (
             f". If {lacking} is a file of the driver's package, add it to py-modules in its pyproject.toml and install "

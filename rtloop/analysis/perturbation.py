@@ -67,11 +67,10 @@ def holding_range(
     coarse: float = 1.0,
     tolerance: float = 1e-4,
 ) -> PercentRange:
-    """Return the range of a change, in percent, over which `holds(plant)` is true, to the nearest failure; (0, 0) if it
-    is false without change.
+    """Return how far a plant may change, downwards and upwards in percent (both ≥ 0), while `holds(plant)` is true.
 
-    An end without a failure, up to the end of the search, is None. `coarse` multiplies the steps of the search;
-    `tolerance` in percent.
+    The range ends at the nearest failure; it is (0, 0) if `holds` is false without change. An end without a failure, up
+    to the end of the search, is None. `coarse` multiplies the steps of the search; `tolerance` in percent.
     """
     if not holds(plant):
         return PercentRange(0.0, 0.0)

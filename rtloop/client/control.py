@@ -153,7 +153,10 @@ class Client:
         return self._request("DELETE", resource, None)
 
     def lock(self, emergency_key: str | None = None) -> Any:
-        """Take the lock, with the emergency key also from another holder. Returns its holder; raises as `post`."""
+        """Take the lock, with the emergency key also from another holder. Raises as `post`.
+
+        Returns the holder as in `/status`: {name, since_unix_s, until_unix_s}, both times in s since 1970.
+        """
         return self.post("/lock", {} if emergency_key is None else {"emergency_key": emergency_key})
 
     def measure(self, resource: str, body: Mapping[str, Any], timeout_s: float = LONGEST_MEASUREMENT_S) -> Any:

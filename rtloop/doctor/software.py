@@ -44,7 +44,7 @@ def compiled_code(host: Host, pacing: Pacing) -> Finding:
 
 
 def library_versions() -> dict[str, str]:
-    """Return the versions of Python and of LIBRARIES; "not installed" for a missing one."""
+    """Return version texts by name: "python" and each of LIBRARIES; "not installed" for a library that is missing."""
     numbers = {"python": platform.python_version()}
     for name in LIBRARIES:
         try:

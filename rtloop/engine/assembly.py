@@ -148,7 +148,10 @@ class Assembly:
         loop.schedule_count = plan.schedule.size
 
     def _set_functions(self, pointers: Pointers, clock: Clock) -> None:
-        """Set the C functions of driver and clock; a driver with a `wait` function replaces the clock's."""
+        """Write the addresses of the functions of driver and clock, from `pointers` and `clock`, to the loop's context.
+
+        `wait` is the driver's if it has one, else the clock's.
+        """
         loop = self.loop
         loop.read, loop.write, loop.driver_context = pointers.read, pointers.write, pointers.context
         loop.now, loop.clock_context = clock.now, clock.context

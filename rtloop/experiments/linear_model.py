@@ -197,10 +197,10 @@ class LinearModel:
 
     @cached_property
     def tolerated_shifts(self) -> PercentRange | None:
-        """Shifts of the resonance in %, down and up, within which the loop is stable; (0, 0) for an unstable loop.
+        """Shifts of the resonance in %, `down` and `up`, both ≥ 0, within which the loop is stable.
 
-        An end is None if the loop is stable for all shifts that the search tries. None without a resonance, or without
-        a linear controller of this axis alone.
+        (0, 0) for an unstable loop. An end is None if the loop is stable for all shifts that the search tries. None
+        without a resonance, or without a linear controller of this axis alone.
         """
         if self._controller is None or not self.resonance_hz:
             return None

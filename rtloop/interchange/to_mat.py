@@ -76,7 +76,9 @@ def _signal(recording: Recording, name: str) -> dict[str, str | float]:
 
 
 def _origin(recording: Recording) -> dict[str, dict[str, str | float]]:
-    """Return structures with the origin of the data: a sentence, the recording's name, header and events as JSON."""
+    """Return two structures of texts: Description {General: a sentence on the origin}, and Info {Recording: name of the
+    first file, Header and Events: those of the recording as JSON}.
+    """
     header = recording.header
     sentence = f"{header['name']}, recorded by rtloop at {header['rate_hz']:g} Hz"
     about = {"Header": json.dumps(header), "Events": json.dumps(recording.events)}

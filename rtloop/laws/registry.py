@@ -75,9 +75,10 @@ def kinds() -> dict[str, str]:
 
 
 def find_law(kind: str) -> LawReference:
-    """Return a shipped or installed law.
+    """Return a shipped or installed law; the module of an installed one is run.
 
-    Raises ValueError for a kind that is unknown, whose module cannot be imported or run, or does not define it.
+    Raises ValueError for a kind that is unknown, whose module cannot be imported or read, or whose file does not define
+    it or cannot be run alone.
     """
     if kind in BUILT_IN:
         return LawReference(kind)
@@ -88,9 +89,10 @@ def find_law(kind: str) -> LawReference:
     announce(kind, module)
     try:
         file = inspect.getsourcefile(import_module(module))
-        return law_from_text(Path(file or "").read_text(encoding="utf-8"), str(file), kind)
-    except (ImportError, OSError) as error:
+        text = Path(file or "").read_text(encoding="utf-8")
+    except Exception as error:  # any code may stand in an installed module
         raise ValueError(f"law {kind!r}: {locations[kind]} cannot be imported: {error}") from error
+    return law_from_text(text, str(file), kind)
 
 
 def laws_in(text: str, file: str) -> tuple[LawReference, ...]:

@@ -44,8 +44,12 @@ def park_configuration(config: Path, name: str | None = None) -> str:
 
     A loop that outlived its service gets the time to ramp down, and is killed after that. The hardware is that of the
     last run; if the configuration names another board, that board is parked as well. A failure of one board does not
-    keep the other from being parked. Raises UnavailableError at once while the service is alive; after all boards were
-    tried, ConfigError if the hardware is unknown, DriverError, HostRefusal, or one RtloopError for several failures.
+    keep the other from being parked.
+
+    Raises at once, with nothing parked, UnavailableError while the service is alive or if its shared block cannot be
+    used, and HostRefusal for a block that another user may have written. After all boards were tried,
+    ConfigError if the hardware is unknown, DriverError, HostRefusal; one RtloopError with all texts for several
+    failures, and for one beside parked outputs or remarks.
     """
     account = ParkingAccount(name or config.stem)
     boards = _find_boards(config, account.name, account)

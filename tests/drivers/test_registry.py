@@ -20,6 +20,8 @@ acme = acme_card:AcmeDriver
 sim = acme_card:AcmeDriver
 absent = acme_absent:Driver
 nameless = acme_card:Nothing
+failing = acme_failing:Driver
+torn = acme_torn:Driver
 """
 MODULE = """
 from rtloop.drivers.base import Channel, Facts, Options
@@ -49,6 +51,8 @@ class AcmeDriver(PythonDriver):
 def acme(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """An installed distribution, as far as Python can see."""
     (tmp_path / "acme_card.py").write_text(MODULE)
+    (tmp_path / "acme_failing.py").write_text("1 / 0\n")
+    (tmp_path / "acme_torn.py").write_text("print(\n")
     write_distribution(tmp_path, "acme-card", "1.0", ENTRY_POINTS)
     monkeypatch.syspath_prepend(tmp_path)
 
@@ -72,6 +76,8 @@ def test_an_entry_point_is_found_but_cannot_replace_a_built_in():
     [
         ("absent", "driver 'absent': acme_absent:Driver cannot be imported: No module named 'acme_absent'"),
         ("nameless", "driver 'nameless': acme_card:Nothing cannot be imported: .*no attribute 'Nothing'"),
+        ("failing", "driver 'failing': acme_failing:Driver cannot be imported: division by zero"),
+        ("torn", "driver 'torn': acme_torn:Driver cannot be imported: '\\(' was never closed"),
     ],
 )
 def test_an_entry_point_that_is_broken_says_how(kind, message):

@@ -10,7 +10,9 @@ import pytest
 
 from rtloop.laws import CoupledController
 from rtloop.laws.mistakes import find_mistakes
+from rtloop.laws.registry import find_law
 from tests.asked import run
+from tests.drivers.installing import write_distribution
 from tests.laws.changing import configuration
 
 LAW = """from rtloop.laws import Controller, ControllerOptions
@@ -204,3 +206,17 @@ def test_a_law_that_divides_by_zero_at_rest_is_named_with_its_line(term: str, er
     result = run("check", config)
     assert result.exit_code == 0
     assert re.search(rf"fails at rest: \S*mine\.py, line {RETURN}: {error}", result.stderr), result.stderr
+
+
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [("import acme_absent\n", "No module named 'acme_absent'"), ("1 / 0\n", "division by zero"),
+     ("print(\n", r"'\(' was never closed")],
+)  # fmt: skip
+def test_an_installed_law_whose_module_cannot_be_imported_says_why(tmp_path, monkeypatch, text, reason):
+    module = f"acme_law_{len(text)}"
+    (tmp_path / f"{module}.py").write_text(text)
+    write_distribution(tmp_path, "acme-law", "1.0", f"[rtloop.laws]\nacme = {module}:Acme\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    with pytest.raises(ValueError, match=f"^law 'acme': {module}:Acme cannot be imported: {reason}"):
+        find_law("acme")

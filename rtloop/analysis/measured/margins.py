@@ -47,8 +47,9 @@ def measured_margins(loop: MeasuredLoop, perturbed_loops: Sequence[MeasuredLoop]
     nominal, *perturbed = map(loop_margins, (loop, loop.perturbed(half), loop.perturbed(1j * half), *perturbed_loops))
 
     def uncertain(name: str) -> UncertainValue:
-        """Return a margin with the root sum of squares of its changes in all perturbed loops; NaN unless it is
-        finite.
+        """Return a margin; its `std` is the root sum of squares of its changes in all perturbed loops.
+
+        Both are NaN if the margin is not finite. `std` alone is NaN or inf if it is not finite in a perturbed loop.
         """
         value = getattr(nominal, name)
         if not math.isfinite(value):
