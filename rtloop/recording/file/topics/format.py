@@ -126,7 +126,10 @@ def tick_dtype(columns: Sequence[str]) -> np.dtype[Any]:
 
 
 def doubles(columns: Sequence[str]) -> list[tuple[str, str]]:
-    """Fields (name, type) of a numpy dtype for a protobuf message of doubles: per column `_tag_1`, `_tag_2`, …, then the double."""
+    """Fields (name, type) of a numpy dtype for a protobuf message of doubles.
+
+    Each column has its tag, named `_tag_1`, `_tag_2`, …, and then its double.
+    """
     fields: list[tuple[str, str]] = []
     for number, name in enumerate(columns, start=1):
         fields += [(f"_tag_{number}", "u1" if number <= SHORT_TAGS else "<u2"), (name, "<f8")]
