@@ -128,7 +128,7 @@ def tick_dtype(columns: Sequence[str]) -> np.dtype[Any]:
 def doubles(columns: Sequence[str]) -> list[tuple[str, str]]:
     """Fields (name, type) of a numpy dtype for a protobuf message of doubles.
 
-    Each column has its tag, named `_tag_1`, `_tag_2`, …, and then its double.
+    Each column has its tag, a field named by its number from 1 on, and then its double.
     """
     fields: list[tuple[str, str]] = []
     for number, name in enumerate(columns, start=1):
