@@ -25,7 +25,8 @@ class Recording(RecordedSignals):
         """Return signals (names or patterns, all by default) as a DataFrame over the time in s since the start.
 
         `tick` and `deadline_ns` are always included. `start_s` and `end_s`, both included, limit the time; of these
-        ticks, the first and every `every`th after it are taken. The DataFrame's `attrs` hold `units` and `events`.
+        ticks, the first is taken, and those whose number is a multiple of `every` above it. The DataFrame's `attrs`
+        hold `units` (text by signal) and `events` (a list).
         Raises RecordingError if a pattern fits no signal or a limited time span holds no tick, MissingExtra without
         pandas.
 

@@ -81,13 +81,20 @@ class RecordedSignals:
 
     @cached_property
     def overview(self) -> Overview:
-        """Least, largest and mean values of the ticks omitted by intention, read on first use."""
+        """Least, largest and mean values of the ticks omitted by intention, by interval, for the whole run.
+
+        Its length is 0 if no tick was omitted. It is read on first use; damaged intervals are left out and added to
+        `problems`. Raises RecordingError for a file that cannot be read.
+        """
         with self._open_readers() as readers:
             return Overview(self.columns, np.concatenate([reader.overview for reader in readers]))
 
     @property
     def units(self) -> dict[str, str]:
-        """Units of all signals by name, such as µm; units of imported signals go before those by name."""
+        """Units of all signals by name, such as {"x_position_um": "µm"}; "" if a unit is unknown.
+
+        A unit that was imported with a signal goes before the one that its name gives.
+        """
         imported = self.header.get("imported", {}).get("units", {})
         return {name: imported.get(name) or signal_unit(name) for name in self.columns}
 
@@ -113,7 +120,8 @@ class RecordedSignals:
     def __getitem__(self, key: str | slice) -> Real | Self:
         """Return the values (ticks,) of a signal, read-only, or the part between two times in s, both included.
 
-        Raises RecordingError for an unknown name and for a slice with a step or with limits that are no times.
+        Raises RecordingError for an unknown name, a file that cannot be read, and a slice with a step or with a limit
+        that is no number.
         """
         return self._part(key) if isinstance(key, slice) else self.read(key)[0]
 
@@ -135,14 +143,14 @@ class RecordedSignals:
         return iter(self.columns)
 
     def __len__(self) -> int:
-        """Number of ticks present in the recording."""
+        """Number of ticks present in the recording, or in the part; the signal `tick` is read on first use."""
         return len(self["tick"])
 
     def read(self, *names: str) -> list[Real]:
         """Read several signals in one pass over the files, and cache them.
 
-        Returns read-only arrays (ticks,), ordered as `names`. Raises RecordingError for an unknown name and for a file
-        that cannot be read.
+        Returns read-only arrays (ticks,), ordered as `names`, without the ticks of damaged chunks, which are added to
+        `problems`. Raises RecordingError for an unknown name and for a file that cannot be read.
         """
         missing = [name for name in dict.fromkeys(names) if name not in self._signals]
         if missing:
@@ -220,7 +228,11 @@ class RecordedSignals:
 
     @contextmanager
     def _open_readers(self) -> Iterator[list[Reader]]:
-        """Open the files again; on exit, add the faults found while reading to `problems` and `left_out`."""
+        """Open the files again. Yields their readers in the order of the run.
+
+        On exit, the faults found while reading are added to `problems` and `left_out`. Raises RecordingError if a file
+        cannot be opened or is now one of another run.
+        """
         with open_run(self.paths) as readers:
             try:
                 yield readers

@@ -37,7 +37,7 @@ class TickSpans:
 
     @property
     def end(self) -> int:
-        """The tick after the last one covered."""
+        """The tick after the last one covered; only defined if there is one."""
         return int(self._last[-1, TICK]) + 1
 
     def gaps(self, expected: int) -> list[tuple[int, int]]:

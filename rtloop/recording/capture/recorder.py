@@ -46,7 +46,10 @@ class SupervisorOrders:
         self._unread, self.is_closed = b"", False
 
     def next(self, wait_s: float | None = 0.0) -> dict[str, Any] | None:
-        """Return the next line's object; None if none arrives within `wait_s` (None: no limit) or stdin is closed."""
+        """Return the next line's object; None if none arrives within `wait_s` (None: no limit) or stdin is closed.
+
+        Sets `is_closed` at the end of stdin. Raises ValueError for a line that is not JSON.
+        """
         while b"\n" not in self._unread:
             if self.is_closed or not select.select([0], [], [], wait_s)[0]:
                 return None
@@ -104,7 +107,8 @@ def record_run(fd: int, names: RequesterNames | None = None) -> int:
     """Record one run from the shared block at descriptor `fd`, as a line on stdin orders; print the totals as JSON.
 
     Waits for the block and the order, and stores RECORDER_STATE in the block. Returns the exit code: 0, also if the
-    supervisor ended before there was a block (without a print), or 1 after an error, which the totals name.
+    supervisor ended before there was a block (without a print), or 1 after an RtloopError, which the totals name. Other
+    errors, such as those of a damaged block or a malformed order, are raised without a print.
     """
     try:
         block = SharedBlock.attach(fd, _is_supervisor_gone)

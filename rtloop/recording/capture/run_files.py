@@ -43,9 +43,9 @@ def predecessor_file(path: Path, sequence: int) -> Path | None:
 
 
 class RunFiles:
-    """Present and finished files of a run; `end_place` follows the last tick in a file.
+    """Present and finished files of a run; `end_place` is tick and deadline after the last tick in a file.
 
-    The present file accounts for the ticks from `file_begin` on.
+    The present file accounts for the ticks from `file_begin` on. `closed_bytes` is the size of the finished files.
     """
 
     def __init__(

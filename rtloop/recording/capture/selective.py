@@ -33,7 +33,10 @@ class SelectiveSession(Session):
         options: Options,
         names: RequesterNames | None = None,
     ) -> None:
-        """Begin as `Session` does. Raises ValueError if the header has no `around`, OutputError as `Session` does."""
+        """Begin as `Session` does. Raises OutputError as `Session` does.
+
+        Raises ValueError, with the first file open, if the header has no `around`.
+        """
         super().__init__(block, path, header, options, names)
         window, rate_hz = EventWindow.from_header(header), header["rate_hz"]
         if window is None:

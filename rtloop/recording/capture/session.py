@@ -144,8 +144,9 @@ class Session:
         """Write the remaining data and finish the file.
 
         `result`: how the loop ended, as `Recorder.record` returns it. Returns {path, paths, ticks_logged, ticks_lost,
-        events_lost, bytes, complete, error}: `path` is the last file, `bytes` the size of all files, `error` the first
-        failure or None.
+        events_lost, bytes, complete, error}: `paths` are the finished files of this session that exist, `path` is the
+        last of them or, without one, the path of the run, `bytes` the size of all files, `error` the first failure or
+        None.
         """
         self._write_remaining(result)
         self._pending.count_dropped(self._pending.take_entries())
@@ -319,7 +320,8 @@ class Session:
     def _write_to_file(self, rows: Real, entries: list[PendingEntry], intervals: Intervals | None = None) -> None:
         """Write entries and gap events, then rows or, if not None, intervals of omitted ticks.
 
-        The write is announced in the block for a replacement recorder. Raises OutputError if it fails.
+        The write is announced in the block for a replacement recorder, and RECORDER_FAILURE set to 0 after it. Raises
+        OutputError if it fails.
         """
         end, messages = self._files.end_place, [entry.message for entry in entries]
         spans, rate_hz = TickSpans(rows, intervals), self._header["rate_hz"]

@@ -39,7 +39,11 @@ class RangeCopy:
         self._skipped_ranges: list[Range] = []
 
     def run(self, progress: ReportTicks | None) -> None:
-        """Copy all ticks and messages of the range, in order, and set `gaps`; `progress` receives tick counts."""
+        """Copy all ticks and messages of the range, in order, and set `gaps`.
+
+        `progress` receives the number of ticks so far. Raises OutputError if a write fails, RecordingError if the
+        source cannot be read.
+        """
         for messages, rows in self._source.contents(self._range):
             self._writer.write_messages(messages)
             self._writer.write_ticks(rows)
@@ -66,7 +70,7 @@ class RangeCopy:
         )
 
     def final_message(self, ticks_logged: int) -> Message:
-        """Return the event that ends the file, with the totals if it holds `ticks_logged` ticks."""
+        """Return the event CUT that ends the file, with the totals if it holds `ticks_logged` ticks; after `run`."""
         skipped = self._writer.ticks_skipped
         lost = self._range.end - self._range.first - ticks_logged - skipped
         totals = {"ticks_executed": self._range.end, "ticks_logged": ticks_logged, "ticks_lost": lost, "events_lost": 0}
@@ -97,7 +101,7 @@ def cut(
     Returns {recording, output, first, end, begin, ticks, gaps [(first tick, count)], problems, complete}: `begin` is
     the first copied tick, `ticks` the number of copied ones, `complete` whether there is no gap and no damage. Raises
     RecordingError for files that are no recording of one run, and for a range that is not in it or has no snapshot to
-    begin from; OutputError for an output that exists or cannot be written.
+    begin from; OutputError for an output that exists or cannot be written. After an error no new file is left.
     """
     with open_run(find_files(files)) as readers:
         source = RunSource([ChunkSeeker(reader) for reader in readers])

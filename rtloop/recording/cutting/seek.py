@@ -56,7 +56,7 @@ class ChunkSeeker:
         return next(filter(None, map(self.span, reversed(range(self.end)))), None)
 
     def final_totals(self) -> dict[str, Any] | None:
-        """Totals in the event that ends the file; None for an unfinished file or a damaged last chunk."""
+        """Totals as `Reader.totals`, from the last chunk alone; None for an unfinished file or a damaged last chunk."""
         content = self.chunk(self.end - 1)
         events = (
             [json.loads(message.payload) for message in content if message.channel == EVENTS]

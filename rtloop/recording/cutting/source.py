@@ -32,7 +32,7 @@ class RunSource:
     """Files of one run, in its order."""
 
     def __init__(self, seekers: Sequence[ChunkSeeker]) -> None:
-        """Take the files of one run, one or more, in the order of the run; `header` is the first one's, for the run."""
+        """Take the files of one run, one or more, in its order; `header` is the first one's without FILE_KEYS."""
         self._seekers = seekers
         header = seekers[0].reader.header
         self.header: dict[str, Any] = {key: value for key, value in header.items() if key not in FILE_KEYS}
@@ -78,7 +78,7 @@ class RunSource:
         raise RecordingError(f"{self.path}: {time_s:g} s is not in the recording; {end}")
 
     def first_tick_due_or_skipped(self, time_s: float) -> int:
-        """First tick due at `time_s` or later; if it was omitted by intention, the first tick of its overview interval.
+        """First tick due `time_s` after the start or later; if it is in an overview interval, that interval's first tick.
 
         Raises RecordingError if there is none.
         """

@@ -41,6 +41,7 @@ class CopyAccount:
     def end_message(self, kind: str, tick: int, details: dict[str, Any], start_unix_ns: int) -> Message:
         """Return the event `kind` that ends the copy, at `tick`, as a message; `details` becomes its `what`.
 
-        The time of the event is one period after the last copied tick; log time = `start_unix_ns` + this time, in ns.
+        The time of the event is one period after the last tick in copied rows or intervals, 0 without any; log time =
+        `start_unix_ns` + this time, in ns.
         """
         return event_message(recorder_event(kind, tick, round(self._end_ns), details), start_unix_ns)

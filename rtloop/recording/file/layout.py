@@ -64,7 +64,7 @@ def open_layout(source: McapSource) -> tuple[McapSource, OwnLayout]:
     """Open the layout of a recording. Returns the file with the chunks, `source` or its converted copy, and the layout.
 
     If it is the copy, `source` is closed. Raises RecordingError for a file without a recording, a damaged one, and one
-    of a newer version.
+    of a newer version; `source` stays open then.
     """
     if library_name(source) not in OWN_LIBRARIES:
         try:

@@ -59,7 +59,7 @@ class Reader:
     `left_out` lists the problems that removed data. `opener` opens the file:
     `open_user_file` of `rtloop.foundation.trusted` for one that a user named, another for one found in a folder.
 
-    Raises RecordingError, here and while reading.
+    Opening the file and every method that reads from it raise RecordingError.
     """
 
     def __init__(self, path: Path | str, *, tolerant: bool = False, opener: Opener = open_user_file) -> None:
@@ -94,9 +94,10 @@ class Reader:
         self._source.close()
 
     def restrict_begin(self, tick: int) -> None:
-        """Let this file begin at `tick`, where the earlier files of the run end; data that it repeats is skipped.
+        """Let this file begin at `tick`, where the earlier files of the run end; `first_tick` becomes at least `tick`.
 
-        Repeated data lies before `repeats_before` of the header. Any other tick before `tick` is a fault.
+        Ticks, events and snapshots that it repeats are skipped: those before `repeats_before` of the header. Any other
+        tick before `tick` is a fault, found when the ticks are read.
         """
         self._end_of_repetition = min(self.header.get("repeats_before", 0), tick)
         self.first_tick = max(self.first_tick, tick)
@@ -234,7 +235,10 @@ class Reader:
         return intervals[is_plausible]
 
     def overview_intervals(self, messages: Iterable[Message]) -> Intervals:
-        """Intervals (n, columns, 3: minimum, maximum, mean) of the overviews among `messages`; others are ignored."""
+        """Intervals (n, columns, 3: minimum, maximum, mean) of the overviews among valid `messages`.
+
+        Messages of other topics are ignored.
+        """
         return self._overview_layout.parse_intervals(
             [message.payload for message in messages if message.channel == format.OVERVIEW]
         )

@@ -150,7 +150,7 @@ def recover(
 
 
 def is_being_written(path: Path) -> bool:
-    """Whether a recorder holds its lock on the file; False for a file that cannot be opened.
+    """Whether a recorder holds its lock on the file; False on Windows, and for a file that cannot be opened.
 
     Raises RecordingError if the lock cannot be tested.
     """

@@ -75,7 +75,8 @@ class Writer:
     def write(self, messages: Sequence[Message], rows: Real) -> None:
         """Write messages of topics other than /ticks, and rows (n, columns) of at most one chunk of ticks.
 
-        Both are written, or neither. Raises OutputError if either fails.
+        Both are written, or neither. Raises OutputError if either fails; messages whose ticks could not be written are
+        removed from the file, unless that fails too.
         """
         self.write_messages(messages)
         try:
@@ -135,7 +136,8 @@ class Writer:
 
         If the disk is full, the last chunks are dropped to make room, their ticks are subtracted from `ticks` and
         `ticks_skipped`, and `final_message` is called again; with `require_all`, OutputError is raised instead. Raises
-        OutputError for any other failure, NotOnDisk if the file may not be on the disk.
+        OutputError for any other failure, NotOnDisk if the file may not be on the disk; it then keeps the name of an
+        unfinished file.
         """
         max_chunks = len(self.file)
         while not self._try_write_end(final_message, require_all):

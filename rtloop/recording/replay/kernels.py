@@ -36,8 +36,9 @@ class Strided(NamedTuple):
 
 
 def first_unequal(recorded: Real, replayed: Real) -> tuple[int, int] | None:
-    """Return row and column of the first value (n, columns) that differs in bytes; None if none does.
+    """Return (row, column) of the first value (n, columns) that differs in bytes; None if none does.
 
+    The first one is in the least row, and there in the least column.
     Measured columns and the flag OVERRUN count as equal; `replayed` may have more rows than `recorded`, not fewer.
     Raises ValueError for shapes that do not fit, and for values that are not float64.
     """

@@ -55,8 +55,9 @@ def recorded_law(recording: Recording, trust: TrustedLaws = NO_TRUST) -> LawWith
 def compare_law(recording: Recording, law: LawWithCoefficients, progress: ReportTicks | None = None) -> dict[str, Any]:
     """Compare the outputs of another law with the recorded ones, on the recorded inputs.
 
-    Returns {ticks, problems, signals: {name: {max, at_tick, rms}}, trip: {tick, causes} of the other law or None}, with
-    `max` and `rms` in the signal's unit. Raises RecordingError if the recording has no tick or cannot be read.
+    Returns {ticks, problems, signals: {name: {max, at_tick, rms}}, trip: {tick, causes} of the other law or None}:
+    `ticks` counts the compared ones; `max` and `rms` are of the absolute difference, in the signal's unit. Raises
+    RecordingError if the recording has no tick or cannot be read.
     """
     differences = SignalDifferences(recording.header["axes"])
     ticks = 0
@@ -102,7 +103,8 @@ def _execute_recording(
 ) -> Generator[tuple[Rows, Rows]]:
     """Yield recorded and executed rows (n, columns) of the same ticks, until the recording or the loop ends.
 
-    The law begins at rest, in the mode of the first recorded tick. Raises RecordingError without ticks.
+    The law begins at rest, in the mode of the first recorded tick. The executed rows are a view, valid until the next
+    pair. Raises RecordingError without ticks.
     """
     commands, rerun, ticks = recorded_commands(recording, LAW_COMMANDS), None, 0
     with closing(recording.blocks()) as blocks:

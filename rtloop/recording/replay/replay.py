@@ -137,7 +137,7 @@ class Replay:
     def run(self) -> ReplayReport:
         """Replay all ticks, up to the first difference; without one, check the totals too. Returns `report`.
 
-        Raises RecordingError if there is no tick to compare.
+        Raises RecordingError if there is no tick to compare, a snapshot is malformed, or a file cannot be read.
         """
         expected = self._recording.extents[0].first_tick
         with closing(self._recording.blocks(ahead=False)) as blocks:
@@ -167,7 +167,8 @@ class Replay:
     def run_rows(self, blocks: Iterable[Rows], first_tick: int) -> int | None:
         """Replay `blocks`, arrays (n, columns) of the ticks from `first_tick` on. Returns the tick after the last one.
 
-        Returns None as soon as a tick is missing, is not verified or differs.
+        Returns None as soon as a tick is missing, is not verified or differs. Raises RecordingError for a malformed
+        snapshot.
         """
         expected = first_tick
         for rows in blocks:
@@ -263,9 +264,9 @@ class Replay:
         return snapshot
 
     def _compare_snapshot(self, rerun: Rerun, snapshot: Snapshot) -> None:
-        """Compare and count the snapshots of coefficients and state after the commands of a tick.
+        """Compare the newest snapshot of `rerun` with the recorded one of its tick, in bytes, and count it in `report`.
 
-        A difference is stored unless the tick already differs.
+        A difference is stored in `report` unless there is an earlier one.
         """
         replayed, recorded = rerun.newest_snapshot()[8:], snapshot.data[8:]
         self.report.snapshots += 1

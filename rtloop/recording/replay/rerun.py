@@ -86,7 +86,7 @@ class SimulatedInputs:
         self.facts, self.wiring, self._driver = driver.facts, driver.wiring, driver
 
     def pointers(self) -> Pointers:
-        """Open the driver. Returns its pointers."""
+        """Open the driver. Returns its pointers. Raises DriverError if it cannot be opened."""
         return self._driver.open()
 
     def load(self, rows: Rows) -> None:
@@ -111,6 +111,7 @@ class Rerun:
     ) -> None:
         """Build the loop; this opens a simulated rig of `source`, and executes no tick.
 
+        Raises DriverError if the rig cannot be opened.
         `laws` name the code of the laws, `law` is their memory before `first_tick`, which the rerun advances.
         `commands` (n,) are recorded commands to the loop, records of MESSAGE due at `first_tick` or later.
         """
@@ -130,7 +131,7 @@ class Rerun:
         return min(SLICE_TICKS, len(self._slots) - tick % len(self._slots))
 
     def execute(self, rows: Rows) -> Rows:
-        """Execute the ticks of `rows` (n, columns), n ≤ `max_ticks`. Returns records (m, columns).
+        """Execute the consecutive ticks of `rows` (n, columns), 0 < n ≤ `max_ticks`. Returns records (m, columns).
 
         m < n if the loop ended. The records are a view, valid until the next call. Missing ticks before `rows` are
         skipped.
@@ -153,7 +154,7 @@ class Rerun:
         self._assembly.loop.next_snapshot = 0
 
     def newest_snapshot(self) -> bytes:
-        """Bytes of the newest snapshot that the rerun took; the first eight are its tick."""
+        """Bytes of the newest snapshot that the rerun took; the first eight are its tick. There must be one."""
         ring = self._block.ring("snapshots")
         return ring.slots[(int(ring.head[0]) - 1) % len(ring.marks)].tobytes()
 

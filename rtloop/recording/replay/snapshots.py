@@ -14,6 +14,7 @@ from rtloop.kernel.memory import LawMemory, RecordKind, field_tables
 def first_difference(recorded: bytes, replayed: bytes, axes: Sequence[str], law: LawMemory) -> tuple[str, Any, Any]:
     """Return (field, recorded value, replayed value) of the first difference; (text, None, None) outside all fields.
 
+    The field is law.AXIS.NAME or law.loop.NAME, with [index] for an element of an array; the values are numbers.
     `recorded` and `replayed` are the bytes of two different snapshots without their tick.
     """
     for name, dtype, start in _snapshot_fields(axes, law):

@@ -33,10 +33,10 @@ LEAST_CHUNKS = 8
 
 
 class Span(NamedTuple):
-    """Ticks from the snapshot `first_tick` up to the snapshot `last_tick` of the next span, which is executed by both.
+    """Ticks from the snapshot at `first_tick` up to the one at `last_tick`, at which the next span begins.
 
-    The last span has no `last_tick`. Its ticks begin in the chunk of ticks number `chunk`, counted
-    over all files.
+    Both spans execute `last_tick`, which is None for the last span. `first_tick` lies in chunk number `chunk` or a
+    later one; chunks with ticks are counted from 0 over all files.
     """
 
     chunk: int

@@ -54,7 +54,11 @@ class ReplayReport:
         self.not_verified.append({"first_tick": first_tick, "count": count, "why": reason})
 
     def as_dict(self) -> dict[str, Any]:
-        """The object of `rtloop replay --json`."""
+        """The object of `rtloop replay --json`, with the fields of the report.
+
+        Keys: ticks, stretches, ticks_skipped, identical, first_difference, not_verified, unverified, gaps,
+        snapshots_compared, problems, not_judged.
+        """
         return {
             "ticks": self.ticks,
             "stretches": self.stretches,
@@ -71,7 +75,7 @@ class ReplayReport:
 
 
 def unjudged_contents(header: Mapping[str, Any]) -> list[str]:
-    """Recorded contents that no replay can judge, since no output of the law depends on them."""
+    """Descriptions of recorded contents that no replay can judge, since no output of the law depends on them."""
     measured_names = ", ".join(signals.COMMON_SIGNALS[column].name for column in signals.MEASURED_COLUMNS)
     return [
         f"measured times: {measured_names}, flag OVERRUN, rate_hz, host",

@@ -30,6 +30,7 @@ MAX_OTHER_SIGNALS = 8
 class Band(NamedTuple):
     """Least and largest values (n,) of one signal over groups of ticks; equal if each group is a single tick.
 
+    Both are NaN for a group without a value that can be drawn; other NaN are ignored.
     `time_s` (n,) is the deadline of each group's first tick, in s since the start of the run.
     """
 
@@ -97,8 +98,8 @@ def read_bands(
     """Read the signals between two times, both included, in s since the start.
 
     Returns bands of about `points` values, by name. Every tick is a value if there are at most `points`. Omitted ticks
-    add about 2 `points` values of their overview. Values of MAX_DRAWN_VALUE or more are NaN. `progress` receives the
-    number of ticks read. Raises RecordingError if no tick lies between the times.
+    add about 2 `points` values of their overview. Values whose magnitude is MAX_DRAWN_VALUE or more count as NaN.
+    `progress` receives the number of ticks read. Raises RecordingError if no tick lies between the times.
     """
     count = sum(len(rows) for rows in recording.between(["deadline_ns"], start_s, end_s))
     overview_band = _overview_band(recording, names, start_s, end_s, points)
@@ -142,7 +143,7 @@ def make_panels(recording: Recording) -> list[Panel]:
 
 
 def _panel(recording: Recording, axis: str, names: Sequence[str]) -> Panel:
-    """Panel of the recorded signals among the signals `names` of an axis."""
+    """Panel of the recorded ones among the signals `names` of an axis, such as error_um; its `names` may be empty."""
     present = [name for signal in names if (name := f"{axis}_{signal}") in recording]
     label = axis if len(names) > 1 else f"{axis} {signal_kind(names[0])}"
     return Panel(label, signal_unit(names[0]), present)

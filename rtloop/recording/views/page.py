@@ -34,8 +34,8 @@ def write_page(
 ) -> Path:
     """Write the page of a recording from `start_s` to `end_s`, both included, in s since the start.
 
-    The page lies beside the recording by default. An existing file is overwritten. Returns its path. Raises
-    RecordingError if no tick or signal can be drawn, OutputError if the page cannot be written.
+    `output` is by default NAME.html beside the recording. An existing file is overwritten. Returns the path of the
+    page. Raises RecordingError if no tick or signal can be drawn, OutputError if the page cannot be written.
     """
     drawing = read_drawing(files, start_s, end_s, POINTS, progress)
     recording = drawing.recording
@@ -69,7 +69,10 @@ def _panel_data(panel: Panel, bands: dict[str, Band]) -> dict[str, Any]:
 
 
 def _trace_data(band: Band, name: str) -> dict[str, Any]:
-    """Band as {label, colour, width, low, high} for the page; `high` is None for a line."""
+    """Band as {label, colour, width, low, high} for the page; `high` is None for a line.
+
+    `low` and `high` are single-precision values in base64, `width` is in pixels, `colour` one of COLOURED or "other".
+    """
     kind, high = signal_kind(name), None if band.is_line else _encode_base64(band.high, np.float32)
     label = "tick" if kind == "exec" else kind if name.startswith(kind) else f"{name[: name.index(f'_{kind}_')]} {kind}"
     colour, width = kind if kind in COLOURED else "other", WIDTHS.get(kind, 1.0)

@@ -20,8 +20,8 @@ REQUIRED_SIGNALS = (COMMON_SIGNALS[TICK].name, COMMON_SIGNALS[DEADLINE].name)
 class Selection:
     """Selected signals and ticks. `signals` are names or patterns such as `x_*`; () selects all.
 
-    `start_s` and `end_s`, both included, count from the start of the run. Of these ticks, the first and every `every`th
-    after it are taken.
+    `start_s` and `end_s`, both included, count from the start of the run. Of these ticks, the first is taken, and those
+    whose number is a multiple of `every` above it.
     """
 
     signals: tuple[str, ...] = ()

@@ -58,7 +58,7 @@ def step_metrics(
 def measure_steps(
     reference_um: npt.NDArray[np.float64], position_um: npt.NDArray[np.float64], rate_hz: float
 ) -> npt.NDArray[np.float64] | None:
-    """Return overshoot %, settling time ms, static error % of each step, (steps, 3).
+    """Return overshoot %, settling time ms, static error % of each step, (steps, 3), all ≥ 0.
 
     Settling is to ±5 % of the step's height about the level reached; that level is the mean of the last fifth. Where it
     is further than that from the reference, the settling time is infinite and the overshoot NaN; likewise where the

@@ -91,13 +91,17 @@ class Summary:
     paced: bool
     overruns: int
     ticks_limited: dict[str, int]
+    """Number of ticks with a limited `command`, `drive` and `slew`, by these keys."""
     saturated_percent: float | None
     """Percentage of closed-loop ticks that limited a command or drive; None if the loop was never closed."""
     lateness_us: dict[str, float] | None
+    """Quantiles and maximum {p50, p99, p999, max} in µs."""
     lateness_histogram: list[dict[str, Any]]
+    """Number of ticks by lateness, as `TimeHistogram.class_counts`; [] without timing."""
     exec_us: dict[str, float] | None
+    """Quantiles and maximum {p50, p99, p999, max} in µs."""
     phases: dict[str, float | None]
-    """Median durations (µs) of the phases of a tick; None without timing."""
+    """Median durations (µs) of the phases of a tick, read_us, law_us and write_us; None without timing."""
     complete: bool
     result: str | None
     driver_error: str | None

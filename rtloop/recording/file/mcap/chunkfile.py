@@ -111,7 +111,8 @@ class ChunkFile:
     def append_chunk(self, content: ChunkContent) -> None:
         """Compress and write one chunk and its index records, if it has any, as a whole or not at all.
 
-        The first chunk gives the file the name PATH.part. Raises OutputError.
+        The first chunk gives the file the name PATH.part. Raises OutputError, with nothing written, if the write fails,
+        and with the chunk written if the file cannot get that name.
         """
         chunk = pack_chunk(content.records, content.start, content.end, self._compressor)
         index_begin = self.size + len(chunk)
@@ -138,7 +139,10 @@ class ChunkFile:
             self._rename_to_part()
 
     def drop_last_chunk(self) -> dict[int, int]:
-        """Remove the last chunk from the file. Returns its number of messages by channel id. Raises OutputError."""
+        """Remove the last chunk, of one or more. Returns its number of messages by channel id.
+
+        Raises OutputError if the file cannot be cut; the chunk no longer counts then, and the next write overwrites it.
+        """
         chunk = self._chunks.pop()
         _, _, self.size = index_record_span(chunk.record)
         self._crc = chunk.crc_before
@@ -189,7 +193,7 @@ class ChunkFile:
             self._fd = -1
 
     def discard(self) -> None:
-        """Close the file and remove it."""
+        """Close the file and remove it; a file that cannot be removed stays, without an error."""
         with contextlib.suppress(OSError):
             os.unlink(self._name)
         self.close()

@@ -156,7 +156,7 @@ def _kind_name(kind: int) -> str:
 
 
 def _kind_value(name: str) -> int:
-    """Return the number of a Kind or Note by its name, or by its number as text."""
+    """Return the number of a Kind or Note by its name, or by its number as text. Raises ValueError for other text."""
     return _member_value(Note if name.upper() in Note.__members__ else Kind, name)
 
 
@@ -174,7 +174,10 @@ def _origin_value(who: str) -> int:
 
 
 def _member_value(kinds: Any, name: str) -> int:
-    """Number of the member `name` of the enumeration `kinds`, or the number of which `name` is the text."""
+    """Number of the member `name` of the enumeration `kinds`, or the number of which `name` is the text.
+
+    Raises ValueError if it is neither.
+    """
     return int(kinds[name.upper()]) if name.upper() in kinds.__members__ else int(name)
 
 
