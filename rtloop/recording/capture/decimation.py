@@ -40,7 +40,7 @@ class Decimation:
             self._add_run(run)
 
     def take_intervals(self) -> Intervals:
-        """Remove and return all intervals (n, columns, 3: minimum, maximum, mean), also the unfinished one."""
+        """Remove and return all intervals (n ≥ 0, columns, 3: minimum, maximum, mean), also the unfinished one."""
         self._end_interval()
         intervals, self._intervals = self._intervals, []
         return np.stack(intervals) if intervals else np.empty((0, self._columns, len(STATISTICS)))

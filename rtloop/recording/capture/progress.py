@@ -55,10 +55,10 @@ class RecorderProgress:
 
     @contextmanager
     def announced_write(self, begin_byte: int, end_position: RingPosition) -> Iterator[None]:
-        """Announce the write inside the block to a replacement recorder, and store it as done afterwards.
+        """Announce, in the shared block, the write that the `with` statement runs, and store it as done afterwards.
 
         The write begins at byte `begin_byte` of the file; `end_position` is the ring position after it. An error
-        withdraws the announcement; a write that raises must leave the file unchanged.
+        withdraws the announcement and is raised; a write that raises must leave the file unchanged.
         """
         previous = self.flushed_position
         # The byte comes first: the file holds nothing behind it yet, whatever position is announced.

@@ -81,7 +81,10 @@ class SelectiveSession(Session):
         self._write_decided()
 
     def _write_remaining(self, result: str) -> None:
-        """Write all waiting ticks and messages; if `result` is "finished", overviews of the ticks far from events."""
+        """Write all waiting ticks and messages.
+
+        If `result` is "finished", overviews replace ticks far from events.
+        """
         super()._write_remaining(result)
         self._write(0, self._pending.take_entries())
         if result != FINISHED:

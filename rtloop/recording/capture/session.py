@@ -136,7 +136,10 @@ class Session:
         self._pending.add_event(recorder_event(FILE_REMOVED, *self._buffer.tick_time(self.cursor), details))
 
     def write_due(self) -> None:
-        """Write all drained data if the buffer is full or FLUSH_S has passed since the last write."""
+        """Write all drained data if the buffer is full or FLUSH_S has passed since the last write.
+
+        A failed write sets `failure` and does not raise.
+        """
         if self.free_rows == 0 or time.monotonic() - self._last_write_s >= FLUSH_S:
             self._write_all()
 
@@ -277,7 +280,8 @@ class Session:
     def _resume(self, tick: int) -> None:
         """Try to continue in another file at the snapshot of `tick`; `_begin_after_failure` tells where it begins.
 
-        Success queues the event RECORDING_RESUMED and clears `failure`; otherwise `failure` is the new reason.
+        Success queues the event RECORDING_RESUMED and clears `failure` and RECORDER_FAILURE; otherwise both get the
+        new reason.
         """
         self._files.discard_unusable()
         room_bytes = RESUME_FREE_BYTES + self._options.min_free_bytes // 4

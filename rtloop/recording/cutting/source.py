@@ -78,7 +78,7 @@ class RunSource:
         raise RecordingError(f"{self.path}: {time_s:g} s is not in the recording; {end}")
 
     def first_tick_due_or_skipped(self, time_s: float) -> int:
-        """First tick due `time_s` after the start or later; if it is in an overview interval, that interval's first tick.
+        """First tick due `time_s` after the start or later; if that is in an overview interval, its first tick.
 
         Raises RecordingError if there is none.
         """

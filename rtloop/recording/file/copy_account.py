@@ -21,7 +21,7 @@ class CopyAccount:
         self.gaps: list[tuple[int, int]] = []
 
     def add_rows(self, rows: Real) -> None:
-        """Add copied rows (n, columns) of ticks, n > 0; missing ticks before and between them are gaps."""
+        """Add copied rows (n, columns) of ticks, n > 0; missing ticks before and between them are added to `gaps`."""
         self.gaps += missing_ranges(rows[:, TICK], self.next_tick)
         self.next_tick = int(rows[-1, TICK]) + 1
         self._end_ns = float(rows[-1, DEADLINE]) + self._period_ns
@@ -29,7 +29,7 @@ class CopyAccount:
     def add_intervals(self, intervals: Intervals) -> None:
         """Add intervals (n, columns, 3: minimum, maximum, mean) of ticks that the original omits by intention.
 
-        These ticks are no gap; missing ticks before and between the intervals are gaps.
+        These ticks are no gap; missing ticks before and between the intervals are added to `gaps`.
         """
         for first, count in tick_ranges(intervals):
             if first > self.next_tick:

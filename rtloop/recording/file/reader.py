@@ -213,7 +213,10 @@ class Reader:
 
     @property
     def events(self) -> list[Event]:
-        """Events in the order of the file, without events of the loop that are read from another file of the run."""
+        """Events {tick, time_ns, kind, who, axis, what} in the order of the file.
+
+        Events of the loop that are read from another file of the run are left out.
+        """
         return [event for event in self._events if event["who"] == RECORDER or self.owns(event["tick"])]
 
     @cached_property

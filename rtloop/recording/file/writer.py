@@ -96,7 +96,7 @@ class Writer:
             self._write_chunk(rows[start : start + len(self._template)])
 
     def _write_chunk(self, rows: Real) -> None:
-        """Write rows (n, columns) of ticks, n ≤ `format.chunk_rows`, as one chunk, and count them.
+        """Write rows (n, columns) of ticks, n ≤ `format.chunk_rows`, as one chunk, and add n to `ticks`.
 
         Raises OutputError if the file was removed, the free space is too small, or the write fails.
         """
@@ -115,7 +115,7 @@ class Writer:
     def write_messages(self, messages: Sequence[Message]) -> None:
         """Write messages of topics other than /ticks as one chunk, indexed by topic; nothing for an empty sequence.
 
-        Counts the ticks that overviews among them replace. Raises OutputError.
+        Adds the ticks that overviews among them replace to `ticks_skipped`. Raises OutputError, with nothing written.
         """
         if messages:
             self._check_writable()
@@ -126,7 +126,7 @@ class Writer:
     def write_overview(self, messages: Sequence[Message], intervals: Intervals) -> None:
         """Write messages and intervals (n, columns, 3: minimum, maximum, mean) of omitted ticks as one chunk.
 
-        Counts the omitted ticks. Raises OutputError.
+        Adds the omitted ticks to `ticks_skipped`. Raises OutputError, with nothing written.
         """
         overview = OverviewLayout(self._columns).make_messages(intervals, self.start_unix_ns)
         self.write_messages([*messages, *overview])

@@ -52,7 +52,8 @@ class SignalDifferences:
     def report(self) -> dict[str, Any]:
         """Return {signals: {name: {max, at_tick, rms}}, trip: {tick, causes} of the replay or None}.
 
-        Units are those of the signals; a signal without a finite difference has zeros.
+        `max` and `rms` are of the absolute difference, in the signal's unit; a signal without a finite difference has
+        zeros.
         """
         rms = np.sqrt(self._square_sum / np.maximum(self._count, 1))
         rows = zip(self._names, self._largest.tolist(), self._at_tick.tolist(), rms.tolist(), strict=True)
@@ -77,7 +78,7 @@ class TrackingPerformance:
     def add(self, rows: Rows) -> None:
         """Add rows (n, columns) of consecutive ticks; a NaN error in closed loop counts as 0.
 
-        Rows after STEP_ANALYSIS_TICKS do not count for the steps.
+        The first trip is stored in `trip` as {tick, causes}. Rows after STEP_ANALYSIS_TICKS do not count for the steps.
         """
         if not len(rows):
             return
@@ -98,9 +99,10 @@ class TrackingPerformance:
         self.trip = self.trip or first_trip(rows)
 
     def report(self) -> list[dict[str, Any]]:
-        """Return a dict for each axis: rms_error_um, max_abs_error_um, max_abs_drive_v and steps.
+        """Return a dict for each axis, in order: rms_error_um, max_abs_error_um, max_abs_drive_v and steps.
 
-        The errors are None if the loop was never closed. `steps` is `StepMetrics.as_dict`, or None without a step.
+        The errors are None if the loop was never closed. `steps` is `StepMetrics.as_dict`, or None where `step_metrics`
+        has none.
         """
         traces = np.concatenate(self._traces) if self._traces else np.empty((0, 2 * len(self._axes)))
         return [

@@ -57,7 +57,7 @@ def replay_on_cores(
 ) -> ReplayReport:
     """Replay a recording like `rtloop.recording.replay.replay.replay` does, with up to `jobs` processes at once.
 
-    The report does not depend on `jobs`. Raises as that function.
+    The report does not depend on `jobs`. Raises RecordingError and ConfigError as that function does.
     """
     laws = recorded_laws(recording, trust)
     report = _replay_in_spans(recording, laws, jobs, progress) if jobs > 1 else None

@@ -27,7 +27,10 @@ class TimeHistogram:
         self._maximum = -math.inf
 
     def add(self, values_us: Real) -> None:
-        """Count values in µs, to 1 ns; NaN and values of NO_TIME_US or more are ignored, negative ones count as 0."""
+        """Count values in µs; NaN and values of NO_TIME_US or more are ignored, negative ones count as 0.
+
+        They are rounded as the class says, but not for the maximum.
+        """
         if not len(values_us) or not values_us.max() < NO_TIME_US:
             values_us = values_us[values_us < NO_TIME_US]
         if not len(values_us):

@@ -50,7 +50,7 @@ def plot(
 ) -> Path:
     """Write a picture of a recording from `start_s` to `end_s`, both included, in s since the start. Returns its path.
 
-    It is by default a PNG beside the recording. The suffix of `output`, one of FORMATS, selects the format; an existing
+    `output` is by default NAME.png beside the recording. Its suffix, one of FORMATS, selects the format; an existing
     file is overwritten. Raises RecordingError if no tick or signal can be drawn, OutputError for another suffix or a
     file that cannot be written, MissingExtra without matplotlib.
     """

@@ -165,7 +165,7 @@ def pack_end(
 
 
 def index_record_span(record: bytes) -> tuple[int, int, int]:
-    """Return first log time, last log time and chunk offset in a packed chunk index record."""
+    """Return first log time (ns), last log time (ns) and offset of the chunk (bytes) in a packed chunk index record."""
     _, _, start, end, offset = CHUNK_INDEX_HEAD.unpack_from(record)
     return start, end, offset
 

@@ -182,5 +182,5 @@ def _member_value(kinds: Any, name: str) -> int:
 
 
 def json_value(value: Any) -> Any:
-    """Return a value for JSON; NaN and infinities, which JSON lacks, become strings that float() parses."""
+    """Return a value for JSON; NaN and infinities, which JSON lacks, become "nan", "inf" and "-inf"."""
     return repr(value) if isinstance(value, float) and not math.isfinite(value) else value

@@ -86,8 +86,9 @@ REASON_TEXTS = {
 def step_meaning(values: Sequence[float]) -> dict[str, Any]:
     """Return {step, left, reason, causes} of the values of a RECOVERY message.
 
-    `left`: number of recoveries left within the hour; `reason`: text, or None for a step without a reason; `causes`:
-    names of the trip's causes. A step or reason that this version does not know is its number as text.
+    `step`: name of a RecoveryStep in lower case; `left`: number of recoveries left within the hour; `reason`: text, or
+    None for a step without a reason; `causes`: names of the trip's causes. A step or reason that this version does not
+    know is its number as text.
     """
     step, left, reason, causes = (int(value) for value in values[:4])
     is_known = reason in list(StepReason)

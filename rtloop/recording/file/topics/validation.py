@@ -295,7 +295,7 @@ def require_columns(header: dict[str, Any]) -> None:
 
 
 def header_extras(header: Mapping[str, Any]) -> Extras:
-    """Return the recorded inputs and outputs besides sensors and drives."""
+    """Return the recorded inputs (names) and outputs besides sensors and drives; both are empty if there were none."""
     entries = header.get("extras", {})
     outputs = [
         ExtraOutput(**{field: output[field] for field in ExtraOutput._fields if field in output})
