@@ -93,7 +93,7 @@ class RecordedSignals:
     def units(self) -> dict[str, str]:
         """Units of all signals by name, such as {"x_position_um": "µm"}; "" if a unit is unknown.
 
-        A unit that was imported with a signal goes before the one that its name gives.
+        For an imported signal, the imported unit goes before the unit by its name.
         """
         imported = self.header.get("imported", {}).get("units", {})
         return {name: imported.get(name) or signal_unit(name) for name in self.columns}

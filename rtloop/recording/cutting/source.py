@@ -78,9 +78,9 @@ class RunSource:
         raise RecordingError(f"{self.path}: {time_s:g} s is not in the recording; {end}")
 
     def first_tick_due_or_skipped(self, time_s: float) -> int:
-        """First tick due `time_s` after the start or later; if that is in an overview interval, its first tick.
+        """First tick due `time_s` after the start or later. Raises RecordingError if there is none.
 
-        Raises RecordingError if there is none.
+        If that time is in an overview interval of omitted ticks, it is the first tick of the interval.
         """
         for overview in (seeker.reader.overview for seeker in self._seekers):
             includes_time = (overview[:, DEADLINE, MINIMUM] <= time_s * 1e9) & (

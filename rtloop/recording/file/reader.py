@@ -59,7 +59,7 @@ class Reader:
     `left_out` lists the problems that removed data. `opener` opens the file:
     `open_user_file` of `rtloop.foundation.trusted` for one that a user named, another for one found in a folder.
 
-    Opening the file and every method that reads from it raise RecordingError.
+    Opening the file, and every method that reads from it, can raise RecordingError.
     """
 
     def __init__(self, path: Path | str, *, tolerant: bool = False, opener: Opener = open_user_file) -> None:

@@ -166,7 +166,10 @@ class Writer:
         self.ticks_skipped += count
 
     def _drop_last_chunk(self) -> None:
-        """Remove the last chunk from the file, and its ticks from the counts. Raises OutputError."""
+        """Remove the last chunk from the file, and its ticks from `ticks` or `ticks_skipped`.
+
+        Raises OutputError, with both counts unchanged, if the file cannot be cut.
+        """
         counts = self.file.drop_last_chunk()
         self.ticks -= counts.get(format.TICKS, 0)
         if counts.get(format.OVERVIEW):
