@@ -62,7 +62,9 @@ class Stage:
     actuator: PlayModel
 
     def complete_design(self, design: DesignOptions) -> DesignOptions:
-        """Return a copy of `design` with the identified plant, at the rate of the step recording."""
+        """Return a copy of `design` with the identified model as `plant`, and the step recording's rate as
+        `controller.rate_hz`.
+        """
         plant = ModelOptions.model_validate(model_values(self.dynamics))
         output = design.controller.model_copy(update={"rate_hz": 1 / self.fast.period_s})
         return design.model_copy(update={"plant": plant, "controller": output})
@@ -191,7 +193,8 @@ def stage_configuration(
 def reference_values(stage: Stage, axis: str | None) -> dict[str, Any]:
     """Return the table [axis.reference], a square wave as `steps_reference` makes, for the step recording's axis.
 
-    `axis` is the name of one of its axes, None the first.
+    It is {"kind": "steps", "levels": two in µm, "dwell_s": the duration of each}. `axis` is the name of one of the
+    recording's axes, None the first.
     """
     limits = LimitsOptions.model_validate(_axis_table(tomllib.loads(stage.fast.configuration), axis).get("limits", {}))
     slowest_hz = min((mode.frequency_hz for mode in stage.dynamics.modes), default=math.inf)
@@ -204,7 +207,8 @@ def _axis_table(configuration: Mapping[str, Any], axis: str | None) -> dict[str,
 
 
 def _enable_oscillation(interlocks: Mapping[str, Any], dynamics: DynamicsFit, period_s: float) -> dict[str, Any]:
-    """Return the interlocks with the one against a growing resonance enabled; the identification runs without it.
+    """Return the interlocks with the one against a growing resonance enabled, by `oscillation_swings` and
+    `swing_ticks`; the identification runs without it.
 
     Without a lightly damped mode, or with the interlock set already, the copy is unchanged.
     """

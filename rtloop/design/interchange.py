@@ -23,7 +23,8 @@ library: Any = control  # its annotations do not describe its functions
 def to_control(
     system: Transfer | DiscreteController | Loop | FrequencyResponse,
 ) -> control.StateSpace | control.FrequencyResponseData:
-    """Return the system as a python-control object: frequencies in rad/s, `dt` the period in s, or 0 if continuous.
+    """Return a frequency response as FrequencyResponseData in rad/s, without coherence, any other system as StateSpace
+    whose `dt` is the period in s, or 0 if continuous.
 
     A loop becomes L = C·D, cut open, with its delay.
     """

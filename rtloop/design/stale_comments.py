@@ -59,7 +59,8 @@ def remove_stale_comments(text: str, values: Mapping[str, Any], rewritten: Colle
 
 
 def _heading(line: str, values: Mapping[str, Any], counts: dict[str, int]) -> list[str | int] | None:
-    """Return the path of the section that a line begins, with indices of tables in lists; None for another line.
+    """Return the path of the section that a line begins, with indices of tables in lists, such as ["axis", 0, "model"];
+    None for another line.
 
     `counts` holds the count of headings [[…]] so far by name, and is brought up to date.
     """

@@ -114,10 +114,10 @@ def read_axis_recording(path: Path, axis: str | None = None) -> AxisRecording:
 
 
 def shifted_rows(recording: Recording) -> int:
-    """Return by how many rows the position of a recording is early: 1 if drive and position were sampled together.
+    """Return by how many rows the position must move, later in time, so that a drive acts on the next row's position.
 
-    They were in an imported recording, unless its header says that the position of a row was sampled before the drive
-    changed. Return 0 for all others.
+    It is 1 if drive and position of a row were sampled together: in an imported recording, unless its header says that
+    the position was sampled before the drive changed. It is 0 for all others.
     """
     imported = recording.header.get("imported")
     return int(imported is not None and not imported.get("position_first", False))
@@ -126,8 +126,8 @@ def shifted_rows(recording: Recording) -> int:
 def distinct(
     runs: Sequence[AxisRecording], other_runs: Sequence[AxisRecording] = ()
 ) -> tuple[list[AxisRecording], list[str]]:
-    """Return the runs whose ticks are in neither an earlier run nor one of `other_runs`, and a sentence for each
-    omitted run.
+    """Return the runs in their order, without those whose drive and position are in all ticks the same as in an
+    earlier run or in one of `other_runs`, and a sentence for each omitted run.
 
     A copy of a recording is no independent evidence.
     """
@@ -160,8 +160,8 @@ def _signals(recording: Recording, path: Path, *names: str) -> list[Real]:
 
 
 def require_usable(name: str, drive_v: Real, position_um: Real, adc_v: Real | None) -> None:
-    """Raise UnsuitableData for a signal that is not finite or clipped, a drive that does not move, and a position that
-    moves by less than LEAST_SPAN_TO_NOISE times its noise.
+    """Raise UnsuitableData for a drive or position that is not finite, a drive that does not move, a position that
+    moves by less than LEAST_SPAN_TO_NOISE times its noise or not at all, and a clipped reading.
 
     `name` names the recording. `adc_v` (ticks,) is the reading; None for a recording without readings, in which the
     position is searched for clipping.
@@ -288,8 +288,8 @@ def trip_remedy(causes: Sequence[str]) -> str:
 
 
 def select_axis(recording: Recording, axis: str | None, path: Path) -> str:
-    """Return `axis`, or the only axis for None. Raises RecordingError if `axis` is unknown, or None with several
-    axes.
+    """Return `axis`, or the only axis for None. Raises RecordingError if `axis` is unknown, or None without exactly one
+    axis.
     """
     axes = recording.header.get("axes", [])
     if axis is None and len(axes) == 1:

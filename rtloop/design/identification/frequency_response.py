@@ -114,7 +114,8 @@ def _require_two_segments(samples: int, period_s: float, segment_s: float = SEGM
 def compare_responses(model: Innovations, measured_curve: FrequencyResponse) -> Agreement:
     """Compare a sampled model with a measured response at the trusted frequencies.
 
-    Returns the median and the largest of |model − measured|/|measured|, the frequency of the latter, and both peaks.
+    Returns the median and the largest of |model − measured|/|measured| as fractions, the frequency of the latter, and
+    the frequencies in Hz at which either magnitude is largest, all among the trusted frequencies.
 
     Raises UnsuitableData if no frequency is trusted.
     """

@@ -38,7 +38,7 @@ def feedforward_section(model: PlayModel, comments: Sequence[str]) -> str:
 
 
 def feedforward_values(model: PlayModel) -> dict[str, Any]:
-    """Return [axis.feedforward] as plain values: `thresholds_v` and `weights_um_per_v`.
+    """Return [axis.feedforward] as {"thresholds_v", "weights_um_per_v"}, two lists of numbers.
 
     Raises UnsuitableData for weights that have no inverse.
     """
@@ -55,7 +55,9 @@ def model_section(fit: DynamicsFit, comment_lines: Sequence[str]) -> str:
 
 
 def model_values(fit: DynamicsFit) -> dict[str, Any]:
-    """Return [axis.model] as plain values: the transfer function as zeros, poles and gain, and `delay_ticks`."""
+    """Return [axis.model] as {"form": "zpk", "gain", "zeros", "poles", "delay_ticks"}, each root in rad/s as a pair
+    [real, imaginary].
+    """
     return {**zpk_values(fit.transfer), "delay_ticks": fit.delay_ticks}
 
 
@@ -130,8 +132,8 @@ class PlantSections(NamedTuple):
 
 
 def read_identified(path: Path, axis: str | None = None) -> PlantSections:
-    """Read [axis.model] and, where there is one, [axis.feedforward] from a file: as `identify` wrote it, or of axis
-    `axis` (None: first) of a configuration.
+    """Read [axis.model] and [axis.feedforward] (None where there is none) from a file: as `identify` wrote it, or of
+    axis `axis` (None: first) of a configuration.
 
     Raises InputFileError for a file that cannot be read; ConfigError for text that is no TOML, a missing axis or
     [axis.model], and invalid options.
@@ -201,8 +203,9 @@ def require_new(path: Path | None) -> None:
 
 
 def write_new_file(path: Path, content: str) -> None:
-    """Write a text file under a temporary name and rename it. Raises OutputError if `path` exists or cannot be
-    written.
+    """Write a text file under a temporary name and rename it to `path`, so that it is there in full or not at all.
+
+    Raises OutputError if `path` exists, with nothing written, or cannot be written: a temporary file may then remain.
     """
     part = path.with_name(f"{path.name}.{os.getpid()}.part")
     try:

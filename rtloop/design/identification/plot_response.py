@@ -17,7 +17,7 @@ PLANE_LIMIT = 2.0
 
 
 def plot_response(measurement: Mapping[str, Any], output: Path) -> None:
-    """Write a PNG of a `LoopMeasurement` given as its JSON mapping.
+    """Write a PNG of a `LoopMeasurement`, given as its JSON mapping, to `output`, over an existing file.
 
     Raises OutputError if `output` cannot be written, MissingExtra without matplotlib.
     """

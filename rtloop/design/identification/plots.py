@@ -61,7 +61,7 @@ def draw_dynamics(fit: DynamicsFit, run: Excitation, measured: FrequencyResponse
     """Return a picture of response and model in time (Fig 5 of the paper), over ZOOM_PERIODS periods, their difference,
     and both over frequency, in magnitude and phase.
 
-    `input_unit` is "V" or "µm". The input is already delayed by the model's delay, which the phase leaves out.
+    `input_unit` is "V" or "µm". The input of `run` is already delayed by the model's delay, which the phase leaves out.
     `measured` None omits the measured frequency response. Raises MissingExtra without matplotlib.
     """
     figure = create_picture(13, 8)
@@ -134,7 +134,7 @@ def _draw_over_frequency(
 
 def plot_compensation(residual: Residual, actuator: PlayModel, inverse: PlayModel, output: Path) -> None:
     """Write a PNG of the compensated position y over the command v (Fig 7 of the paper), and of the residual
-    Ω = y − ρ v with its bound ±ξ.
+    Ω = y − ρ v with its bound ±ξ, to `output`, over an existing file.
 
     Raises OutputError if `output` cannot be written, MissingExtra without matplotlib.
     """

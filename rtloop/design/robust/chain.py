@@ -264,8 +264,8 @@ def _slowest_hz(family: Family) -> float:
 
 
 def _limit_command(subject: Subject, design: DesignOptions) -> Subject:
-    """Return `subject` with |v| limited to `specification.command.command_um` too, unchanged unless that is larger than
-    its reference step.
+    """Return `subject` with |v| limited to `command_um` of [specification.command] too; unchanged unless `command_um`
+    is larger than `reference_um`.
     """
     command, bounds = design.specification.command, subject.bounds
     if command is None or command.command_um <= command.reference_um:

@@ -31,7 +31,7 @@ class ScenarioOptions(Options):
 
     @model_validator(mode="after")
     def _check(self) -> Self:
-        """Require damping factors from 0.01 to 10 and delays from 0 to MOST_DELAY samples."""
+        """Raise ValueError unless damping factors are from 0.01 to 10 and delays from 0 to MOST_DELAY samples."""
         if not all(0.01 <= factor <= 10 for factor in self.damping):
             raise ValueError(f"damping: {list(self.damping)}; allowed: factors from 0.01 to 10")
         if not all(0 <= ticks <= MOST_DELAY for ticks in self.delay_ticks):

@@ -55,7 +55,7 @@ class Family:
 
     @property
     def bands(self) -> Real:
-        """Least and largest |Im s| (rad/s) of closed-loop poles that belong to each leading mode, (n, 2).
+        """Least and largest |Im s| (rad/s) of closed-loop poles that belong to each leading mode, (leading modes, 2).
 
         MODE_BAND times the mode's |s|, as far as no other lightly damped mode is nearer.
         """
@@ -115,7 +115,8 @@ class Family:
 
     def sweep_scenarios(self, count: int) -> Iterator[Scenario]:
         """Yield scenarios for every delay and each end of damping and gain: all lightly damped modes are moved
-        together, to `count` even steps of ±resonance_percent; a single step without lightly damped modes or range.
+        together, by `count` evenly spaced shifts from −resonance_percent to +resonance_percent; by 0 alone without
+        lightly damped modes or range.
         """
         r, g = self.options.resonance_percent, self.options.gain_percent
         places = np.linspace(-r, r, count) if self.modes.size and r else [0.0]

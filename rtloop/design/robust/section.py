@@ -77,8 +77,8 @@ def taps_values(taps: Taps) -> dict[str, Any]:
 
 
 def taps_provenance(tap_design: TapDesign, subject: Subject, source: str) -> list[str]:
-    """Return comment lines on the origin of taps; `source` is the name of the file with their controller or
-    specification.
+    """Return comment lines, without #, on the origin of taps; `source` is the name of the file with their controller
+    or specification.
     """
     options, proof = subject.options.scenarios, tap_design.proof
     return [
@@ -101,12 +101,14 @@ def certified_values(proof: Certificate) -> list[tuple[str, float, str]]:
 
 
 def robust_values(robust: RobustDesign, design: DesignOptions) -> dict[str, Any]:
-    """Return [axis.controller] as plain values, with the method "matched"."""
+    """Return [axis.controller] as {"form": "zpk", "gain", "zeros", "poles", "method": "matched"}; each root in rad/s as
+    a pair [real, imaginary].
+    """
     return controller_values(robust.controller, _output(design))
 
 
 def provenance(robust: RobustDesign, design: DesignOptions, source: str, text: str) -> list[str]:
-    """Return comment lines on the origin of a controller and its certified figures.
+    """Return comment lines, without #, on the origin of a controller and its certified figures.
 
     `source` and `text` are the specification's name and content.
     """

@@ -176,7 +176,7 @@ def fastest_settling(programme: Programme, overshoot: float, least_ticks: float 
     """Return the least settling time in ticks, at least `least_ticks`, at which taps with `overshoot` (a fraction, see
     `Programme.is_feasible`) exist; resolution 1/points of a tick.
 
-    None if LONGEST_SHARE of the taps' length does not suffice.
+    None if LONGEST_SHARE of the taps' length does not suffice. Raises NoDesign if no solver finishes.
     """
 
     def is_feasible(point: int) -> bool:
@@ -203,8 +203,8 @@ def fastest_settling(programme: Programme, overshoot: float, least_ticks: float 
 
 
 def trade_off_curve(programme: Programme, fastest: float, tick_ms: float) -> tuple[tuple[float, float], ...]:
-    """Return points (settling time in ms, least ε) for settling times around `fastest` ticks (CURVE_RANGE); infeasible
-    times are omitted.
+    """Return points (settling time in ms, least overshoot as a fraction), by rising time, for settling times around
+    `fastest` ticks (CURVE_RANGE); infeasible times are omitted. Raises NoDesign if no solver finishes.
     """
     points: list[tuple[float, float]] = []
     for place in np.unique(np.round(np.linspace(*CURVE_RANGE) * fastest * programme.points)):

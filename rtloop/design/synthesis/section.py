@@ -99,7 +99,9 @@ def configuration_around(
 
 
 def _separate_poles(plant: Transfer) -> Transfer:
-    """Return the plant, with repeated poles moved apart by POLE_SPACING at the same static gain."""
+    """Return the plant; if poles repeat, its real poles, and likewise its pairs, are multiplied in order by 1,
+    1 + POLE_SPACING, 1 + 2·POLE_SPACING …, with the static gain preserved.
+    """
     try:
         modal_sum(plant.zeros, plant.poles, plant.gain)
     except RepeatedPoles:
@@ -113,8 +115,8 @@ def _separate_poles(plant: Transfer) -> Transfer:
 
 
 def provenance(synthesis: Synthesis, design: DesignOptions, source: str, text: str) -> list[str]:
-    """Return comment lines on the origin of the controller; `source` and `text` are the specification's name and
-    content.
+    """Return comment lines, without #, on the origin of the controller; `source` and `text` are the specification's
+    name and content.
     """
     hinf, weights = synthesis.hinf, synthesis.weights
     order, full_order = synthesis.controller.order, synthesis.full.order
@@ -137,13 +139,15 @@ def provenance(synthesis: Synthesis, design: DesignOptions, source: str, text: s
 
 
 def controller_values(controller: Transfer, output: OutputOptions) -> dict[str, Any]:
-    """Return [axis.controller] as plain values: zeros, poles, gain, `method` and, if set, `prewarp_hz`."""
+    """Return [axis.controller] as {"form": "zpk", "gain", "zeros", "poles", "method"} and, if set, "prewarp_hz"; each
+    root in rad/s as a pair [real, imaginary].
+    """
     prewarp = {} if output.prewarp_hz is None else {"prewarp_hz": output.prewarp_hz}
     return {**zpk_values(controller), "method": output.method, **prewarp}
 
 
 def formula(transfer: Transfer) -> str:
-    """Return gain and real factors of zeros and poles as text, six digits each."""
+    """Return gain and real factors of zeros and poles as text, six digits each: "0.5 (s + 3)/(s² + 2 s + 5)"."""
     numerator = "".join(_factors(transfer.zeros)) or "1"
     denominator = "".join(_factors(transfer.poles))
     return f"{transfer.gain:.6g} {numerator}/{denominator}" if denominator else f"{transfer.gain:.6g}"

@@ -99,7 +99,7 @@ class SpecificationOptions(Options):
 
     @model_validator(mode="after")
     def _check(self) -> Self:
-        """Require that every claim is about one of QUANTITIES or EXPERIMENT_QUANTITIES."""
+        """Raise ValueError for claims about other quantities than QUANTITIES and EXPERIMENT_QUANTITIES."""
         unknown = sorted(set(self.claims) - set(QUANTITIES) - set(EXPERIMENT_QUANTITIES))
         if unknown:
             allowed = ", ".join((*QUANTITIES, *EXPERIMENT_QUANTITIES))
@@ -202,7 +202,7 @@ class SimulationOptions(Options):
 
     @model_validator(mode="after")
     def _check(self) -> Self:
-        """Require step heights above 0."""
+        """Raise ValueError unless all step heights are above 0."""
         if self.steps_um is not None and not all(height > 0 for height in self.steps_um):
             raise ValueError(f"steps_um: {list(self.steps_um)}; allowed: heights above 0")
         return self
@@ -251,7 +251,7 @@ class OutputOptions(Options):
 
     @model_validator(mode="after")
     def _check(self) -> Self:
-        """Require that `prewarp_hz` is set with the method "tustin" only."""
+        """Raise ValueError if `prewarp_hz` is set with another method than "tustin"."""
         if self.prewarp_hz is not None and self.method != "tustin":
             raise ValueError(
                 f"prewarp_hz is set, but method is {self.method!r}; remove prewarp_hz, or set method = 'tustin'"

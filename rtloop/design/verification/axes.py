@@ -127,7 +127,7 @@ Verifications = dict[str, tuple[Verification, DesignOptions]]
 def add_simulation(configuration: Configuration, verifications: Verifications) -> Verifications:
     """Return the verifications with simulated steps of every stable axis; an unstable one stays unchanged.
 
-    If no rig can represent the hardware, every axis gets a warning instead.
+    If no rig can represent the hardware, or the configuration cannot run on it, every axis gets a warning instead.
     """
     axes = {axis.name: axis for axis in configuration.axes}
     hardware_models = {name: _hardware_model(axes[name], design) for name, (_, design) in verifications.items()}

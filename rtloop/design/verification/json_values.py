@@ -13,9 +13,10 @@ from rtloop.values import to_jsonable
 def as_dict(verification: Verification) -> dict[str, Any]:
     """Return a verification for JSON; null stands for an undefined or infinite value and a missing limit.
 
-    Robustness is computed if it was not before. Keys: meets, stable, delay_ticks, rate_hz, rows,
-    resonance_shift_percent, robustness_percent, delay_margin_us, more_delay_ticks, together, scenarios, host_delay,
-    simulated, warnings.
+    Robustness is computed if it was not before. Keys: meets; stable {continuous, running}; delay_ticks; rate_hz; rows
+    (`_row`); resonance_shift_percent {"continuous" or the samples of delay: [−down, up]}; robustness_percent {plant
+    parameter: {"continuous", "running" or "running_missed": [−down, up]}}; delay_margin_us; more_delay_ticks; together;
+    scenarios (`_scenarios`); host_delay; simulated; warnings, as texts.
     """
     robustness = verification.robustness
     values = {

@@ -29,7 +29,10 @@ class Limit(NamedTuple):
 
 
 def required_limits(specification: SpecificationOptions) -> dict[str, Limit]:
-    """Return the limit of each required quantity, keyed as in `rtloop.design.synthesis.specification.QUANTITIES`."""
+    """Return the limit of each required quantity, keyed as in `rtloop.design.synthesis.specification.QUANTITIES`.
+
+    The limit of `disturbance_hz` is infinite for a disturbance without `up_to_hz`.
+    """
     directions = {"static_error_percent": True, "settling_ms": True, "overshoot_percent": True, "bandwidth_hz": False,
                   "modulus_margin": False, "resonance_decay_ms": True, "resonance_shift_percent": False}  # fmt: skip
     required = {
@@ -47,10 +50,11 @@ def required_limits(specification: SpecificationOptions) -> dict[str, Limit]:
 def specified_quantities(
     loop: Loop, specification: SpecificationOptions, resonance: float | None = None
 ) -> dict[str, float]:
-    """Return the quantities that a specification can limit, by name: all of SPECIFIED, `disturbance_hz` and
-    `modulus_margin` if they are specified, `resonance_decay_ms` with a `resonance`, the model's in rad/s.
+    """Return the quantities that a specification can limit, by name: `static_error_percent`, `settling_ms`,
+    `overshoot_percent`, `peak_command` and `bandwidth_hz` (SPECIFIED), `disturbance_hz` and `modulus_margin` if they
+    are specified, `resonance_decay_ms` with a `resonance`, the model's in rad/s.
 
-    All are NaN for an unstable loop.
+    All are NaN for an unstable loop; settling and overshoot also where the static error exceeds 5 %.
     """
     conditions = {
         "disturbance_hz": specification.disturbance,
@@ -96,8 +100,9 @@ def slowest_near_s(loop: Loop, resonance: float) -> float:
 
 
 def loop_quantities(loop: Loop, sensor: SensorOptions) -> dict[str, float]:
-    """Return the quantities of a loop beside `specified_quantities`, by name: `max_re_pole` (continuous loop) or
-    `max_abs_pole` (sampled), crossover, margins, max |S|, |S| at 1 Hz and, as in `_noise`, sensor noise.
+    """Return the quantities of a loop beside `specified_quantities`, by name: `max_re_pole` in rad/s (continuous loop)
+    or `max_abs_pole` (sampled), `crossover_hz`, `phase_margin_deg`, `gain_margin` (a factor), `modulus_margin`,
+    `max_sensitivity`, `sensitivity_1hz`; with sensor noise, for a stable sampled loop, `noise_x_nm`, `noise_v_nm`, rms.
     """
     margins = loop_margins(loop)
     name, magnitudes = (

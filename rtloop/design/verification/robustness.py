@@ -86,7 +86,8 @@ def range_until_missed(
     specification: SpecificationOptions,
     required: dict[str, Limit],
 ) -> PercentRange:
-    """Return the range in percent over which the loop is stable and every limit of `required` is met.
+    """Return how far `change` may go, down and up in percent (both ≥ 0), with the loop stable and every limit of
+    `required` met.
 
     (0, 0) if one is missed without change; None for an end without a failure.
     """

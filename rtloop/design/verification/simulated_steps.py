@@ -85,8 +85,9 @@ class SimulationResult:
         ] + [f"steps of {step.height_um:g} µm, which trip" for step in self.steps if step.trips]
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the result for JSON: `truth`, `steps`, `left_out_um`, `range_um`, `noise_x_nm`, `noise_v_nm`,
-        `judged`.
+        """Return the result for JSON: `truth`; `steps`, each with the fields of SimulatedStep and `met` {figure:
+        whether it meets its limit}, without figures that have none; `left_out_um`; `range_um` [low, high];
+        `noise_x_nm`; `noise_v_nm`; `judged`.
         """
         steps = [
             {

@@ -79,6 +79,8 @@ class VerifiedLoop(NamedTuple):
 class Robustness(NamedTuple):
     """Tolerated changes in percent, until the loop is unstable and until a requirement met now is missed.
 
+    Both ends of a range, `down` and `up`, are ≥ 0, or None if the search found no failure there.
+
     `ranges` maps a plant parameter to "continuous", "running" and "running_missed" (None if no limit is met); `shifts`
     is the tolerated shift of the resonance, by "continuous" or samples of delay. "continuous" exists with C(s) only.
     `delay_us` is the additional delay that the loop of C(s) tolerates, or without C(s) the running loop; `delay_ticks`

@@ -122,7 +122,8 @@ def static_gain_std(model: Innovations, covariance: Real, *, noise: bool) -> flo
 
 
 def _limit_fast_rates(rates: Complex, residues: Complex, period_s: float) -> tuple[Complex, Complex]:
-    """Return rates (n,) and residues (m, n) with decay limited to FASTEST_DECAY per tick; D(0) is preserved.
+    """Return rates (n,) in rad/s and residues in z (m, n) with decay limited to FASTEST_DECAY per tick; D(0) is
+    preserved.
 
     A delay by a fraction of a tick makes a pole at z ≈ 0, which lies anywhere beyond reach in s.
     """

@@ -57,6 +57,7 @@ def identify_delay(run: Excitation, orders: Sequence[int]) -> int:
     """Return the delay, 0 to MOST_TICKS samples, judged on the held-out samples or, without any, on all.
 
     `orders` are the numbers of poles to try. If no model can be fitted, the longest delay that ARX allows is returned.
+    Raises ArithmeticError if the predictor of a refitted model is unstable.
     """
     delays = _candidate_delays(run)
     if len(delays) == 1:
@@ -101,10 +102,11 @@ def _judge_candidate(ticks: int, model: Innovations, run: Excitation, start: int
 
 
 def _refitted_rms_um(model: Innovations, run: Excitation) -> float:
-    """Return the rms one-step-ahead error in µm after the model was fitted to the whole recording; infinite where that
-    fails.
+    """Return the rms one-step-ahead error in µm after the model was fitted to the whole recording; infinite if the
+    result is not stable.
 
-    Models with equally many unknowns are in the order of Akaike's criterion.
+    For models with equally many unknowns it ranks as Akaike's criterion does. Raises ArithmeticError for an unstable
+    predictor.
     """
     fitted = refine(model, run)
     return np.inf if fitted is None else rms_error(fitted, run)
@@ -116,7 +118,8 @@ def fitted_part(run: Excitation, start: int | None) -> Excitation:
 
 
 def held_out_start(run: Excitation) -> int | None:
-    """Return the first held-out sample; None where the input changes too little before it or from it on.
+    """Return the first held-out sample; None if no change of the input leaves LEAST_SHARE of all squared changes both
+    before it and from it on.
 
     It is the first change that has half of all squared changes before it, or else LEAST_SHARE of them.
     """

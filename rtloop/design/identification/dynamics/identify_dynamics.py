@@ -93,7 +93,8 @@ def _identify_from_rest(
 ) -> tuple[DynamicsFit, Excitation]:
     """Identify a model as `identify_dynamics`, of a run from rest. Returns also the run that it was fitted to.
 
-    Its input is delayed, its position relative to the first one. Raises as `identify_dynamics`.
+    The input of that run is delayed and the levels it holds are corrected (`correct_levels`); its position is relative
+    to the first one. Raises as `identify_dynamics`.
     """
     if criterion == "validation" and not validation:
         raise ValueError("criterion 'validation' needs another recording for the validation; give a further RUN")

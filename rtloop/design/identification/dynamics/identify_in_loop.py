@@ -64,8 +64,10 @@ def identify_recorded_dynamics(
 ) -> DynamicsFit:
     """Identify dynamics of a LoopExcitation by `identify_in_loop`, of any other run by `identify_dynamics`.
 
-    Arguments and errors are as there; None for `criterion` is "held-out". Raises ValueError for another criterion in
-    closed loop.
+    The model has `order` poles behind `delay_ticks` samples of delay; None estimates them, the order up to
+    `largest_order`. The candidates also report their errors on the runs `validation`. None for `criterion` is
+    "held-out". Raises ValueError for another criterion in closed loop, and the errors of both functions, such as
+    UnsuitableData.
     """
     if not isinstance(run, LoopExcitation):
         return identify_dynamics(run, order, largest_order, criterion or "held-out", validation, delay_ticks)
@@ -81,7 +83,8 @@ def identify_in_loop(
     validation: Sequence[Excitation] = (),
     delay_ticks: int | None = None,
 ) -> DynamicsFit:
-    """Identify a model of `order` poles behind `delay_ticks` samples; None chooses them by the held-out part.
+    """Identify a model of `order` poles behind `delay_ticks` samples; None chooses them by the held-out part, the order
+    up to `largest_order`.
 
     The candidates also report their errors on `validation`. Raises UnsuitableData for fewer than LEAST_SAMPLES ticks,
     for external signals that stand still, if no model is stable, and if no mode's frequency is certain.

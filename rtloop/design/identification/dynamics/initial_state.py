@@ -52,6 +52,6 @@ def free_motion(model: Innovations, run: Excitation) -> FreeMotion | None:
 
 
 def _decay_samples(model: Innovations) -> int:
-    """Return the number of samples in which the slowest mode decays to DECAY."""
+    """Return the number of samples in which the slowest mode decays to DECAY, at least FEWEST_SAMPLES."""
     slowest_per_s = max(float(-model.rates.real.max()), 1e-9)
     return max(int(-np.log(DECAY) / (slowest_per_s * model.period_s)), FEWEST_SAMPLES)

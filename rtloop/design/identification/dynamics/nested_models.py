@@ -60,8 +60,8 @@ class JudgedModel:
         return float(np.sqrt(np.mean(self.squared_errors)))
 
     def is_worse_than(self, reference: JudgedModel) -> bool:
-        """Whether the held-out errors exceed the errors of `reference` by more than CLEAR_STD_ERRORS standard
-        errors.
+        """Whether the mean square of the held-out errors exceeds that of `reference` by more than CLEAR_STD_ERRORS
+        standard errors of the difference.
         """
         excess = self.squared_errors - reference.squared_errors
         return float(excess.mean()) > CLEAR_STD_ERRORS * float(excess.std()) / np.sqrt(excess.size)

@@ -54,7 +54,8 @@ def fit_models(run: Excitation, orders: Sequence[int]) -> list[Innovations]:
     """Return models of increasing order, from two poles below the last clear gap in the singular values of the impulse
     response, until two in a row beyond the last likely gap bring no gain.
 
-    A single order is fitted in any case; orders without a stable model are omitted.
+    A single order is fitted in any case; orders without a stable model are omitted, so that the list may be empty.
+    Raises ArithmeticError for a model with an unstable predictor.
     """
     guesses = _mode_guesses(run)
     clear_order, likely_order = (

@@ -52,7 +52,8 @@ class AveragedRecording(NamedTuple):
 def average_recording(
     run: AxisRecording, runs: int, before_v: npt.ArrayLike | None = None, blocks: int = BLOCKS
 ) -> AveragedRecording:
-    """Return the recording `run` averaged over blocks; `runs` is the number of recordings that share about `blocks`.
+    """Return the recording `run` averaged over at most `blocks`/3 blocks, or `blocks`/`runs` if it is one of more than
+    three recordings; at most LEAST_BLOCKS if that is more.
 
     Each drive is paired with the position of the following tick. `before_v` (k,) is the drive in V from rest to the
     first tick, [0] for a start at rest, None if unknown.

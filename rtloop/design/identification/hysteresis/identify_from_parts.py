@@ -142,7 +142,8 @@ def _require_stroke(runs: Sequence[AxisRecording], work: RecordingSet) -> tuple[
 def _choose_trial(work: RecordingSet, trials: Sequence[Trial]) -> tuple[Trial, dict[str, float]]:
     """Choose placement, then drift, then creep, each if it lowers the held-out error.
 
-    Returns the chosen trial and the rms error in µm of every trial, by its name.
+    Returns the chosen trial and the held-out rms error in µm of every trial, by a name of placement and terms such as
+    "chebyshev + drift + creep", with " by path" for creep over the drive's path.
     """
     squares_by_name = {trial.placement: _mean_squares(work, trial) for trial in trials}
     best_trial = min(trials, key=lambda trial: float(np.mean(squares_by_name[trial.placement])))
@@ -166,11 +167,13 @@ def _lowers_error(squares: Real, reference_squares: Real) -> bool:
 def _is_lag_over_time(
     work: RecordingSet, trial: Trial, name: str, squares_by_name: dict[str, Real], reference_squares: Real
 ) -> bool:
-    """Whether creep lowers the error of all recordings, and more than a memory that fades with the drive's path.
+    """Whether the error with creep is less than without it, and than with a memory that fades with the drive's path:
+    both by LEAST_STD_ERRORS standard errors over the recordings, the second also by the factor IMPROVED_SHARE.
 
     `squares_by_name` has the mean square errors of `trial`, which includes creep, under `name`; this function adds the
-    errors with a memory by path. An actuator that is no sum of plays may have such a memory (Bouc and Wen's is a lag by
-    path); weights fitted beside it would not model it. A drive of one speed cannot tell the two apart.
+    errors with a memory by path under "NAME by path". An actuator that is no sum of plays may have such a memory (Bouc
+    and Wen's is a lag by path); weights fitted beside it would not model it. A drive of one speed cannot tell the two
+    apart.
     """
     path_name = f"{name} by path"
     squares_by_name[path_name] = _mean_squares(work, trial._replace(clock="path"))

@@ -135,7 +135,8 @@ def prepare_recordings(
     before_v: Sequence[npt.ArrayLike | None] | None,
     blocks: int = BLOCKS,
 ) -> RecordingSet:
-    """Return the recordings averaged to about `blocks` blocks in all.
+    """Return the recordings averaged over blocks of equal length, each as by `average_recording` to its share of
+    `blocks`.
 
     `before_v` has for each recording the drive in V from rest to its first tick, [0] for a start at rest, None if
     unknown; None instead of a list: unknown for all.

@@ -14,15 +14,18 @@ Placement = Literal["auto", "chebyshev", "chebyshev-from-0", "uniform"]
 
 
 def candidate_placements(placement: Placement) -> tuple[PlacementRule, ...]:
-    """Return the rules to try: for "auto" with and without a dead band. Raises ValueError for an unknown placement."""
+    """Return the rules to try: "chebyshev" and "chebyshev-from-0" for "auto", otherwise `placement` alone.
+
+    Raises ValueError for an unknown placement.
+    """
     if placement not in get_args(Placement):
         raise ValueError(f"placement: {placement!r}; allowed: {', '.join(get_args(Placement))}")
     return ("chebyshev", "chebyshev-from-0") if placement == "auto" else (placement,)
 
 
 def place_thresholds(count: int, largest_v: float, placement: PlacementRule) -> Real:
-    """Return `count` thresholds in V below `largest_v`, the largest drive. Raises ValueError unless 1 ≤ count ≤
-    MAX_PLAYS.
+    """Return n = `count` thresholds in V, rising, below R = `largest_v`, the largest drive. Raises ValueError unless
+    1 ≤ count ≤ MAX_PLAYS.
 
     "chebyshev": R/2·(1 − cos(π i/(n + 1))), i = 1 … n, dense at both ends, where loops are round; n = 15 and R = 10
     give eq (4) within 0.02 V. "chebyshev-from-0": R/2·(1 − cos(π i/n)), i = 0 … n − 1, without a dead band.

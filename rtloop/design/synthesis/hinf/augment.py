@@ -56,7 +56,7 @@ class GeneralisedPlant(NamedTuple):
     def close_loop(self, controller: Matrices) -> Matrices:
         """Return F_l(P, K), the loop from w to z with u = K y; states of the plant, then of K.
 
-        Raises ValueError if it is not well posed.
+        Raises ValueError if the loop is not well posed: I − D22·D_K is singular.
         """
         loop_matrix = np.eye(self.d22.shape[0]) - self.d22 @ controller.d
         if np.linalg.cond(loop_matrix) > 1e14:

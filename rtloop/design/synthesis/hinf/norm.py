@@ -28,7 +28,10 @@ class Peak(NamedTuple):
 
 
 def hinf_norm(system: Matrices, tolerance: float = 1e-6) -> Peak:
-    """Return the H∞ norm, too small by at most `tolerance` of it, and its frequency; inf for an unstable system."""
+    """Return the H∞ norm, too small by at most `tolerance` of it, and its frequency in rad/s, inf for the direct part.
+
+    For an unstable system the norm is inf, and the frequency |p| of its pole farthest right.
+    """
     poles = np.linalg.eigvals(system.a)
     if np.any(poles.real >= 0):
         return Peak(math.inf, float(np.abs(poles[np.argmax(poles.real)])))

@@ -9,9 +9,9 @@ from rtloop.errors import MissingExtra
 
 
 def slicot_gamma(plant: GeneralisedPlant, start: float) -> tuple[float, Matrices]:
-    """Return γ_opt by bisection down from `start`, and the controller there. D22 is left out, which does not change γ.
+    """Return γ_opt by bisection down from `start`, and the controller there, for the plant with D22 = 0.
 
-    Raises MissingExtra without slycot.
+    D22 does not change γ. Raises MissingExtra without slycot.
     """
     try:
         import slycot  # pyright: ignore[reportMissingImports]

@@ -52,10 +52,10 @@ class _Solutions(NamedTuple):
 def synthesise_hinf(
     plant: GeneralisedPlant, gamma: float | None = None, backoff: float = 0.004, tolerance: float = 1e-7
 ) -> Hinf:
-    """Synthesise the central controller, of the plant's order, at `gamma` or (1 + `backoff`)·γ_opt.
+    """Synthesise the central controller, of the plant's order, at `gamma`; None takes (1 + `backoff`)·γ_opt.
 
-    Raises NoController if an assumption fails, no γ up to LARGEST_GAMMA or not `gamma` can be reached, or rounding has
-    spoilt the controller.
+    `tolerance` is the largest relative error of γ_opt. Raises NoController if an assumption fails, no γ up to
+    LARGEST_GAMMA or not `gamma` can be reached, or rounding has spoilt the controller.
     """
     check_assumptions(plant)
     normal_form = normalise(plant)
