@@ -245,8 +245,9 @@ def _add_disturbance(design: DesignOptions) -> DesignOptions:
 
 
 def _choose_tap_options(design: DesignOptions, family: Family) -> DesignOptions:
-    """Return `design` with unset tap options set: enough taps for the slowest leading mode, about as many points in
-    total as the default taps have, and a settling band of ±NARROW_PERCENT, which leaves room for nonlinear effects.
+    """Return `design` with unset options of [shape] set: enough `taps` for the slowest leading mode, `points_per_tick`
+    for about as many points in total as the default taps have, and a `band_percent` for settling of NARROW_PERCENT,
+    which leaves room for nonlinear effects.
     """
     shape: ShapeOptions = design.shape
     needed_taps = math.ceil(TAP_PERIODS / (_slowest_hz(family) * family.period_s))

@@ -144,7 +144,9 @@ def _run_steps(bench: Bench, axis: str, levels_um: tuple[float, ...], dwell_s: f
 
 
 def _summarise_steps(height_um: float, levels_um: tuple[float, ...], runs: Sequence[_SteppedRecord]) -> SimulatedStep:
-    """Return the figures of all steps of one height from several runs; trips count in any tick, limits in steps."""
+    """Return the figures of all steps of one height from several runs; trips count in all ticks, active limits only
+    after the first level is held.
+    """
     steps = np.vstack([run.steps for run in runs])
     all_flags = reduce(or_, (run.flags for run in runs))
     overshoot_percent, settling_ms, static_error_percent = step_quantiles(steps)

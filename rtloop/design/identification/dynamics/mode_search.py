@@ -75,7 +75,10 @@ class Spectra:
         return gain, pair
 
     def _net_gain(self, gains: dict[bool, float], *, pair: bool) -> float:
-        """Return the energy that a pair (True) or a real pole (False) explains, of `gains`, less Akaike's penalty."""
+        """Return `gains[pair]`, the energy that a pair (True) or a real pole (False) explains, less Akaike's penalty.
+
+        The penalty is two variances per parameter.
+        """
         return gains[pair] - 2 * PARAMETERS[pair] * self._variance
 
     def _choose_rate(self, rates: Complex) -> tuple[float, complex]:

@@ -87,7 +87,9 @@ def unexplained_um(runs: Sequence[AxisRecording], fit: HysteresisFit) -> float:
 
 
 def _fit_trial(recordings: RecordingSet, trial: Trial) -> HysteresisFit:
-    """Return the fit of a trial's slopes to all recordings. Raises UnsuitableData where they cannot be told apart."""
+    """Return the least-squares fit of weights at a trial's thresholds to all recordings. Raises UnsuitableData if the
+    drives do not determine all weights.
+    """
     equations = [recordings.equations(run, trial) for run in recordings.runs]
     columns = np.vstack([part.slopes for part in equations])
     singular_values = np.linalg.svd(columns / np.linalg.norm(columns, axis=0), compute_uv=False)

@@ -91,11 +91,13 @@ class RecordingSet(NamedTuple):
         return Limits(self.least_slope if self.weights == "invertible" else -np.inf, self.largest_v)
 
     def equations(self, run: AveragedRecording, trial: Trial) -> Equations:
-        """Return the equations of one recording for a trial."""
+        """Return the least-squares equations of one recording for a trial's thresholds and terms, a row per block."""
         return build_equations(run, trial.thresholds_v, trial.terms, trial.clock, self.duration_s, self.path_v)
 
     def describe_fit(self, trial: Trial, slopes: Real, offsets_um: Sequence[float], residual_um: Real) -> HysteresisFit:
-        """Return the fit with the slopes (plays,) of a trial, its recordings' offsets and all their residuals in µm."""
+        """Return the fit of a trial with the partial sums of its weights, `slopes` (plays,) in µm/V, the recordings'
+        offsets, and the residuals of all their fitted blocks in µm.
+        """
         model = PlayModel(trial.thresholds_v, np.diff(slopes, prepend=0.0))
         widest = max(self.recorded, key=lambda run: float(np.ptp(run.drive_v)))
         noises = [
