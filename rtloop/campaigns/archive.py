@@ -31,12 +31,13 @@ def examine(
 
     Returns {recordings, pending, stored, counts, duration_s, rate_per_s, verdicts}: `verdicts` is the list of rows, in
     the order of `recordings`, `counts` the number of rows by verdict, `stored` the number of rows from earlier calls,
-    `pending` the number of recordings without a row after a stop.
+    `pending` the number of recordings without a row after a stop. A row is {path, files, size, mtime_ns, rtloop,
+    verdict, the columns of the examination, reason}.
     After a request to stop, the recordings that were submitted end and no other one starts. `on_progress` receives the
-    number of rows.
+    number of rows, stored ones included.
 
     Raises UnavailableError if the scheduler is gone, a worker has another version or another process uses the folder,
-    OutputError if a row cannot be stored.
+    OutputError if a row cannot be stored. Rows that `folder` has by then stay there.
     """
     start_s = time.monotonic()
     with open_table(recordings, examination.columns, folder, examination.file_name) as table:
@@ -61,7 +62,7 @@ class Archive:
         self._examination, self._table, self._workers = examination, table, workers
 
     def run(self, on_progress: Callable[[int], None], is_stop_requested: Callable[[], bool]) -> None:
-        """Examine the recordings; `on_progress` receives the number that have a verdict.
+        """Examine the recordings, and add their rows to the table; `on_progress` receives its number of rows.
 
         After a request to stop, the recordings that were submitted end and no other one starts. Raises UnavailableError
         if the scheduler is gone or a worker has another version, OutputError if a verdict cannot be stored.
@@ -76,9 +77,12 @@ class Archive:
         return self._workers.submit(self._examination.function, items[0].paths, __version__)
 
     def store(self, items: tuple[ArchivedRecording, ...], result: Row) -> None:
-        """Store the row of a recording. Raises OutputError if the system refuses."""
+        """Add `result`, the row of the single recording in `items`, to the table and its file. Raises OutputError."""
         self._table.add(items[0], result)
 
     def set_aside(self, item: ArchivedRecording) -> None:
-        """Store that each worker that examined a recording died. Raises OutputError if the system refuses."""
+        """Add a row with verdict CRASHED to the table and its file: each worker that examined `item` died.
+
+        Raises OutputError if the system refuses.
+        """
         self._table.add(item, {"verdict": CRASHED, "reason": "each worker process that examined it died"})

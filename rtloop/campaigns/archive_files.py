@@ -29,18 +29,22 @@ class ArchivedRecording(NamedTuple):
 
 
 def find_recordings(patterns: Iterable[Path]) -> list[ArchivedRecording]:
-    """Return the recordings that patterns, files and folders name, by path, each once.
+    """Return the recordings that patterns, files and folders name, sorted by path, each once.
 
     In a pattern, ** stands for any number of folders; a folder stands for all recordings below it. A subfolder that
     cannot be read is returned like a recording. An unfinished file beside its recovered one is left out. Raises
-    RecordingError for a file that cannot be opened, and for a pattern or a folder without a match.
+    RecordingError for a file of `patterns` itself that cannot be opened, and for a pattern or a folder without a match;
+    files that a pattern or a folder leads to are not tested.
     """
     paths = {os.path.abspath(path) for pattern in patterns for path in _expand(pattern)}
     return [_read_status(run) for run in sorted(_group_runs(sorted(paths)))]
 
 
 def _expand(pattern: Path) -> Iterator[str]:
-    """Yield the files that a pattern, a file or a folder names; raises as `find_recordings`."""
+    """Yield the paths of the files that a pattern, a file or a folder names, some perhaps twice.
+
+    Raises as `find_recordings`.
+    """
     if glob.has_magic(str(pattern)) and not os.path.exists(pattern):
         matches = glob.glob(str(pattern), recursive=True)
         if not matches:
@@ -84,9 +88,10 @@ def _is_recovered(path: str) -> bool:
 
 
 def _group_runs(paths: Sequence[str]) -> Iterator[tuple[str, ...]]:
-    """Yield the files of each run, in the order of the sorted `paths`; a file that fits no other is a run alone.
+    """Yield the files of each run, in the order of the sorted `paths`.
 
-    Files are of one run if their names differ in the number alone, and if `open_run` accepts them together.
+    Files are of one run if their names differ in the number alone, and if `open_run` accepts them together. If it does
+    not, each of them is yielded as a run of one file.
     """
     candidates: defaultdict[str, list[str]] = defaultdict(list)
     for path in paths:

@@ -80,7 +80,7 @@ class VerdictTable:
                 self.rows[recording.paths[0]] = {**self._empty(recording), **row}
 
     def close(self) -> None:
-        """Let other processes write to the folder."""
+        """Close the file and release the lock, so that other processes may write to the folder."""
         for descriptor in (self._file, self._lock):
             if descriptor >= 0:
                 close_descriptor(descriptor)
@@ -90,9 +90,9 @@ class VerdictTable:
         return [recording for recording in self._recordings if recording.paths[0] not in self.rows]
 
     def add(self, recording: ArchivedRecording, values: Row) -> None:
-        """Add the row of a recording, first to the file, with None for columns that `values` lacks.
+        """Add the row of a recording to the file, if there is one, then to `rows`; columns not in `values` are None.
 
-        Raises OutputError if the system refuses.
+        A row of the same recording is replaced. Raises OutputError if the system refuses; `rows` is unchanged then.
         """
         row = {**self._empty(recording), **values}
         if self.path is not None:

@@ -48,8 +48,9 @@ class Examination(NamedTuple):
 def replay_files(paths: Sequence[str], version: str) -> Row:
     """Replay the files of a recording in this process. Returns {verdict, tick, column, reason}.
 
-    `tick` and `column` name the first difference; without one, they are left out. An error, as for an unreadable file,
-    becomes a verdict. Raises UnavailableError alone, if this worker's version of rtloop is not `version`.
+    `verdict` is a text such as "identical", `reason` a text, "" without one. `tick` and `column` name the first
+    difference; without one, they are left out. An error, as for an unreadable file, becomes a verdict. Raises
+    UnavailableError alone, if this worker's version of rtloop is not `version`.
     """
     return _examine(paths, version, _replay)
 
@@ -57,8 +58,9 @@ def replay_files(paths: Sequence[str], version: str) -> Row:
 def summarise_files(paths: Sequence[str], version: str) -> Row:
     """Summarise the files of a recording. Returns {verdict, ticks, duration_s, lost, trips, reason}.
 
-    `trips` are {tick, causes, reason}; the figures are left out for a recording that cannot be read, as an error
-    becomes a verdict. Raises UnavailableError alone, if this worker's version of rtloop is not `version`.
+    `verdict` is a text such as "readable", `reason` a text, "" without one; `ticks` and `lost` are numbers of ticks,
+    `trips` a list of {tick, causes, reason}. An error becomes a verdict: of a recording that cannot be read, verdict
+    and reason alone are returned. Raises UnavailableError alone, if this worker's version of rtloop is not `version`.
     """
     return _examine(paths, version, _summarise)
 
@@ -68,10 +70,10 @@ INFO = Examination(summarise_files, ("ticks", "duration_s", "lost", "trips"), RE
 
 
 def _examine(paths: Sequence[str], version: str, judge: Callable[[list[Path]], Row]) -> Row:
-    """Return the row that `judge` makes of a recording; any error becomes a verdict.
+    """Return the row that `judge` makes of a recording; any error that it raises becomes a verdict.
 
-    The paths of the files are taken out of its reason. Raises UnavailableError if this worker's version of rtloop is
-    not `version`.
+    In its reason, the paths of the files are left out, and characters that cannot be printed become "?". Raises
+    UnavailableError if this worker's version of rtloop is not `version`.
     """
     if version != __version__:
         raise UnavailableError(
@@ -160,18 +162,21 @@ def _is_unfinished(paths: Sequence[Path]) -> bool:
 
 
 def _unfinished_reason(path: Path) -> str:
-    """Return the reason why a file is unfinished. Raises RecordingError if its lock cannot be tested."""
+    """Return in words whether a recorder still writes an unfinished file, or a run left it behind.
+
+    Raises RecordingError if its lock cannot be tested.
+    """
     if is_being_written(path):
         return "a recorder is writing this file"
     return "left from an unfinished run; `rtloop recover` completes it"
 
 
 def _missing_files(paths: Sequence[Path]) -> list[str]:
-    """Return a message for each missing file of a rotated run; [] if none is missing."""
+    """Return a message for each missing file of a rotated run; [] if none is. Raises RecordingError."""
     with open_run(paths) as readers:
         return missing_parts(readers)
 
 
 def _reasons(messages: Sequence[str]) -> str:
-    """Return the first MAX_REASONS different messages as one text, "" for none."""
+    """Return the first MAX_REASONS different messages as one text, separated by "; "; "" for none."""
     return "; ".join(list(dict.fromkeys(messages))[:MAX_REASONS])

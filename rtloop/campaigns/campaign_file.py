@@ -148,7 +148,9 @@ def load_campaign(path: Path, rigs: int | None = None, configuration: Path | Non
 
 
 def _limits(options: CampaignOptions, path: Path, configuration: Configuration) -> dict[str, float]:
-    """Return the largest value of each limited figure: from the file, and for steps from the specification.
+    """Return the largest value of each limited figure, by "EXPERIMENT.FIGURE".
+
+    They are those of [limits] in the file, and for steps also those of the specification, which [limits] replaces.
 
     The specification is the campaign's, else the axis's; without one, the file's limits alone count. Raises
     InputFileError, ConfigError for its faults.

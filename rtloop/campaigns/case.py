@@ -38,10 +38,11 @@ SHARES_FOR_EFFECT = (0.25, 0.75)
 class CaseResult:
     """Values, figures and verdict of one rig.
 
-    `values` are read back from the rig that ran. `trips` has the causes of a trip for each experiment, "" without one;
-    `missed` names every limit that is exceeded and every trip; `ratio` is the largest figure in parts of its limit,
-    infinite after a trip, 0 without limits. `refusal` says why a rig cannot run, "" if it ran; a rig that cannot run
-    has no figures and the ratio NaN, and its `values` are those drawn.
+    `values` by key are read back from the rig that ran; `figures` are by "EXPERIMENT.FIGURE". `trips` has the causes of
+    a trip for each experiment by its name, "" without one; `missed` names every limit that is exceeded and every trip;
+    `ratio` is the largest figure in parts of its limit, infinite after a trip, 0 without limits. `refusal` says why a
+    rig cannot run, "" if it ran; a rig that cannot run has no figures and the ratio NaN, and its `values` are those
+    drawn.
     """
 
     rig: int
@@ -80,9 +81,10 @@ class CaseRunner:
         return self._builder.rate_hz
 
     def sample_values(self, rig: int) -> dict[str, Any]:
-        """Return the values of a rig's uncertain keys and the seed of its noise; the configured ones for NOMINAL.
+        """Return the values of a rig's uncertain keys, by key, and under "driver.seed" the seed of its noise.
 
-        Raises ValueError for a rig beyond the campaign's number of rigs.
+        They are the configured ones for the rig NOMINAL, 0. Raises ValueError for a rig beyond the campaign's number of
+        rigs, and as `quantile_value`.
         """
         options = self.options
         if rig == NOMINAL:
@@ -91,7 +93,10 @@ class CaseRunner:
         return self.quantile_values(rig, shares)
 
     def quantile_values(self, rig: int, shares: Real) -> dict[str, Any]:
-        """Return the values of rig number `rig` at `shares` (keys,) of its distributions, and the seed of its noise."""
+        """Return the values of rig number `rig`, by key, at `shares` (keys,), in (0, 1), of the keys' distributions.
+
+        Under "driver.seed" is the seed of its noise, unless this key is uncertain itself. Raises as `quantile_value`.
+        """
         values = {key: self.quantile_value(key, float(share)) for key, share in zip(self.keys, shares, strict=True)}
         return {SEED_KEY: noise_seed(self.options.seed, rig), **values}
 
@@ -113,8 +118,8 @@ class CaseRunner:
     def run(self, rig: int, values: Mapping[str, Any] | None = None) -> CaseResult:
         """Run all experiments of a rig; return its figures and verdict, with a `refusal` for a rig that cannot run.
 
-        `values` by key replace all drawn ones, the noise's seed included. Raises RuntimeError if the rig that runs has
-        another value.
+        `values` by key replace all drawn ones; of a key that they lack, also of "driver.seed", the configured value
+        counts. Raises RuntimeError if the rig that runs has another value.
         """
         drawn = self.sample_values(rig) if values is None else dict(values)
         try:
@@ -224,7 +229,7 @@ class CaseRunner:
 
 
 class _Outcome(NamedTuple):
-    """Figures of one experiment, causes of its trip as text, and the values of the rig that ran, by key."""
+    """Figures of one experiment, causes of its trip ("" without one), and the values of the rig that ran, by key."""
 
     figures: tuple[float, ...]
     trip: str

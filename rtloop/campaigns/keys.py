@@ -24,9 +24,10 @@ def is_rig_key(key: str) -> bool:
 
 
 def replace_values(tables: Mapping[str, Any], values: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a copy of a configuration's tables in which each key has its value; missing tables are made.
+    """Return a deep copy of a configuration's tables in which each dotted key of `values` has its value.
 
-    Raises ValueError for a path through a value that is neither a table nor a list, and past the end of a list.
+    Missing tables are made. Raises ValueError for a path through a value that is neither a table nor a list, and for an
+    entry, by name or number, that a list lacks.
     """
     changed = copy.deepcopy(dict(tables))
     for key, value in values.items():
@@ -78,7 +79,7 @@ def _list_index(entries: list[Any], part: str, key: str) -> int:
 
 
 def option_value(configuration: Configuration, driver_options: Options, key: str) -> Any:
-    """Return the value of a key from the checked options, defaults included.
+    """Return the value of a dotted key, such as `axis.x.limits.drive_v`, from the checked options, defaults included.
 
     A key of the driver is read from `driver_options`. Raises ValueError for a key that no option has.
     """

@@ -17,8 +17,9 @@ from rtloop.supervision.supervisor import Processes, Supervisor
 def record_rig(runner: CaseRunner, rig: int, folder: Path) -> list[Path]:
     """Run all experiments of a rig in virtual time, each recorded in `folder`; a recording that exists is kept.
 
-    Returns the paths of the recordings, in the order of the experiments. Raises ConfigError for a rig that cannot run,
-    OutputError for a file that cannot be written.
+    Returns the paths of all recordings, rig-NUMBER-EXPERIMENT.mcap, in the order of the experiments. Raises ConfigError
+    for a rig that cannot run, OutputError for a file that cannot be written, RtloopError for a run that cannot start;
+    recordings of earlier experiments stay.
     """
     return record_values(runner, runner.sample_values(rig), f"rig-{rig:09d}", folder)
 

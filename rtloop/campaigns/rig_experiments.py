@@ -228,7 +228,7 @@ class DisturbanceExperiment(ExperimentOptions):
 
     @property
     def disturbance(self) -> dict[str, Any]:
-        """Step and sine from `start_s` on."""
+        """Step and sine from `start_s` on: {step_um, sine_um, sine_hz, start_s}."""
         return {"step_um": self.step_um, "sine_um": self.sine_um, "sine_hz": self.sine_hz, "start_s": self.start_s}
 
     @property

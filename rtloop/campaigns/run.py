@@ -27,7 +27,8 @@ def campaign(
 ) -> Any:
     """Run a campaign and return its results, a row for each rig and one for the nominal rig, which has number 0.
 
-    They are a DataFrame of pandas, or without pandas columns by name.
+    They are a DataFrame of pandas, or without pandas a dict of arrays (rigs,) by column: rig, status, missed, ratio,
+    the seed and the values of the keys, the figures, and the causes of each experiment's trip.
 
     `file` is a CAMPAIGN.toml, `configuration` replaces its configuration, `rigs` its number of rigs. Results that `out`
     (campaigns/NAME by default) has already are not run again. `jobs` worker processes run the rigs, or the workers of
@@ -35,7 +36,7 @@ def campaign(
     `if __name__ == "__main__":`, because worker processes import it. Raises ConfigError, InputFileError and
     RecordingError for the files that it reads, OutputError, MissingExtra without pyarrow or dask, UnavailableError for
     a folder in use and a scheduler that cannot be used, OtherVersion for workers with other packages, LoopFault if the
-    nominal rig kills its workers.
+    nominal rig kills its workers. Results that came before an error stay in `out`.
     """
     loaded = load_campaign(Path(file), rigs, None if configuration is None else Path(configuration))
     folder = default_folder(loaded) if out is None else Path(out)
@@ -60,9 +61,9 @@ def run_campaign(
 ) -> bool:
     """Run the rigs of a campaign that have no result in `folder`, then record the worst ones in its folder `worst`.
 
-    Returns whether all rigs have results; only then the worst ones are recorded, `keep_worst` of them. After a request
-    to stop, the rigs that were submitted end and no other one starts. Raises as `CaseRunner`, `Store`,
-    `Coordinator.run` and `record_rig`.
+    Returns whether all rigs have results; only then the worst ones are recorded: at most `keep_worst` rigs, of those
+    with a ratio above 0. After a request to stop, the rigs that were submitted end and no other one starts. Raises as
+    `CaseRunner`, `Store`, `Coordinator.run` and `record_rig`; results that came before stay.
     """
     runner = CaseRunner(campaign)
     with open_store(folder, campaign, runner.sample_values(NOMINAL)) as store:

@@ -32,7 +32,10 @@ Evaluate = Callable[[Sequence[tuple[int, dict[str, Any]]]], Sequence[CaseResult]
 
 
 class SearchResult(NamedTuple):
-    """Worst rig of a search, the value of the figure that was maximised, and the number of rigs that ran."""
+    """Worst rig of a search, the value of the figure that was maximised, and the number of rigs that were tried.
+
+    `figure` is infinite where the rig has no finite value; the ratio of a rig that tripped has none.
+    """
 
     worst: CaseResult
     figure: float
@@ -42,8 +45,9 @@ class SearchResult(NamedTuple):
 class Boundary(NamedTuple):
     """Range of a key around its nominal value in which every tried rig passes.
 
-    An end is None where no rig up to the end of the key's distribution failed. `low_cause` and `high_cause` name the
-    limits that the first failing rig misses. Both ends are the nominal value if the nominal rig fails.
+    An end is None, and its cause "", where no rig up to the end of the key's distribution failed. Else `low_cause` and
+    `high_cause` name the limits that the failing rig nearest to the end misses, or why it cannot run. Both ends are the
+    nominal value if the nominal rig fails. `rigs` is the number of rigs that were tried.
     """
 
     key: str
@@ -84,9 +88,9 @@ def find_worst(
 ) -> SearchResult:
     """Return the rig with the largest `figure` among about `rigs` tried ones; without a name, the largest ratio.
 
-    Whole generations run, at least one; the search ends early once the figure reaches `target`. Rigs that are refused
-    count as harmless. Raises ConfigError for an unknown figure, for keys without numbers, and for the ratio of a
-    campaign without limits; and as `evaluate` does.
+    Whole generations run, at least one; the search ends early once the figure reaches `target`. A rig that is refused
+    counts with the figure 0, one whose figure is not finite as the worst. Raises ConfigError for an unknown figure, for
+    keys without numbers, and for the ratio of a campaign without limits; and as `evaluate` does.
     """
     from scipy.optimize import differential_evolution
 
@@ -207,7 +211,8 @@ def _check_search(runner: CaseRunner, figure: str) -> None:
 def _height(case: CaseResult, figure: str) -> float:
     """Return the value that a search maximises: the case's `figure`, or its ratio if `figure` is empty.
 
-    It is TRIP_RATIO for a rig that tripped or whose figure is not a number, and 0 for a refused rig, which never ran.
+    It is TRIP_RATIO where that value is not finite, as the ratio of a rig that tripped, and 0 for a refused rig, which
+    never ran.
     """
     if case.refusal:
         return 0.0

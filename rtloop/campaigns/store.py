@@ -64,8 +64,9 @@ def status(case: CaseResult) -> str:
 class Store:
     """Results of one campaign in `folder`.
 
-    Raises ConfigError if the folder has the results of another campaign, UnavailableError if another process writes to
-    it, OutputError if the system refuses, MissingExtra without pyarrow.
+    Raises ConfigError if the folder has the results of another campaign, InputFileError if its campaign.json cannot be
+    read, UnavailableError if another process writes to it, OutputError if the system refuses, MissingExtra without
+    pyarrow.
     """
 
     def __init__(self, folder: Path, campaign: Campaign, nominal: Mapping[str, Any]) -> None:
@@ -96,7 +97,10 @@ class Store:
             self._paths[first] = path
 
     def _check_manifest(self, manifest: dict[str, Any]) -> None:
-        """Write the manifest to a new folder. Raises ConfigError if the folder has another one, OutputError."""
+        """Write the manifest to a folder without one.
+
+        Raises ConfigError if the folder has another one, InputFileError if that cannot be read, OutputError.
+        """
         path = self.folder / MANIFEST
         if not path.exists():
             self._write(path, (json.dumps(manifest, indent=1) + "\n").encode())
@@ -111,7 +115,7 @@ class Store:
             )
 
     def close(self) -> None:
-        """Let other processes write to the folder."""
+        """Release the lock, so that other processes may write to the folder."""
         close_descriptor(self._lock)
 
     def missing(self, unit: Unit) -> Sequence[int]:

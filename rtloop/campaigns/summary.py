@@ -58,8 +58,8 @@ class WorstRig(NamedTuple):
 class CampaignSummary:
     """Result of a campaign. Counts, yield and figures leave out the nominal rig.
 
-    `counts` has the number of rigs by status, `crashed` the numbers of rigs, `refused` their numbers with the reasons,
-    `nominal` the nominal rig's row by column, {} without a result.
+    `counts` has the number of rigs by status, `crashed` the number of each rig that crashed, `refused` (number, reason)
+    of each refused rig, the nominal rig 0 included, `nominal` the nominal rig's row by column, {} without a result.
     """
 
     name: str

@@ -39,7 +39,10 @@ class Workers(Protocol):
     """Kind, number and address of the workers, for messages."""
 
     def submit(self, function: Callable[..., Any], *arguments: Any) -> Future[Any]:
-        """Start a function of a module in a worker; return the future, whose errors `explain` converts."""
+        """Start a function of a module in a worker; return the future of its result.
+
+        `explain` converts the errors of the future, and of this call where the workers have died before it.
+        """
         ...
 
     def explain(self, error: BaseException) -> BaseException:
@@ -84,7 +87,7 @@ class ProcessWorkers:
         return WorkerDied() if isinstance(error, BrokenProcessPool) else error
 
     def recover(self) -> None:
-        """Replace the broken pool by a new one."""
+        """Replace the broken pool by a new one; functions that had not ended are dropped."""
         self._executor.shutdown(wait=True, cancel_futures=True)
         self._executor = self._start()
 
@@ -179,9 +182,9 @@ class DaskWorkers:
         return self._executor.submit(function, *arguments)
 
     def explain(self, error: BaseException) -> BaseException:
-        """Return WorkerDied where a function killed its workers, UnavailableError where the scheduler is gone.
+        """Return WorkerDied where a function killed its workers, else UnavailableError for CancelledError and OSError.
 
-        Returns any other error itself.
+        These two are taken as the sign that the scheduler is gone. Returns any other error itself.
         """
         from concurrent.futures import CancelledError
 
@@ -197,7 +200,7 @@ class DaskWorkers:
         """Return at once: the scheduler's nannies start new workers."""
 
     def close(self) -> None:
-        """Leave the scheduler; a client that was given stays connected."""
+        """Close the client that was made for the scheduler's address; a client that was given stays connected."""
         if self._owns_client:
             self._client.close()
 
