@@ -200,7 +200,9 @@ def _beyond_drive(axis: AxisOptions, lowest_um: float, highest_um: float) -> Ite
 
 
 def _reach(configuration: Configuration, axis: AxisOptions) -> Iterator[str]:
-    """Yield a warning for each limit beyond the range of drive or sensor, which can never act."""
+    """Yield a warning if limits.command_um lies beyond the range of the drive, and one if interlocks.position_um lies
+    beyond that of the sensor: such a limit never acts.
+    """
     limits, interlocks = axis.limits, axis.interlocks
     reach_um = max(np.abs(drive_ends_um(axis)))
     if limits.command_um > reach_um:

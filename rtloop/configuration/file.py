@@ -173,8 +173,8 @@ def load(path: str | Path, name: str | None = None) -> Configuration:
 def parse(text: str, name: str, folder: Path, source: str, library: Library | None = None) -> Configuration:
     """Check a configuration's text. Relative paths, also of laws without a `library`, start at `folder`.
 
-    `source` names the text in messages. `library` is the source of laws; None: shipped and installed ones, and files
-    below `folder`. A text that names user laws is checked first in the limited process, as checking runs their files.
+    `source` names the text in messages. `library` is the source of laws; None: shipped and installed ones, and files.
+    A text that names user laws is checked first in the limited process, as checking runs their files.
     Raises ConfigError with all faults.
     """
     try:

@@ -23,7 +23,10 @@ DEFAULT_LAWS = (LawReference(FEEDFORWARD), LawReference(CONTROLLER))
 
 @dataclass(frozen=True)
 class Library:
-    """Sources of laws: files below `folder`, or, for a running loop, the laws that it has `loaded` alone."""
+    """Sources of laws: shipped and installed ones, and files, whose relative paths start at `folder`.
+
+    For a running loop, the laws that it has `loaded` are the only source.
+    """
 
     folder: Path = Path()
     loaded: tuple[LawReference, ...] | None = None

@@ -133,8 +133,8 @@ def _facts(configuration: Configuration, paced: bool, findings: Findings) -> Fac
 def build_driver(configuration: Configuration) -> Driver:
     """Return the configuration's driver, which is not open.
 
-    Raises ConfigError if it raises DriverError, ValueError for an unknown kind or options that do not fit,
-    MissingLibrary if its module cannot be imported.
+    Raises ConfigError if the driver's constructor raises DriverError, ValueError for an unknown kind or options that do
+    not fit, MissingLibrary if the driver's module cannot be imported.
     """
     kind = driver_class(configuration.driver_kind)
     try:

@@ -57,9 +57,11 @@ def simulated_plant(configuration: Configuration, axis_name: str) -> PlantOption
 def true_positions(
     driver: SimDriver, rig: tuple[np.recarray, np.recarray], axis: str, columns: Mapping[str, Real], points: int
 ) -> Real:
-    """Return the true positions of an axis in a run of the simulated rig, in µm, (ticks, points), from each tick on.
+    """Return the true positions of an axis in a run of the simulated rig, in µm, (ticks, points).
 
-    `rig` has the coefficients and a copy of the state before the run, `columns` the recorded columns by name.
+    A row has the position at `points` evenly spaced times of the period, the tick first. `rig` has the coefficients and
+    a copy of the state before the run; `columns` are recorded ones by name: periods_missed, and AXIS_hysteresis_um of
+    all axes.
     """
     axes = sorted(driver.wiring, key=lambda name: int(driver.wiring[name].output.removeprefix("dac")))
     number = axes.index(axis)

@@ -67,7 +67,10 @@ def _law_table(laws: dict[str, type[Law]], references: dict[Any, Schema], base: 
 def _driver_table(
     drivers: Mapping[str, type[BaseModel]], references: dict[Any, Schema], definitions: dict[str, Schema]
 ) -> Schema:
-    """Return the schema of [driver]. The options of each driver receive the keys `kind` and `channels` in place."""
+    """Return the schema of [driver].
+
+    The schema of each driver's options in `definitions` is changed: it receives the keys `kind` and `channels`.
+    """
     channels = {"type": "object", "description": CHANNELS_TEXT, "additionalProperties": references[ChannelOptions]}
     for kind, model in drivers.items():
         options = definitions[references[model]["$ref"].rpartition("/")[2]]

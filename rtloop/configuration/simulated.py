@@ -79,7 +79,10 @@ def _check_on_rig(configuration: Configuration, axis: AxisOptions, check: AxisCh
 
 
 def drive_ends_um(axis: AxisOptions) -> tuple[float, float]:
-    """Return the positions in µm at the drive's lower and upper limit, from rest, by the feedforward's model."""
+    """Return the positions in µm at the drive's lower and upper limit, from rest, by the feedforward's model.
+
+    With weights above 0, the first is ≤ 0 and the second ≥ 0.
+    """
     ends_v = np.array([axis.limits.lowest_v, axis.limits.drive_v])
     down_um, up_um = np.sign(ends_v) * loading_curve(axis.feedforward.actuator(), np.abs(ends_v))
     return float(down_um), float(up_um)
@@ -108,7 +111,10 @@ def sensor_reach_um(configuration: Configuration, axis: AxisOptions) -> float:
 
 
 def _stroke_ratio(axis: AxisOptions, rig_plays: PlayModel) -> float | None:
-    """Return the rig's position over the feedforward's at `drive_v`; None where either has no plays or stays at 0."""
+    """Return the rig's position over the feedforward's at `drive_v`, below 0 where the two move in opposite directions.
+
+    None where either has no plays or stays at 0.
+    """
     _, stroke_um = drive_ends_um(axis)
     rig_stroke_um = float(loading_curve(rig_plays, axis.limits.drive_v))
     return rig_stroke_um / stroke_um if rig_stroke_um and stroke_um else None

@@ -27,9 +27,10 @@ PATH = re.compile(r"[A-Za-z0-9_.-]+")
 
 
 def numbered(faults: Sequence[str], source: str) -> list[str]:
-    """Return `faults`, each with the line of the key that it begins with, if `source` is a file with that key.
+    """Return `faults`, each as "line N: FAULT" with the line of the key that it begins with, if `source` is a file that
+    has this key or a part of its path; any other fault unchanged.
 
-    A fault of TOML syntax has the text of its line, which this user may read, and the likely mistake.
+    A fault of TOML syntax gets the text of its line, which this user may read, and the likely mistake.
     """
     try:
         text = read_regular(Path(source), MAX_TEXT_BYTES).decode()

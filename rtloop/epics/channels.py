@@ -38,7 +38,10 @@ class Channel(ChannelData):
     _shown: tuple[Any, ...] = ()
 
     async def show(self, value: Any, mode: str | None) -> None:
-        """Show a value that the service reported in `mode`; None: unknown, which is INVALID."""
+        """Show a value that the service reported in `mode`, as a MAJOR alarm if it is the variable's `alarm`.
+
+        None: unknown; the channel keeps the last value, with the alarm INVALID.
+        """
         unit = unit_in_mode(self.variable, mode)
         if value is None:
             await self._show(None, AlarmStatus.READ, AlarmSeverity.INVALID_ALARM, unit)

@@ -24,14 +24,18 @@ class Requests:
         self._pending_count = self._stop_count = 0
 
     async def stop(self, request: Callable[[], object]) -> None:
-        """Execute a request that stops the loop, at once. Raises as `request`."""
+        """Execute a request that stops the loop, at once, and wait for its end. Raises as `request`.
+
+        The requests of `execute` that wait are withdrawn: each of their calls raises LoopFault.
+        """
         self._stop_count += 1
         await asyncio.get_running_loop().run_in_executor(self._stops, request)
 
     async def execute(self, request: Callable[[], object]) -> None:
-        """Execute a request after those before it.
+        """Execute a request after those before it, and wait for its end.
 
-        Raises LoopFault if MAX_PENDING requests wait, or if a stop came meanwhile; else as `request`.
+        Raises LoopFault, with nothing sent, if MAX_PENDING requests wait, or if a stop came before this one began; else
+        as `request`.
         """
         if self._pending_count >= MAX_PENDING:
             raise LoopFault(f"{self._pending_count} writes are pending; allowed: at most {MAX_PENDING}; write later")

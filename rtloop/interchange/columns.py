@@ -41,9 +41,10 @@ class ColumnSelection(BaseModel):
 
 
 def extend_selection(maps: Sequence[str], selection: ColumnSelection) -> ColumnSelection:
-    """Return `selection` with further columns: `NAME=COLUMN` as a signal, any other text as a column to keep.
+    """Return a copy of `selection` with further columns: `NAME=COLUMN` as a signal, any other text as one to keep.
 
-    A signal NAME that is selected already gets the new mapping.
+    NAME is of letters, digits and _, and begins with no digit; a text with another one is a column to keep. A signal
+    NAME that is selected already gets the new mapping.
     """
     signals, keep = dict(selection.signals), [*selection.keep]
     for text in maps:

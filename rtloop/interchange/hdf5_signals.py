@@ -22,7 +22,7 @@ def create_dataset(parent: Any, name: str) -> Any:
 
 
 def append_rows(datasets: Sequence[Any], rows: np.ndarray[Any, Any]) -> None:
-    """Append rows (n, datasets) to the datasets."""
+    """Append each column of `rows` (n, datasets) to the dataset at the same place in `datasets`."""
     for dataset, values in zip(datasets, rows.T, strict=True):
         length = dataset.shape[0]
         dataset.resize(length + len(values), axis=0)

@@ -112,8 +112,8 @@ def list_columns(path: Path, table: Table, selection: ColumnSelection) -> dict[s
     """Return the content of a file, with unit and extremes of each column.
 
     Keys: file, rows, time, time_column, rate_hz, notes, columns, about, in_other_files; `columns` are {name, unit,
-    grows_evenly, least, largest}. Of `selection`, only time and rate count. Where the time is unusable, `time` and
-    `rate_hz` are None, and `notes` says why.
+    grows_evenly, least, largest}, `time_column` is a name, None without one. Of `selection`, only time and rate count.
+    Where the time is unusable, `time`, a text on its source, and `rate_hz` are None, and `notes` says why.
     """
     columns = [
         {"name": name, "unit": column_unit(table, name), "grows_evenly": grows_evenly(values), **extremes(values)}

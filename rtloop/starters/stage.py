@@ -48,7 +48,7 @@ def stage_actuator(figures: StageFigures) -> Actuator:
 
 
 def _values(figures: StageFigures) -> dict[str, object]:
-    """Return the values of all templates by name: numbers as TOML floats, counts of ticks as integers."""
+    """Return the values of all templates by name: numbers, or texts as they stand in TOML."""
     actuator = stage_actuator(figures)
     um_per_v = figures.sensor_um_per_v or figures.range_um / TRAVEL_V
     noise_um, resolution_um = _sensor_um(figures)
@@ -124,9 +124,10 @@ def _travel_numbers(range_um: float, reach_um: float, remanence_um: float) -> di
 
 
 def _levels_um(actuator: Actuator, position_um: float) -> list[float]:
-    """Return the reference's levels: the middle of the reachable travel, and a quarter of it to each side.
+    """Return the reference's four levels in µm: upper, middle, lower and again the middle one.
 
-    They are rounded to about three digits of the travel.
+    They are the middle of the reachable travel, and a quarter of this travel to each side, rounded to about three
+    digits of the travel.
     """
     top_um = min(actuator.rise_um(actuator.highest_v), position_um)
     bottom_um = max(actuator.lowest_um, -position_um)

@@ -58,7 +58,8 @@ class Actuator:
         return 100 * width_um / self.fall_um(span_v)
 
     def drives_within(self, limit_um: float) -> tuple[float, float]:
-        """Return the lowest and the highest drive between which a slow motion from rest stays within ±`limit_um`.
+        """Return the lowest (≤ 0) and the highest (≥ 0) drive in V between which a slow motion from rest stays within
+        ±`limit_um`.
 
         The motion begins upwards. It is assumed to go to the highest drive before it goes to the lowest.
         """

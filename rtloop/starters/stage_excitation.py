@@ -27,7 +27,8 @@ def excitation_values(
 ) -> dict[str, object]:
     """Return the values of the templates of sine and step by name, for a position interlock at ±`position_um`.
 
-    `noise_um` is the sensor's noise, rms; `rate_hz` is the rate of the step, in whose ticks its times are.
+    Values are numbers, or texts with the digits to print. `noise_um` is the sensor's noise, rms; `rate_hz` is the rate
+    of the step, in whose ticks its times are.
     """
     noise_um *= NOISE_DEVIATIONS
     lowest_v, highest_v = map(_shorten, actuator.drives_within(SINE_SHARE * position_um - noise_um))
@@ -63,7 +64,7 @@ def _step_v(actuator: Actuator, damping: float, limit_um: float) -> float:
 
 
 def _shorten(value: float) -> float:
-    """Return a value towards 0, rounded to three digits."""
+    """Return a value cut, towards 0, to three significant digits."""
     if value == 0.0:
         return 0.0
     scale = 10.0 ** (2 - math.floor(math.log10(abs(value))))

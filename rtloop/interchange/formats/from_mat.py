@@ -121,7 +121,7 @@ def _is_controldesk(value: Any) -> bool:
 
 
 def _controldesk_tables(path: Path, value: dict[str, Any]) -> dict[str, Table]:
-    """Return a table for each X that has columns, by the name of its raster.
+    """Return a table for each X that has columns, by the name of its raster: "X(2)" without a name, "" for a single X.
 
     A Y belongs to an X of equal length, unless its XIndex or its raster names another one.
     """

@@ -42,9 +42,10 @@ class McapContents(NamedTuple):
 def read_mcap(path: Path | str, topic: str | None = None) -> Table:
     """Return the messages of a topic as a table, in the order of their log times; of the file's only topic by default.
 
-    Messages after a damage are left out, which `about["problems"]` says. Raises UnreadableData if the file is no MCAP
-    file or empty, the topic is missing or not the only one, has no number, too many messages or a message that cannot
-    be decoded; MissingExtra if a decoder's package is missing.
+    Columns are `log_time_s`, from 0 at the first message, and each number of a message by its path, such as `pose.x.0`,
+    NaN where a message lacks it. Messages after a damage are left out, which `about["problems"]` says. Raises
+    UnreadableData if the file is no MCAP file or empty, the topic is missing or not the only one, has no number, too
+    many messages or a message that cannot be decoded; MissingExtra if a decoder's package is missing.
     """
     path = Path(path)
     try:

@@ -26,10 +26,10 @@ SAMPLE_PERIOD_S = 1.28e-6
 
 
 def read_stabilizer(path: Path) -> Table:
-    """Return adc0, adc1, dac0, dac1 in V, `time` in s by SAMPLE_PERIOD_S, and the index `sample`, with gaps.
+    """Return a table of `time` in s by SAMPLE_PERIOD_S, the index `sample`, and adc0, adc1, dac0, dac1 in V.
 
-    Raises UnreadableData for another format than the ADC and DAC codes, for frames of different lengths, and for a
-    file that is too large.
+    Time and index begin with 0, and jump where frames were lost. Raises UnreadableData for another format than the ADC
+    and DAC codes, for frames of different lengths or not in the order sent, and for a file that is too large.
     """
     with os.fdopen(open_user_file(path), "rb") as file:
         start = file.read(HEADER.itemsize)

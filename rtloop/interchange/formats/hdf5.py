@@ -30,9 +30,10 @@ UNIT_ATTRIBUTES = ("unit", "units", "Unit", "Units")
 
 @contextmanager
 def open_hdf5(columns: FileColumns) -> Iterator[Any]:
-    """Open the file of `columns` for the block.
+    """Open the file `columns.path` for reading; yield the h5py.File.
 
-    Errors of the library in the block become UnreadableData. Raises MissingExtra without h5py.
+    An OSError, KeyError, ValueError, RuntimeError or TypeError of opening or in the block, as the library raises them
+    for a damaged file, becomes UnreadableData. Raises MissingExtra without h5py.
     """
     try:
         import h5py
@@ -65,8 +66,9 @@ def _collect_group(
 ) -> None:
     """Collect into `datasets`, by path, the datasets of a group and of the groups in it, without text.
 
-    `visited` holds the objects met so far; links to them, to nowhere and to other files are left out. Raises
-    UnreadableData for groups nested too deeply, and for too many objects.
+    `visited` holds the objects met so far, and grows. Links to them and to nowhere are listed in `columns.left_out`,
+    data in other files in `columns.in_other_files`. Raises UnreadableData for groups nested too deeply, and for too
+    many objects.
     """
     import h5py
 

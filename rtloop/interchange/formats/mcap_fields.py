@@ -51,8 +51,9 @@ def decoder(channel: Channel, schema: Schema | None) -> Callable[[bytes], Fields
 def _flat(value: Any, children: Callable[[Any], Iterator[tuple[str, Any]] | None]) -> Fields:
     """Return all numbers in `value` by name; `children` gives the named parts of a value, None for a leaf.
 
-    True and False are 1 and 0, None is NaN; text that is no number is left out; a bare number is called `value`. Raises
-    DecodingError for too many or too deeply nested fields, and for too large an integer.
+    True and False are 1 and 0, None is NaN. A text counts only if it is one of WORDS, such as "NaN" and "-Infinity";
+    any other text, "1.5" too, is left out. A bare number is called `value`. Raises DecodingError for too many or too
+    deeply nested fields, and for too large an integer.
     """
     fields: Fields = {}
     pending: list[tuple[str, Any, int]] = [("", value, 0)]
