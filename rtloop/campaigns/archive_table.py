@@ -90,9 +90,9 @@ class VerdictTable:
         return [recording for recording in self._recordings if recording.paths[0] not in self.rows]
 
     def add(self, recording: ArchivedRecording, values: Row) -> None:
-        """Add the row of a recording to the file, if there is one, then to `rows`; columns not in `values` are None.
+        """Append the row of a recording to the file, if there is one, then store it in `rows`.
 
-        A row of the same recording is replaced. Raises OutputError if the system refuses; `rows` is unchanged then.
+        Columns that `values` lacks are None. Raises OutputError if the system refuses; `rows` is unchanged then.
         """
         row = {**self._empty(recording), **values}
         if self.path is not None:

@@ -172,7 +172,10 @@ def _unfinished_reason(path: Path) -> str:
 
 
 def _missing_files(paths: Sequence[Path]) -> list[str]:
-    """Return a message for each missing file of a rotated run; [] if none is. Raises RecordingError."""
+    """Return a message for each missing file of a rotated run; [] if none is missing.
+
+    Raises RecordingError if a file cannot be opened.
+    """
     with open_run(paths) as readers:
         return missing_parts(readers)
 

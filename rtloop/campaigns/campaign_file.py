@@ -150,7 +150,7 @@ def load_campaign(path: Path, rigs: int | None = None, configuration: Path | Non
 def _limits(options: CampaignOptions, path: Path, configuration: Configuration) -> dict[str, float]:
     """Return the largest value of each limited figure, by "EXPERIMENT.FIGURE".
 
-    They are those of [limits] in the file, and for steps also those of the specification, which [limits] replaces.
+    They are those of [limits] in the file; of steps, also those of the specification where [limits] has none.
 
     The specification is the campaign's, else the axis's; without one, the file's limits alone count. Raises
     InputFileError, ConfigError for its faults.

@@ -119,7 +119,7 @@ class CaseRunner:
         """Run all experiments of a rig; return its figures and verdict, with a `refusal` for a rig that cannot run.
 
         `values` by key replace all drawn ones; of a key that they lack, also of "driver.seed", the configured value
-        counts. Raises RuntimeError if the rig that runs has another value.
+        counts. Raises RuntimeError if the rig that runs has another value than the one given or drawn.
         """
         drawn = self.sample_values(rig) if values is None else dict(values)
         try:

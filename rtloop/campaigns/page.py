@@ -121,7 +121,7 @@ def percent_text(share: float) -> str:
 
 
 def yield_text(estimate: Yield) -> str:
-    """Return the yield of rigs with its interval as a sentence; the sentence that there is none without a rig."""
+    """Return a sentence with the yield of rigs and its interval; for 0 rigs, one that says that there is no yield."""
     if not estimate.rigs:
         return "No rig could run, so that there is no yield."
     return (
@@ -227,7 +227,7 @@ def _range_text(values: Any) -> str:
 
 
 def abbreviate_keys(keys: Sequence[str]) -> dict[str, str]:
-    """Return a short name by key: its last parts between dots, of each key as many, as few as tell all keys apart."""
+    """Return a short name by key: its last n parts between dots, for the least n with which all names differ."""
     for count in range(1, max((key.count(".") for key in keys), default=0) + 2):
         names = {key: ".".join(key.split(".")[-count:]) for key in keys}
         if len(set(names.values())) == len(keys):

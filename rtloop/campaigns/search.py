@@ -61,7 +61,7 @@ class Boundary(NamedTuple):
 def evaluate_on(workers: Workers, campaign: Campaign) -> Evaluate:
     """Return a function that runs rigs of a campaign on workers, spread evenly over them.
 
-    The function raises LoopFault if a worker dies, and the other errors of a unit.
+    The function raises LoopFault if a worker dies, UnavailableError if the scheduler is gone, and as `run_values`.
     """
     facts = WorkerFacts.of_this_process()
 

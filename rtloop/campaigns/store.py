@@ -50,7 +50,10 @@ def arrow() -> Any:
 
 
 def crashed_case(rig: int, values: Mapping[str, Any]) -> CaseResult:
-    """Return the result of a rig whose worker died each time it ran the rig."""
+    """Return the result of a rig whose worker died each time it ran the rig.
+
+    It has no figures and no trips, `missed` is (CRASHED,), and the ratio infinite.
+    """
     return CaseResult(rig, values, {}, {}, (CRASHED,), float("inf"))
 
 
@@ -260,8 +263,8 @@ def read_tables(folder: Path) -> Iterator[pa.Table]:
 def read_columns(folder: Path) -> dict[str, Any]:
     """Return the columns of all results in a campaign's folder by name, (rigs,); equal texts are one object.
 
-    A missing text is "". Raises InputFileError for a folder without results, for a damaged file and for a rig with two
-    results, MissingExtra without pyarrow.
+    A missing text is "", a missing number NaN. Raises InputFileError for a folder without results, for a damaged file
+    and for a rig with two results, MissingExtra without pyarrow.
     """
     library = arrow()
     table = library.concat_tables(list(read_tables(folder)))
@@ -313,7 +316,10 @@ def _column_type(library: Any, value: Any) -> Any:
 
 
 def _file_name(unit: Unit, last: int) -> str:
-    """Return the name of the file of a unit whose last stored rig is `last`; names sort as rigs do."""
+    """Return "rigs-FIRST-LAST.parquet", the name of a unit's file; names sort as rigs do.
+
+    FIRST and LAST are the unit's own, but LAST is the last stored rig, `last`, if that is greater.
+    """
     return f"rigs-{unit.first:09d}-{max(unit.last, last):09d}.parquet"
 
 

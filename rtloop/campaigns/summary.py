@@ -77,9 +77,9 @@ class CampaignSummary:
 
 
 def clopper_pearson(passed: int, rigs: int, confidence: float = CONFIDENCE) -> Yield:
-    """Return the yield of `passed` among `rigs`, with its interval; without rigs, a share NaN between 0 and 1.
+    """Return the yield of `passed` among `rigs`, with its interval; for 0 rigs the share NaN and the interval 0 … 1.
 
-    Raises ValueError for more passed than rigs.
+    Raises ValueError for more passed than rigs, and for a negative number.
     """
     from scipy.special import betaincinv
 

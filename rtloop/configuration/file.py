@@ -163,8 +163,8 @@ class Configuration:
 def load(path: str | Path, name: str | None = None) -> Configuration:
     """Read and check a TOML file. `name` replaces the stem of the file's name as the configuration's name.
 
-    Laws from files that it names are run once in the limited process, which is killed if a law does not return. Raises
-    InputFileError, or ConfigError with all faults.
+    Laws that it names and that do not ship are run first in the limited process, which is killed if a law does not
+    return, then in this one. Raises InputFileError if the file cannot be read, else ConfigError with all faults.
     """
     path = Path(path)
     return parse(read_text(path), name or path.stem, path.parent, str(path))

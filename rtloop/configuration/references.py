@@ -92,7 +92,7 @@ def generator_values(
 
 
 def _require_below_half_rate(key: str, frequency_hz: float, rate_hz: float) -> None:
-    """Raise ValueError for a frequency that the loop's samples cannot show: a lower one would be played."""
+    """Raise ValueError for a frequency of half the loop's rate or more, which would be played as a lower one."""
     if not frequency_hz < rate_hz / 2:
         raise ValueError(f"{key}: {frequency_hz:g} Hz; allowed: below half of the loop's rate, {rate_hz / 2:g} Hz")
 

@@ -46,7 +46,7 @@ def export(
     output, ticks, bytes, problems}; the problems are damaged parts of the recording, which are left out. Raises
     RecordingError for another format, an unreadable recording, a pattern that fits no signal, a limited time span
     without ticks and a MAT file above 2 GiB; OutputError if the output exists or cannot be written; MissingExtra if the
-    format's package is missing. After an error no output is left.
+    format's package is missing. An incomplete output is removed.
     """
     if to not in EXPORT_SUFFIXES:
         raise RecordingError(f"export to {to!r}; allowed: {', '.join(EXPORT_SUFFIXES)}")

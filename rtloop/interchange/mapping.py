@@ -189,7 +189,10 @@ def default_signal_name(column: str) -> str:
 
 
 def axis_names(signals: list[str]) -> list[str]:
-    """Return the axes in the names of signals, in order; `x_true_position_um` belongs to x where there is an axis x."""
+    """Return the names of the axes to which signals belong, each once, in the order of `signals`: x for `x_drive_v`.
+
+    `x_true_position_um` belongs to x where there is an axis x, else to an axis x_true.
+    """
     candidates = [
         name.removesuffix(f"_{signal.name}")
         for name in signals

@@ -79,7 +79,8 @@ def driver(kind: str) -> Starter:
 def write_starter(starter: Starter, folder: Path) -> list[Path]:
     """Write all files of a starter to `folder`, which is created, and SCHEMA unless it is there. Returns new paths.
 
-    Raises OutputError where another file exists already (none is written then), or if the system refuses.
+    Raises OutputError where another file exists already (none is written then), or if the system refuses (some may be
+    written then).
     """
     from rtloop.configuration.schema import schema_text
 

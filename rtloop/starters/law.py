@@ -32,9 +32,10 @@ def class_name(name: str) -> str:
 
 
 def _stage_text(name: str, stage: Configuration) -> str:
-    """Return a configuration with the law of NAME.py in its first axis, without the pre-filter for another law.
+    """Return the text of `stage` with the law of NAME.py as controller of the first axis, and without its pre-filter.
 
-    It takes the gains of the axis's shipped PI controller; in place of any other one, SLOW_KI_PER_S.
+    The law gets the gains kp and ki_per_s of the axis's controller if that is the shipped PI controller; else ki_per_s
+    is SLOW_KI_PER_S.
     """
     from rtloop.design.stale_comments import remove_first_comments
     from rtloop.design.toml_text import edit_text

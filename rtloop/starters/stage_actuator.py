@@ -82,7 +82,10 @@ def make_actuator(lowest_v: float, highest_v: float, range_um: float, hysteresis
 
 
 def _weights(width: float) -> tuple[float, ...]:
-    """Return weights relative to one another with which h/H is `width`: 1, then WEIGHTS[1:] times one factor."""
+    """Return weights relative to one another: 1, then WEIGHTS[1:] times one factor.
+
+    With them the major loop, over a symmetric drive, is `width` wide, as a fraction of the stroke.
+    """
     plays = list(zip(WEIGHTS[1:], THRESHOLDS[1:], strict=True))
     height = sum(weight * min(2 * threshold, 2 - 2 * threshold) for weight, threshold in plays)
     stroke = sum(weight * (2 - 2 * threshold) for weight, threshold in plays)

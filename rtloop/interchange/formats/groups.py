@@ -152,7 +152,7 @@ def row_count(table: Table) -> int:
 
 
 def unique_name(name: str, names: Iterable[str]) -> str:
-    """Return the name, with a number in brackets behind it if `names` contains it already."""
+    """Return `name`, "name (2)", "name (3)" …: the first of these that `names` does not contain."""
     used_names = set(names)
     candidate, number = name, 1
     while candidate in used_names:
