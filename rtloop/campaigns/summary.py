@@ -140,9 +140,9 @@ def _yield(columns: Mapping[str, Any], manifest: Mapping[str, Any]) -> Yield:
 
 
 def _sensitivity(columns: Mapping[str, Any], manifest: Mapping[str, Any]) -> dict[str, Mapping[str, SensitivityIndex]]:
-    """Return Sobol's indices by key of "passed" and of each figure, where rigs follow Saltelli's design without a gap.
+    """Return Sobol's indices of "passed" and of each figure, by this quantity and then by uncertain key.
 
-    Returns {} for other rigs.
+    {} unless the sampled rigs follow Saltelli's design without a gap.
     """
     order = np.argsort(columns["rig"])
     rigs = columns["rig"][order][columns["rig"][order] != NOMINAL]

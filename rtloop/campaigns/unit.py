@@ -55,9 +55,10 @@ class WorkerFacts:
 
 
 def split_into_units(campaign: Campaign, rate_hz: float) -> list[Unit]:
-    """Return the units of a campaign: the nominal rig alone, then units of about UNIT_S each.
+    """Return the units of a campaign: the nominal rig alone, then `unit_rigs` rigs each.
 
-    Their size depends on the campaign's file and on `rate_hz` alone: further rigs leave full units as they are.
+    Without that option, they have as many rigs as take about UNIT_S, at most MAX_RIGS. Their size depends on the
+    campaign's file and on `rate_hz` alone: further rigs leave full units as they are.
     """
     experiments = campaign.options.experiment
     ticks = sum(experiment.ticks(rate_hz) for experiment in experiments)

@@ -169,8 +169,8 @@ def check_axes(configuration: Configuration, findings: Findings) -> list[AxisChe
     """Build each axis's controller and its loop on the model. Returns a check for each axis, in their order.
 
     Unstable loops and other faults are appended to `findings`. Each law gets the numbers of its inputs and outputs.
-    With a user law it runs in the limited process, which is killed if a law does not return. Raises ConfigError for
-    mistakes in the code of such a law.
+    With a user law, all this is done in the limited process, which is killed if a law does not return. Raises
+    ConfigError for mistakes in the code of such a law.
     """
     if needs_limited_process(configuration.laws):
         checks, limited_findings = run_limited(configuration.source, _checks_and_findings, configuration)

@@ -72,7 +72,7 @@ def true_positions(
 
 
 def plant_dynamics(options: DynamicsOptions) -> Transfer:
-    """Return D(s) of a simulated plant, the resonance's shift included."""
+    """Return D(s) of a simulated plant, with its changes of resonance, damping and gain."""
     return Transfer.from_zpk(*zeros_poles_gain(options))
 
 

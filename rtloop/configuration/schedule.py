@@ -58,7 +58,8 @@ def setpoint_fault(value_um: float, position_limit_um: float) -> str | None:
 def setpoint_faults(axes: Sequence[AxisOptions], mode: str, schedule: Sequence[ScheduleOptions]) -> Iterator[str]:
     """Yield a line for each constant reference in µm of axes and schedule beyond its axis's position interlock.
 
-    The loop begins in `mode`, in which the references of the axes are judged.
+    The loop begins in `mode`, in which the references of the axes are judged; one of the schedule is judged in the mode
+    of its tick.
     """
     for axis in axes:
         references = [("reference", mode, axis.reference)]

@@ -100,7 +100,8 @@ def _write_csv(recording: Recording, file: IO[bytes], selection: Selection, prog
 
 
 def _write_parquet(recording: Recording, file: IO[bytes], selection: Selection, progress: ReportTicks) -> int:
-    """Write a column of doubles for each signal, units in the fields' metadata, header and events in the file's.
+    """Write a column of doubles for each signal, with `unit` in its metadata; write header and events, as JSON, to the
+    file's metadata rtloop.header and rtloop.events.
 
     Returns the number of ticks. Raises OSError if pyarrow fails, MissingExtra without pyarrow.
     """
@@ -127,7 +128,7 @@ def _write_parquet(recording: Recording, file: IO[bytes], selection: Selection, 
 
 
 def _write_npz(recording: Recording, file: IO[bytes], selection: Selection, progress: ReportTicks) -> int:
-    """Write an array for each signal, `header_json` and `events_json`, in several passes if memory requires.
+    """Write an array for each signal, and the texts header_json and events_json, in several passes if memory requires.
 
     Returns the number of ticks.
     """
@@ -147,7 +148,8 @@ def _write_npz(recording: Recording, file: IO[bytes], selection: Selection, prog
 
 
 def _write_hdf5(recording: Recording, file: IO[bytes], selection: Selection, progress: ReportTicks) -> int:
-    """Write a dataset for each signal, `unit` and `meaning` as attributes, and header and events as JSON.
+    """Write a dataset for each signal, with the attributes `unit` and `meaning`, the datasets header_json and
+    events_json, and the file's attribute `rate_hz`.
 
     Returns the number of ticks. Raises MissingExtra without h5py.
     """

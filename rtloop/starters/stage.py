@@ -163,7 +163,10 @@ def _integral_gain(figures: StageFigures, rate_hz: float) -> float:
 
 
 def _sensor_um(figures: StageFigures) -> tuple[float, float]:
-    """Return noise and resolution of the sensor in µm; one that is None equals the other, or has its NOISE_SHARE."""
+    """Return noise and resolution of the sensor in µm; one that is None equals the other.
+
+    If both are None, both are NOISE_SHARE of the travel.
+    """
     noise_um, resolution_um = figures.sensor_noise_um, figures.sensor_resolution_um
     default_um = NOISE_SHARE * figures.range_um
     if noise_um is None:
