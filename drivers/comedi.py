@@ -68,7 +68,8 @@ class ComediOptions(Options):
 def _call_in_python(function: int, device: int, line: tuple[int, ...], final_argument: Any) -> int:
     """Call the function at address `function` of libcomedi like `_call`, without the compiler; return its int.
 
-    `line` is (subdevice, channel, range, aref). A code in `final_argument` has the type uint32.
+    `line` is (subdevice, channel, range, aref). `final_argument` is a code to write if its type is uint32, else an
+    address.
     """
     last_type = ctypes.c_uint32 if getattr(final_argument, "dtype", None) == np.uint32 else ctypes.c_ssize_t
     prototype = ctypes.CFUNCTYPE(ctypes.c_int32, ctypes.c_ssize_t, *[ctypes.c_uint32] * len(line), last_type)
@@ -253,7 +254,7 @@ class ComediDriver(Driver):
         context["failed_input"] = context["failed_output"] = -1
 
     def _park(self) -> None:
-        """Set all outputs to `safe_v`. Raises DriverError if a write fails."""
+        """Set all outputs to `safe_v`. Raises DriverError if a write fails; the outputs before it are set then."""
         safe = np.full(len(self._outputs), self._options.safe_v)
         if comedi_write(self._context.ctypes.data, safe.ctypes.data) < 0:
             raise DriverError(

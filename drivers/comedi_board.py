@@ -93,7 +93,7 @@ class Board:
     def reserve_subdevice(self, kind: Kind, number: int | None) -> int:
         """Lock subdevice `number`, by default the first of its kind, for this process; return its number.
 
-        Raises DriverError if there is none of this kind, or another program has locked it.
+        Raises DriverError if there is none of this kind, or it cannot be locked, as when another program has locked it.
         """
         subdevice = self._library.comedi_find_subdevice_by_type(self._handle, kind, 0) if number is None else number
         if number is None and subdevice < 0:

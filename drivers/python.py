@@ -58,8 +58,8 @@ class PythonDriver(Driver):
         """Call `start` and return pointers to C functions that call `read` and `write`.
 
         They return FAILED, and store the first exception in `error`, if a method raises, if `read` and `observe` return
-        another number of values than the facts say, and for a voltage outside its channel's range or NaN. Raises
-        DriverError as `start` does.
+        another number of values than the facts say, and for an output voltage that is NaN or outside its channel's
+        range, before `write` is called. Raises DriverError as `start` does.
         """
         self.start()
         facts: Facts = self.facts

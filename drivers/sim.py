@@ -77,7 +77,9 @@ class SimDriver(Driver):
 
     @property
     def rig(self) -> tuple[np.recarray, np.recarray]:
-        """Coefficients and state of the rig, records (axes,) in the order of its channels; the driver changes them."""
+        """Coefficients and state of the rig, records (axes,) in the order of its channels, no copies: ticks advance the
+        state.
+        """
         return self._rig
 
     def _axes_by_plant(self) -> list[str]:

@@ -82,7 +82,8 @@ def _fill_positions(
 ):
     """Fill `out` (ticks, points) with positions in µm, as `positions_between_ticks` describes; return 0.
 
-    The other arguments are addresses of arrays, or numbers of points, modes, axes and ticks.
+    The other arguments are addresses of arrays, or numbers of points, modes, axes and ticks. The record at
+    `state_address` is advanced by all periods.
     """
     coefficients = carray(address_pointer(coefficients_address), 1, COEFFICIENTS)[0]
     state = carray(address_pointer(state_address), 1, STATE)[0]

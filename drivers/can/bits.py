@@ -43,7 +43,10 @@ def fd_frame_bits(length: int) -> tuple[int, int]:
 
 
 def frame_duration_s(length: int, fd: bool, bitrate: int, data_bitrate: int) -> float:
-    """Return the longest duration in s of a frame with `length` data bytes; rates in bit/s, `data_bitrate` if `fd`."""
+    """Return the longest duration in s of a frame with `length` data bytes: classic, or CAN FD if `fd`.
+
+    The rates are in bit/s; `data_bitrate` counts for CAN FD alone.
+    """
     if not fd:
         return classic_frame_bits(length) / bitrate
     slow, fast = fd_frame_bits(length)

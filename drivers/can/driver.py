@@ -93,8 +93,9 @@ class CanDriver(PythonDriver):
 
         Sets `sample_age_us`, the time since the drive frame of this sample was sent, plus the node's own, and `status`:
         0, or STATUS_HELD while the last drive frame is not answered and the previous sample is held. After more than
-        `hold_ticks` such ticks the age is infinite. The first call discards older frames, sends the safe values and
-        waits up to RETRY_S for the answer. Raises DriverError if another controller drives the node.
+        `hold_ticks` such ticks the age is infinite. Until the first `write`, a call first discards older frames, sends
+        the safe values and waits up to RETRY_S for the answer. Raises DriverError if another controller drives the node
+        or the driver is not open; python-can's errors pass through.
         """
         if self._stream.sent == 0:  # Much time may pass between `open` and the first tick.
             while self._receive(0.0) is not None:
@@ -121,7 +122,10 @@ class CanDriver(PythonDriver):
         return stream.lost, stream.reordered, stream.duplicated, stream.invalid, self._total_held_ticks
 
     def write(self, volts: Sequence[float]) -> None:
-        """Send `volts`, one per output channel, with the next sequence number; do not wait for the answer."""
+        """Send `volts`, one per output channel, with the next sequence number; do not wait for the answer.
+
+        Raises DriverError if the driver is not open; python-can's errors pass through.
+        """
         self._send(self._stream.next_sequence(), volts)
 
     def stop(self) -> None:
@@ -182,7 +186,7 @@ class CanDriver(PythonDriver):
     def _listen(self, duration_s: float) -> bool:
         """Process frames until a new sample comes, for at most `duration_s`; return whether one came.
 
-        Raises DriverError if another controller drives the node.
+        Raises DriverError if another controller drives the node; python-can's errors pass through.
         """
         deadline_s = time.monotonic() + duration_s
         while (remaining_s := deadline_s - time.monotonic()) > 0:
@@ -192,9 +196,9 @@ class CanDriver(PythonDriver):
         return False
 
     def _send(self, sequence: int, volts: Sequence[float]) -> None:
-        """Send a drive frame with `volts`, and store its bytes and time at index `sequence`.
+        """Send a drive frame with `volts`; its bytes and the time are stored at index `sequence` before.
 
-        Raises DriverError if the bus is not open.
+        Raises DriverError if the bus is not open; python-can's errors pass through.
         """
         self._sent_frames[sequence] = self._exchange.drive.pack((sequence, *volts, *self._padding))
         self._message.data[:] = self._sent_frames[sequence]
@@ -204,7 +208,7 @@ class CanDriver(PythonDriver):
     def _receive(self, timeout_s: float) -> can.Message | None:
         """Return the next frame, or None if none comes within `timeout_s`.
 
-        Raises DriverError if the bus is not open.
+        Raises DriverError if the bus is not open; python-can's errors pass through.
         """
         return self._opened_bus.recv(timeout_s)
 

@@ -48,14 +48,18 @@ class RigNode:
         self._start_s = self._last_move_s = self._last_frame_s = time.monotonic()
 
     def announce(self) -> None:
-        """Send this node's announcement: number of channels, starting or serving, watchdog time, random identity."""
+        """Send this node's announcement: number of channels, starting or serving, watchdog time, random identity.
+
+        Raises python-can's errors.
+        """
         values = (self._exchange.channels, self._serving, self._options.watchdog_ms, self._identity)
         self._bus.send(self._announcement.message(self._options, values))
 
     def require_alone(self) -> None:
         """Announce this node, listen for LISTEN_S, then count as serving.
 
-        Raises DriverError if a node answers drive frames, or another node's announcement comes, in this time.
+        Raises DriverError if a node answers drive frames, or another node's announcement comes, in this time; this node
+        then does not serve. Raises python-can's errors.
         """
         self.announce()
         deadline_s = time.monotonic() + LISTEN_S
@@ -101,10 +105,11 @@ class RigNode:
             self._target_v[:], self._following, self._newest = SAFE_V, False, 0
 
     def _apply_drive_frame(self, message: can.Message) -> bool:
-        """Take the frame's volts as target and answer; the outputs jump there if they follow, else they ramp there.
+        """Take the frame's volts as target, answer with a sample, and return True.
 
-        Returns False, without an answer, for a malformed frame or one not newer than the last. Sequence 0 is always
-        accepted, and its volts are reached by a ramp.
+        The outputs jump to the target if they follow drive frames, else they ramp there. Returns False, without an
+        answer, for a malformed frame or one not newer than the last. Sequence 0 is always accepted, and its volts are
+        reached by a ramp; after it, after the start and after a parking, any sequence is accepted.
         """
         drive, highest = self._exchange.drive, self._exchange.highest_sequence
         if not drive.fits(message):
@@ -145,7 +150,8 @@ def serve(
     """Run a node on the bus of the options until `is_stopped()`; return a sentence with its counts.
 
     `on_ready` is called when no other node has answered. Raises ValueError for an unknown interface and if rig, axes
-    and DBC do not fit together; DriverError if the bus cannot be opened or fails, and for another node on it.
+    and DBC do not fit together, KeyError for a DBC without the frame Node; DriverError if the bus cannot be opened or
+    fails, and for another node on it.
     """
     require_interface(options)
     with open_bus(options) as bus:

@@ -72,10 +72,12 @@ SCALE = np.dtype(
 def make_card(
     fd: int, strangers_fd: int | None, **values: Any
 ) -> tuple[np.ndarray[Any, Any], dict[str, np.ndarray[Any, Any]]]:
-    """Return a record CARD, shape (1,), and by name the arrays at its addresses, which must live as long as it does.
+    """Return a record CARD, shape (1,), and a dict of the arrays whose addresses it holds, by the names of these
+    fields.
 
-    `fd` is connected to the node; `strangers_fd` is a socket of the same port for all others, None for a serial line.
-    `values` are further fields; `in_scales` and `out_scales` are sequences of Scale.
+    The arrays must live as long as the record. `fd` is connected to the node; `strangers_fd` is a socket of the same
+    port for all others, None for a serial line. `values` are further fields; `in_scales` and `out_scales` are sequences
+    of Scale.
     """
     inputs, outputs = (_scale_array(values.pop(name)) for name in ("in_scales", "out_scales"))
     arrays: dict[str, np.ndarray[Any, Any]] = {
@@ -101,13 +103,13 @@ def make_card(
 
 
 def _scale_array(scales: tuple[Scale, ...]) -> np.ndarray[Any, Any]:
-    """Return the scales as records SCALE."""
+    """Return the scales as records SCALE (channels,), without safe value and change per ms."""
     rows = [(s.lowest, s.highest, s.volts_per_code, s.offset_v) for s in scales]
     return np.array(rows, SCALE)
 
 
 def crc_table() -> np.ndarray[Any, Any]:
-    """Return the 256 values by which CRC-32 takes a byte at a time (polynomial 0xEDB88320, bits reflected)."""
+    """Return the 256 values, uint32, by which CRC-32 takes a byte at a time (polynomial 0xEDB88320, bits reflected)."""
     table = np.arange(256, dtype=np.uint32)
     for _ in range(8):
         table = np.where(table & 1, np.uint32(0xEDB88320) ^ (table >> 1), table >> 1).astype(np.uint32)

@@ -40,6 +40,7 @@ class FrameReader:
     """Takes bytes as they come and returns whole frames; bytes that are no frame are counted in `broken`."""
 
     def __init__(self) -> None:
+        """Begin without bytes; `broken` is 0."""
         self._bytes, self.broken, self._skips = bytearray(), 0, False
 
     def feed(self, data: bytes) -> None:

@@ -124,7 +124,8 @@ class NodeDriver(Driver):
         """Open the node, whose outputs ramp to safe values, measure `count` exchanges at the tick rate, and close it.
 
         Whatever the option `answer`, an exchange waits for its answer for up to MEASURING_WAIT_S, and is counted as
-        lost without it. Raises DriverError as `open` does, and if the node ends the session.
+        lost without it. Raises DriverError as `open` and `close` do, and, after closing the node, if it ends the
+        session.
         """
         pointers, durations_us, lost = self.open(), list[float](), 0
         try:
@@ -177,7 +178,7 @@ class NodeDriver(Driver):
     def _greet(self, link: Link) -> Welcome:
         """Send a HELLO every RETRY_S until the node describes itself, and return its description.
 
-        Raises DriverError if none comes within `wait_s` or the node speaks another version.
+        Raises DriverError if none comes within `wait_s` or the node speaks another version, OSError if the line fails.
         """
         deadline_s, sequence = time.monotonic() + self._options.wait_s, 0
         while time.monotonic() < deadline_s:
@@ -255,7 +256,7 @@ class NodeDriver(Driver):
         """Send an OPEN every RETRY_S until the node is ready; return the sequence that it has answered.
 
         Raises DriverError if another loop drives the node for longer than BUSY_S, if the node refuses for another
-        reason, and if it is not ready within `wait_s`.
+        reason, and if it is not ready within `wait_s`; OSError if the line fails.
         """
         safe = tuple(scale.safe for scale in welcome.outputs)
         start_s, sequence = time.monotonic(), 0
@@ -276,7 +277,10 @@ class NodeDriver(Driver):
         )
 
     def _await_answer(self, link: Link, sequence: int, timeout_s: float) -> Sample | frames.Refusal | None:
-        """Return the sample or refusal that answers this session's DRIVE `sequence`, None if none comes in time."""
+        """Return the sample or refusal that answers this session's DRIVE `sequence`.
+
+        None if none comes within `timeout_s`, or if its content is malformed. Raises OSError if the line fails.
+        """
         for header, data in _receive_for(link, timeout_s):
             if header.session != self._session or header.sequence != sequence:
                 continue
@@ -371,7 +375,7 @@ def _digital_channels(prefix: str, count: int) -> list[Channel]:
 
 
 def _receive_for(link: Link, duration_s: float) -> Any:
-    """Yield header and bytes of each valid frame that comes within `duration_s`.
+    """Yield each valid frame that comes within `duration_s` as (Header, bytes of the whole frame).
 
     Raises OSError if the line is broken.
     """

@@ -109,9 +109,10 @@ def node_write(context, values):
 
 @jit_rare
 def _send_drive(card, flags):
-    """Send a DRIVE with the codes and digital outputs at `card.sent`; with ANSWER, store the time of sending.
+    """Send a DRIVE with the codes and digital outputs at `card.sent`; `flags` is a sum of OPEN, APPLY and ANSWER.
 
-    A frame that the system does not take counts as one whose answer is missing.
+    With ANSWER, the frame becomes the last request, and the time of sending is stored. A frame that the system does not
+    take is not reported: it counts as one whose answer is missing.
     """
     frame = carray(address_pointer(card.sent), 1, DRIVE)[0]
     card.last_sequence = np.uint32(card.last_sequence + np.uint32(1))
@@ -269,7 +270,10 @@ def _take_sample(card):
 
 @jit
 def _fill_values(card, values):
-    """Fill `values` with volts of inputs and digital inputs, the age in µs, and the counts."""
+    """Fill `values` with volts of inputs and digital inputs, the age in µs, and the counts.
+
+    The age is infinite after more than `hold_ticks` successive held ticks.
+    """
     inputs = card.inputs + card.digital_inputs
     out = carray(values, inputs + 1 + OBSERVED_COUNT)
     scales = carray(address_pointer(card.in_scales), card.inputs, SCALE)

@@ -79,7 +79,11 @@ class Scale(NamedTuple):
 
 
 class Welcome(NamedTuple):
-    """A node's description of itself; `hold_us` is the longest time that it holds its outputs without a DRIVE."""
+    """A node's description of itself.
+
+    `boot` is a number that differs after each start of the node, `hold_us` the longest time that it holds its outputs
+    without a DRIVE, `period_us` the shortest period of a loop, `is_driven` whether a session is open.
+    """
 
     session: int
     version: int

@@ -79,7 +79,10 @@ class UdpLink(Link):
         self.fd, self.strangers_fd = self._socket.fileno(), self._strangers.fileno()
 
     def _bind(self, host: str) -> None:
-        """Bind both sockets to one free port of this computer's address `host`; other sockets cannot share it."""
+        """Bind both sockets to one free port of this computer's address `host`; other sockets cannot share it.
+
+        Raises OSError if the system refuses.
+        """
         self._socket.setblocking(False)
         self._strangers.setblocking(False)
         self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, BUFFER_BYTES)
@@ -93,7 +96,10 @@ class UdpLink(Link):
             shared.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 0)
 
     def _connect(self) -> None:
-        """Connect the first socket to the node, and discard what it has received from others."""
+        """Connect the first socket to the node, and discard what it has received from others.
+
+        Raises OSError if the system refuses.
+        """
         self._socket.connect(self._address)
         with contextlib.suppress(BlockingIOError):
             while True:

@@ -172,7 +172,10 @@ def discretise(modal: ModalSystem, period_s: float) -> dict[str, object]:
 
 
 def settle(coefficients: np.record, state: np.record, input_um: float) -> None:
-    """Set every mode in `state` to its steady state at a constant `input_um`; an integrator, which has none, to 0."""
+    """Set `state.input_um` to a constant `input_um`, and every mode in `state` to its steady state at this input.
+
+    An integrator, which has no steady state, becomes 0.
+    """
     poles = coefficients.mode_real + 1j * coefficients.mode_imag
     modes: npt.NDArray[np.complex128] = np.where(poles == 1, 0.0, input_um / np.where(poles == 1, 1.0, 1 - poles))
     modes[coefficients.mode_count :] = 0.0
