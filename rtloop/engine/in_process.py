@@ -36,6 +36,7 @@ class LoopsInProcess:
     """Runs loops one after the other; block and laws are used again where the next loop has the same."""
 
     def __init__(self) -> None:
+        """Begin without blocks and laws that could be used again."""
         self._blocks: dict[Sizes, SharedBlock] = {}
         self._law: _LawAtRest | None = None
 

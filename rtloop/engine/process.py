@@ -42,7 +42,8 @@ GO_POLL_S = 0.001
 
 
 def report(kind: str, **facts: Any) -> None:
-    """Write one JSON line, `report` and `facts`, to stdout; nothing happens if the supervisor has ended.
+    """Write one line of JSON, {"report": `kind`, and the `facts`}, to stdout; nothing happens if the supervisor has
+    ended.
 
     It is unbuffered, so that no write can fail at the exit.
     """

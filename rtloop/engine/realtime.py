@@ -19,8 +19,9 @@ _libc = ctypes.CDLL(None, use_errno=True)
 def prepare_realtime(pacing: Pacing) -> dict[str, Any]:
     """Request all privileges that keep ticks on time, for the calling thread. Unpaced, none is requested.
 
-    Returns the setting in force of `scheduler`, `priority`, `mlock`, `affinity` (processors), `kernel`,
-    `timer_slack_ns` and `pm_qos`, and in `refused` a message for each refused one.
+    Returns what is in force: `scheduler` ("SCHED_FIFO" or "SCHED_OTHER"), `priority` (0 for the latter), `mlock` and
+    `pm_qos` (booleans), `affinity` (list of processors), `kernel` (text), `timer_slack_ns` (1, or None if it was not
+    set), and in `refused` a list with a message for each refused one. Raises nothing for a refusal.
     """
     report: dict[str, Any] = {
         "scheduler": "SCHED_OTHER",

@@ -61,7 +61,7 @@ class Options(BaseModel):
         return cls.model_construct()
 
     def model_copy(self, *, update: Mapping[str, Any] | None = None, deep: bool = False) -> Self:
-        """Return a copy as pydantic does, without the cached properties of the original."""
+        """Return a copy as pydantic does, without the cached properties of the original; `update` is not validated."""
         copy = super().model_copy(update=update, deep=deep)
         attributes = vars(copy)
         for name in attributes.keys() - type(self).model_fields.keys():

@@ -41,7 +41,7 @@ def model_output(model: PlayModel, drive: npt.ArrayLike) -> Real:
 
 
 def turning_points(drive: Real, min_reversal: float) -> npt.NDArray[np.intp]:
-    """Return the indices of the drive's alternating maxima and minima, each followed by a reversal of at least
+    """Return the rising indices of the drive's alternating maxima and minima, each followed by a reversal of at least
     `min_reversal`, in the drive's unit.
 
     The first sample is never among them.

@@ -72,9 +72,10 @@ def can_hold(model: PlayModel, positions_um: npt.ArrayLike, lowest_v: float, hig
 
 
 def _outermost_drives(model: PlayModel, positions_um: npt.ArrayLike) -> tuple[float, float]:
-    """Return the least and the largest drive in V that take a virgin `model` through positions, with 0 before them.
+    """Return the least (≤ 0) and the largest (≥ 0) drive in V that take a virgin `model` through positions, with 0
+    before them.
 
-    A dead band, the first threshold of the model, is added to both sides. Raises ValueError without an inverse.
+    A dead band, the first threshold of the model, is added to each that is not 0. Raises ValueError without an inverse.
     """
     dead_band_v = float(model.thresholds[0])
     drive_v: Real = model_output(model.inverse(), positions_um)

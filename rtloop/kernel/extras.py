@@ -104,7 +104,10 @@ def pass_extra_inputs(record):
 
 @jit_rare
 def set_marks(record, a, step_um, position_um):
-    """Set whether the marks of axis `a` are high, from the reference's change since the last tick and the position."""
+    """Set `is_high` of the marks of axis `a`, 1 or 0, from the reference's change since the last tick and the position.
+
+    `step_um` is this change, with its sign; outputs without a mark get 0.
+    """
     outputs = extra_outputs(record)
     for k in range(record.extra_output_count):
         if outputs[k].axis == a:

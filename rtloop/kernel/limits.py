@@ -16,7 +16,7 @@ def is_usable(value):
 
 @jit
 def clip(value, low, high):
-    """Return `value` limited to low … high."""
+    """Return `value` limited to low … high; NaN stays NaN."""
     return low if value < low else (high if value > high else value)
 
 

@@ -104,7 +104,8 @@ class Layout:
     def split_snapshot(
         self, snapshot: bytes | npt.NDArray[np.uint8], axes: int
     ) -> tuple[int, Records, Records, Records]:
-        """Return tick, coefficients, state of the axes and state of the loop of a law's snapshot, as aligned copies.
+        """Return tick, coefficients (axes,), states of the axes (axes,) and state of the loop (1,), aligned copies,
+        from a law's snapshot.
 
         Raises ValueError if the length does not fit `axes`, a count, an index or a switch is not allowed, a law is in a
         wrong slot, or an axis has not exactly one controller.

@@ -218,7 +218,10 @@ def _trip_on_law_failure(loop):
 
 @jit
 def _control_axis(law, a):
-    """Compute the command of one axis with a controller for itself alone. Returns False if its law failed."""
+    """Set the command of one axis, in its state and its CONTROL record, by a controller for itself alone.
+
+    Returns False, with the failure recorded in the state, if its law failed.
+    """
     coefficients, state = coefficients_record(law, a), axis_state(law, a)
     _set_control_inputs(
         law, a, coefficients, state, coefficients.resting_error[0] * (state.applied_command_um - state.feed_um)
@@ -231,7 +234,7 @@ def _control_axis(law, a):
 
 @jit_rare
 def _evaluate_coupled(law, first, count, loop, references):
-    """Compute commands and drives of the `count` axes from `first` on, which share a controller."""
+    """Set commands and drives of the `count` axes from `first` on, which share a controller; a failure of a law trips."""
     if loop.mode == CLOSED_LOOP and not _control_coupled(law, first, count):
         _trip_on_law_failure(loop)
     for i in range(first, first + count):
@@ -240,9 +243,11 @@ def _evaluate_coupled(law, first, count, loop, references):
 
 @jit
 def _control_coupled(law, first, count):
-    """Compute the commands of axes that share a controller. Returns False if its law failed.
+    """Set the commands of `count` axes from `first` on, in their states and CONTROL records, by the controller that
+    they share.
 
-    The error at which an axis rests depends on the commands of all.
+    Returns False, with the failure recorded in a state, if its law failed. The error at which an axis rests depends on
+    the commands of all.
     """
     entering = False
     for i in range(first, first + count):
@@ -378,7 +383,10 @@ def _decayed_offset(coefficients, offset, restarts, gap):
 
 @jit
 def update(record):
-    """Advance the memory of all laws by the drives that were applied; a law that fails trips the next tick."""
+    """Advance the memory of all laws by the drives that were applied, and set each axis's applied command.
+
+    Controllers advance in closed loop alone. A law that fails trips the next tick.
+    """
     law = unpack_law(record)
     loop = loop_state(law)
     for a in range(law.axis_count):

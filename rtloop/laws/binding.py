@@ -30,6 +30,7 @@ RETURNS_NOTHING = "No conversion from none to float64"
 def bind_functions(laws: Sequence[LawReference]) -> npt.NDArray[Any]:
     """Return the FUNCTIONS records of these laws, in their order, compiled or loaded from the cache.
 
+    The fields `output`, `update` and `enter` are addresses, 0 for an `enter` that the law lacks; the others are 0.
     Raises ValueError for a law that cannot be compiled or calls a forbidden function, and as `law_class` does.
     """
     return np.concatenate([np.zeros(0, FUNCTIONS), *map(_bind_law, laws)])
@@ -130,7 +131,7 @@ def _compiler_message(error: Exception) -> str:
 
 
 def _line_text(error: Exception, file: str) -> str:
-    """Return file name and line of the law's own file that the compiler names, as words; "" if it names none."""
+    """Return " (FILE), line N" for the last line of the law's own file that the compiler names; "" if it names none."""
     locations = re.findall(r'File "([^"]+)", line (\d+)', str(error))
     lines = [number for name, number in locations if Path(name).name == Path(file).name]
     return f" ({Path(file).name}), line {lines[-1]}" if lines else ""

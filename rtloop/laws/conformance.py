@@ -204,10 +204,10 @@ class Bench:
             return self._kernels[name](*self._rows, law_input)
 
     def run(self, ticks: int, seed: int = SEED, wild: bool = True) -> Iterator[tuple[Any, bytes]]:
-        """Run `ticks` ticks with random signals; yield each tick's result, and the bytes of state and extra outputs.
+        """Run `ticks` ticks with random signals; yield for each (result, bytes of the state and of the extra outputs).
 
-        The result is the command (for several axes a tuple), or a feedforward's drive plus its command. With `wild`,
-        every 97th tick of a controller has positions and references up to 1e6 µm.
+        The result is the command in µm (for several axes a tuple), or a feedforward's drive plus its command. With
+        `wild`, every 97th tick of a controller has positions and references up to 1e6 µm.
         """
         random = np.random.default_rng(seed)
         for number in range(ticks):
@@ -290,7 +290,10 @@ class Bench:
         return loop
 
     def _limited_tick(self, position_um: Any, reference_um: Any, limit_um: float) -> Any:
-        """Run one tick with a limit of the command; return the applied commands. All (axes,), in µm."""
+        """Run one tick with the command limited to ±`limit_um`; return the applied commands (axes,), in µm.
+
+        `position_um` and `reference_um` are (axes,). The state advances.
+        """
         control = self._control[0]
         if self._law.count == 1:
             position_um, reference_um = float(position_um[0]), float(reference_um[0])

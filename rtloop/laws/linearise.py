@@ -29,9 +29,10 @@ MAX_STATES = 400
 
 
 def linear_part(law: Controller) -> Any:
-    """Return the law's `linear()`, or, if that is None, its linearisation at rest.
+    """Return the law's `linear()`, or, if that is None, its linearisation at rest: the transfer from error to command.
 
-    Raises ValueError for a law that cannot be linearised: too many states, not smooth, or failing at rest.
+    A SampledController or DiscreteController, of several axes a SampledCoupledSystem. Raises ValueError for a law that
+    cannot be linearised: too many states, not smooth, or failing at rest.
     """
     declared = law.linear()
     return linearise_at_rest(law) if declared is None else declared

@@ -42,7 +42,10 @@ class ExportedKernel:
         return self._machine_code
 
     def _compile(self) -> int:
-        """Compile the kernel, store its machine code if it can be loaded without numba, and return its address."""
+        """Compile the kernel, store its machine code if it can be loaded without numba, and return its address.
+
+        Each subclass defines it.
+        """
         raise NotImplementedError
 
     @property

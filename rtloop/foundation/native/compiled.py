@@ -95,12 +95,17 @@ def jit_checked(function: Callable[..., Any]) -> Any:
 
 
 def jit_strict(function: Callable[..., Any]) -> Any:
-    """Compile a user's kernel: an index outside its array, and a division by zero, raise an exception."""
+    """Compile a user's kernel on first use, without a cache; return it as `jit` does.
+
+    An index outside its array raises IndexError, a division by zero ZeroDivisionError.
+    """
     return _make_kernel(function, error_model="python", boundscheck=True)
 
 
 def jit_rare(function: Callable[..., Any]) -> Any:
-    """Compile a kernel for rare work: it is called, not inlined, to keep its callers small."""
+    """Compile a kernel for rare work on first use; return it as `jit` does. It is called, not inlined, to keep its
+    callers small.
+    """
     return _make_kernel(function, cache=True, error_model="numpy")
 
 
@@ -113,7 +118,10 @@ def jit_rare_checked(function: Callable[..., Any]) -> Any:
 
 
 def jit_inline(function: Callable[..., Any]) -> Any:
-    """Copy a function into the source of its calling kernels before compilation: they are optimised together."""
+    """Return a kernel whose source is copied into its calling kernels before compilation: they are optimised together.
+
+    The function itself is returned if UNCOMPILED.
+    """
     return _make_kernel(function, inline="always", error_model="numpy")
 
 
@@ -125,6 +133,8 @@ def intrinsic(function: Callable[..., Any], uncompiled: Callable[..., Any] | Non
     """
 
     def resolve_type(compiler: Any) -> Any:
+        """Return numba's type of the name; `compiler` is the module `native.compiler`."""
+
         @wraps(function)
         def typing_function(_: Any, *arguments: Any) -> Any:
             return function(compiler, *arguments)
@@ -148,9 +158,13 @@ def numba_function(name: str, uncompiled: Callable[..., Any] | None = None) -> A
 
 
 def c_library_function(name: str, signature: str, uncompiled: Callable[..., Any] | None = None) -> Any:
-    """Return a function of the C library for use in kernels; `uncompiled` is its Python equivalent, if any."""
+    """Return a function of the C library for use in kernels; `uncompiled` is its Python equivalent, if any.
+
+    `signature` is numba's, as a text such as "int32(int32, intp)".
+    """
 
     def resolve_type(compiler: Any) -> Any:
+        """Return numba's type of the function; `compiler` is the module `native.compiler`."""
         return compiler.types.ExternalFunction(name, compiler.parse_signature(signature))
 
     return KernelSymbol(name, resolve_type, uncompiled)

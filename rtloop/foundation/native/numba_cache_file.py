@@ -18,7 +18,10 @@ class CheckedCacheFile(IndexDataCacheFile):
     """Index and data of one kernel. A damaged file is treated as missing and written again."""
 
     def _load_index(self) -> Any:
-        """Return the kernel's signatures and the file name of the code for each; empty if the index is damaged."""
+        """Return a dict from each signature of the kernel to the file name of its code.
+
+        It is empty if the index is missing or damaged.
+        """
         return super()._load_index() if stored.read(Path(self._index_path)) is not None else {}
 
     def _load_data(self, name: str) -> Any:

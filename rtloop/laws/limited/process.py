@@ -73,12 +73,15 @@ class LimitedProcess:
             self._prepare(function, compiles=False)
 
     def run(self, function: Callable[..., Any], *arguments: Any, compiles: bool = False, show: bool = True) -> Any:
-        """Run a module-level function and return its result; `show` forwards its output to stderr.
+        """Run a module-level function in the limited process and return its result; `show` forwards its output to
+        stderr.
 
         With `compiles`, the compiler is loaded first; this time does not count for the limit.
-
-        Raises the function's ConfigError, DriverError and RtloopError, ConfigError if a law's code raises another error
-        or leaves a thread or process, and AbandonedJob if it does not return, prints too much or ends the process."""
+        Raises the function's ConfigError, DriverError and RtloopError, of a subclass as these three; ConfigError also
+        if a law's code raises another error or leaves a thread or process, and for an ArithmeticError without a law;
+        AbandonedJob if the function does not return, prints too much or ends the process. After AbandonedJob and after
+        a leftover, the process has been killed, and the next job starts another.
+        """
         with self._lock:
             self._law = None
             self._printed.clear()
@@ -122,7 +125,10 @@ class LimitedProcess:
                 pipe.close()
 
     def _start(self) -> None:
-        """Start the process if none runs; a dead one is replaced, and its messages and preparations are dropped."""
+        """Start the process if none runs; a dead one is replaced, and its messages and preparations are dropped.
+
+        Raises OSError if the system refuses.
+        """
         process = self._process
         if process is not None and process.poll() is None:
             return
@@ -159,9 +165,10 @@ class LimitedProcess:
         return process.stdin, process.stdout, process.stderr
 
     def _outcome(self) -> tuple[str, Any]:
-        """Wait for the answer to a job and return its kind and value; the law announced last is stored in `_law`.
+        """Wait for the answer to a job; return its kind and value as `Worker._outcome` describes them.
 
-        Raises AbandonedJob if the job takes too long, prints too much or ends the process.
+        The law announced last is stored in `_law`, and output that is left is collected. Raises AbandonedJob if the job
+        takes too long, prints too much or ends the process.
         """
         clock = _Clock(self.limit_s, self.pid)
         while True:

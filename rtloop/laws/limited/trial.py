@@ -25,8 +25,8 @@ def needs_limited_process(laws: Iterable[LawReference]) -> bool:
 def run_limited(source: str, function: Callable[..., Any], *arguments: Any, compiles: bool = False) -> Any:
     """Run `function` in the limited process and return its result; `compiles` says whether it needs the compiler.
 
-    Raises ConfigError of `source` for faults of a law, else DriverError and RtloopError as `function` does, and
-    AbandonedJob if the process fails while no law runs.
+    Raises ConfigError of `source` for faults of a law and for every ConfigError of `function`, DriverError and
+    RtloopError as `function` does, and AbandonedJob if the process fails while no law runs.
     """
     return _run_for_source(source, partial(PROCESS.run, compiles=compiles), function, *arguments)
 
@@ -34,8 +34,10 @@ def run_limited(source: str, function: Callable[..., Any], *arguments: Any, comp
 def try_limited(source: str, function: Callable[..., Any], *arguments: Any) -> None:
     """Run `function` in the limited process before it runs in this one; no effect inside a limited process.
 
-    Raises ConfigError of `source` if a law's code ends the process, does not return, or leaves a thread or process.
-    ValueError, RtloopError and DriverError are ignored here; they occur again in the caller."""
+    Raises ConfigError of `source` if a law's code ends the process, does not return, leaves a thread or process, or
+    raises an error other than ValueError, RtloopError and DriverError. These three are ignored here, as they occur
+    again in the caller. Raises AbandonedJob if the process fails while no law runs.
+    """
     if not is_limited():
         _run_for_source(source, partial(PROCESS.run, show=False), partial(_run_ignoring_errors, function), *arguments)
 

@@ -82,7 +82,9 @@ class PositivePosition(Controller):
 
     @staticmethod
     def enter(c: Any, s: Any, told: Any) -> None:
-        """Set the filter at rest with the position, and the integral so that the command continues."""
+        """Set, in a state of zeros, the filter at rest with the position, and the integral so that the command
+        continues.
+        """
         s.filter[0] = told.position_um
         s.integral_um = told.command_um - c.gain * told.position_um
 

@@ -138,5 +138,5 @@ class Repetitive(Controller):
 
     @staticmethod
     def enter(c: Any, s: Any, told: Any) -> None:
-        """Start with an empty memory and the command in force."""
+        """Set, in a state of zeros, the integral to the command in force; the memory of a period stays empty."""
         s.integral_um = told.command_um
