@@ -195,7 +195,8 @@ class ComediDriver(Driver):
         return DriverError(f"{self._options.device}: {channels}: {self._board.error_text()}")
 
     def open(self) -> Pointers:
-        """Reserve the subdevices; set the outputs to `safe_v` unless all can be read back.
+        """Open the board, reserve its subdevices and return the pointers; set the outputs to `safe_v` unless all can be
+        read back.
 
         Raises DriverError, with the board released, for a missing library, board, channel or range, a subdevice in use,
         and outputs that cannot be set.

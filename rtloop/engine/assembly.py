@@ -84,7 +84,10 @@ class Assembly:
         return outputs_v
 
     def run(self, until_tick: int) -> Outcome:
-        """Run the compiled loop until it has executed `until_tick` ticks since its start; return why it ended."""
+        """Run the compiled loop until it has executed `until_tick` ticks since its start; return why it ended.
+
+        DONE leaves the outputs as they are, and a later call continues; the other values are as Outcome describes them.
+        """
         return Outcome(run_ticks(self._loops.ctypes.data, until_tick))
 
     def _add_array(self, name: str, array: np.ndarray[Any, Any]) -> None:
@@ -160,7 +163,9 @@ class Assembly:
 
 
 def rehearse() -> None:
-    """Compile the loop, the clocks and the simulated rig by some ticks in virtual time, in the caller's process."""
+    """Run some ticks of the simulated rig in virtual time, in this process, so that loop, clocks and rig are compiled
+    or loaded from the cache.
+    """
     pacing = Pacing(rate_hz=1000.0, paced=False, simulated_lateness_us=(0.0,))
     wiring = {"x": Wiring("adc0", "dac0")}
     laws = tuple(map(LawReference, REHEARSED_LAWS))

@@ -157,7 +157,7 @@ def _change_units(loop, mode, holds_output):
     """Set the unit of all references for `mode`: V in RAW, else µm.
 
     With `holds_output`, a reference in the other unit becomes a constant: the drive in RAW, the applied command in
-    FEEDFORWARD, the position in CLOSED_LOOP.
+    FEEDFORWARD, the position in CLOSED_LOOP. Without it, the reference keeps its numbers in the new unit.
     """
     generators, law, volts = axis_generators(loop), law_record(loop), 1 if mode == RAW else 0
     for a in range(loop.axis_count):
@@ -174,7 +174,10 @@ def _change_units(loop, mode, holds_output):
 
 @jit_checked
 def _set_reference(loop, command):
-    """Start the generator of a command at this tick, on its axis or on all, in V if the mode is RAW, else in µm."""
+    """Start, at this tick, the generator whose kind and parameters are a command's `values`.
+
+    It starts on the command's axis, on all axes for a negative number, in V if the mode is RAW, else in µm.
+    """
     generators, volts = axis_generators(loop), 1 if loop_state(law_record(loop)).mode == RAW else 0
     for a in range(loop.axis_count):
         if command.axis < 0 or command.axis == a:
@@ -239,7 +242,10 @@ def _load_axis(law, a, staged):
 
 @jit_rare
 def publish_event(loop, kind, axis, origin, identity, values):
-    """Publish an event of this tick; its values are `values`, at most MESSAGE_VALUES, and then zeros."""
+    """Publish an event of this tick in the ring of events and count it in `loop.events`.
+
+    Its values are `values`, at most MESSAGE_VALUES, and then zeros.
+    """
     ring, position = event_ring(loop), np.uint64(loop.events)
     event = ring.slots[claim(ring, position)]
     event.tick = loop.tick

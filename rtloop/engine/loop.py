@@ -220,7 +220,10 @@ def _elapsed_ns(loop):
 
 @jit
 def _record_outputs(loop, write_status):
-    """Store the drives of a successful write, for parking; after a failed one (status below 0) hold the last drives."""
+    """Store the drives of a successful write in the shared block, for parking.
+
+    After a failed one (status below 0) the last drives are held.
+    """
     if write_status < 0:
         _hold_outputs(loop)
         return
@@ -344,7 +347,11 @@ def _fill_signals(loop, row):
 
 @jit
 def _publish_events(loop, status, write_status, missed):
-    """Publish the events of this tick: a trip, a failure of the driver, the beginning of an episode of late ticks."""
+    """Publish the events of this tick: a trip, a failure of the driver, the beginning of an episode of late ticks.
+
+    The first failure of the driver is stored in `loop.failed` (READ_FAILED or WRITE_FAILED), `failed_tick` and
+    `failed_status`.
+    """
     new_trip = loop_state(law_record(loop)).new_trip
     if new_trip != 0:
         _publish_trip(loop, new_trip)

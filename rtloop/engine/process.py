@@ -90,7 +90,7 @@ def main() -> int:
 
 
 def _report_failure(error: DriverError | RtloopError) -> int:
-    """Report on stdout why there is no run; return the exit code of the error."""
+    """Report "failed" on stdout, with message and exit code of an error that ended the run; return the exit code."""
     code = UnavailableError.exit_code if isinstance(error, DriverError) else error.exit_code
     report("failed", message=str(error), exit_code=code)
     return code

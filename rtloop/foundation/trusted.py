@@ -53,7 +53,8 @@ def open_folder(path: Path, mode: int | None = None, *, shared: bool = False) ->
     """Return an O_PATH descriptor of a folder to which this user and root alone may write.
 
     Missing folders of the path are made with `mode`, unless it is None. `shared` allows a sticky folder such as /tmp.
-    Raises UntrustedPath if another user owns, or may change, a folder or link of the path; OSError.
+    Raises UntrustedPath if another user owns, or may change, a folder or link of the path, OSError if the system
+    refuses.
     """
     fd, _, is_shared = _walk_path(path, mode)
     if is_shared and not shared:
@@ -65,7 +66,8 @@ def open_folder(path: Path, mode: int | None = None, *, shared: bool = False) ->
 def trusted_owners(folder: Path) -> set[int]:
     """Return the user ids whose files in `folder` are trusted: this user, root, and a user to whom root gave it.
 
-    Raises UntrustedPath if another user owns, or may change, a folder or link of the path; OSError.
+    Raises UntrustedPath if another user owns, or may change, a folder or link of the path, OSError if the system
+    refuses.
     """
     fd, owner_ids, _ = _walk_path(folder, None, trusts_grants=True)
     close_descriptor(fd)
@@ -75,8 +77,9 @@ def trusted_owners(folder: Path) -> set[int]:
 def open_file(path: Path, flags: int, mode: int = 0o600, *, group: bool = False) -> int:
     """Return a descriptor, not blocking, of a regular file of this user or root in a trusted or sticky folder.
 
-    With `group`, members of this process's groups may own it and write to it, too. Raises UntrustedPath if another user
-    owns or may change the file or its folder, and for a link or anything but a regular file; OSError.
+    `flags` are as of os.open; a new file has `mode`. With `group`, members of this process's groups may own it and
+    write to it, too. Raises UntrustedPath if another user owns or may change the file or its folder, and for a link or
+    anything but a regular file, OSError if the system refuses.
     """
     folder = open_folder(path.parent, shared=True)
     try:
@@ -158,7 +161,8 @@ def is_own(path: Path) -> bool:
 def make_file(path: Path, mode: int = 0o666) -> int:
     """Make a new file and return its descriptor, for reading and writing; others may write to its folder.
 
-    Raises FileExistsError if the name is used, UntrustedPath if the path leads through another user's link, OSError.
+    Raises FileExistsError if the name is used, UntrustedPath if the path leads through another user's link, OSError if
+    the system refuses.
     """
     if not HAS_OWNERS:
         return os.open(path, _NEW, mode)
@@ -170,7 +174,7 @@ def replace_file(path: Path, mode: int = 0o666) -> int:
     """Make a new file like `make_file` does, in place of a regular file of this user or root, which is removed.
 
     Raises BlockingIOError if a process has locked that file, UntrustedPath if it is another user's or not a regular
-    file, or if the path leads through another user's link; OSError.
+    file, or if the path leads through another user's link, OSError if the system refuses.
     """
     if not HAS_OWNERS:
         path.unlink(missing_ok=True)
@@ -199,7 +203,7 @@ def overwrite_file(path: Path, mode: int = 0o666) -> int:
     """Return a descriptor, for writing, of a new file, or of an emptied file, FIFO or device of this user or root.
 
     Links of this user or root are followed. Raises UntrustedPath for another user's file or link, and for a file with
-    more than one name in a folder where others may write; OSError.
+    more than one name in a folder where others may write, OSError if the system refuses.
     """
     if not HAS_OWNERS:
         return os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | _CLOEXEC, mode)

@@ -149,7 +149,9 @@ class Layout:
             require_allowed(owner, slot_view(state, slot, law.state), law.allowed_state)
 
     def _law_number_rules(self, number: int, axes: int) -> Rules:
-        """Return, by field, the allowed numbers of laws and of axes of the controller, for axis `number` of `axes`."""
+        """Return the ranges of `feedforward_law`, `controller_law` and `controller_axes`, by name, for axis `number` of
+        `axes`.
+        """
         laws = Allowed(0, len(self.laws) - 1)
         return {"feedforward_law": laws, "controller_law": laws, "controller_axes": Allowed(0, axes - number)}
 

@@ -128,7 +128,8 @@ def mark_new_controller(law, a):
 def continue_prefilter(law, a, last_um):
     """Let new taps of axis `a`, which are in place, continue from `last_um`, the two outputs of the taps before them.
 
-    In closed loop the differences go to the decaying offsets; in other modes nothing is done.
+    In closed loop the differences go to the decaying offsets of the command and, without sections, of the error; in
+    other modes nothing is done.
     """
     coefficients, state = coefficients_record(law, a), axis_state(law, a)
     target_um, added_um = tap_outputs_um(coefficients, state)
@@ -234,7 +235,9 @@ def _control_axis(law, a):
 
 @jit_rare
 def _evaluate_coupled(law, first, count, loop, references):
-    """Set commands and drives of the `count` axes from `first` on, which share a controller; a failure of a law trips."""
+    """Set commands and drives of the `count` axes from `first` on, which share a controller; if its law fails, trip the
+    loop.
+    """
     if loop.mode == CLOSED_LOOP and not _control_coupled(law, first, count):
         _trip_on_law_failure(loop)
     for i in range(first, first + count):
@@ -299,7 +302,8 @@ def _set_control_inputs(law, i, coefficients, state, resting_um):
 def _set_command(law, i, coefficients, state, command_um):
     """Set the command of an axis: the controller's command, its decaying offset, and the part from the reference.
 
-    The controller receives its own part alone. Returns False for a command that is not a usable number.
+    The controller receives its own part alone. Returns False, with the failure recorded, for a command that is not a
+    usable number.
     """
     gap_um = state.applied_command_um - state.feed_um - command_um
     state.command_bump_um = _decayed_offset(coefficients, state.command_bump_um, state.entering != 0, gap_um)

@@ -199,7 +199,9 @@ class Bench:
             self._kernels[name] = _compiled(python_kernel, signature) if compiled else python_kernel
 
     def _call(self, name: str, law_input: Any) -> Any:
-        """Call one of the functions with coefficients, state and `law_input`, without floating-point warnings."""
+        """Call function `name` with coefficients, state and `law_input`, without floating-point warnings; return its
+        result.
+        """
         with np.errstate(all="ignore"):
             return self._kernels[name](*self._rows, law_input)
 

@@ -77,9 +77,9 @@ def mistakes_in_function(function: ast.FunctionDef, law: type[Law], names: Mappi
 
 
 def _undefined_signals(function: ast.FunctionDef, law: type[Law]) -> tuple[str, ...]:
-    """Return the signals of a controller that have no value yet in a function.
+    """Return the names of a controller's signals that have no value yet in a function; () except in `output`.
 
-    In `output` these are the command and its applied part. The `output` of a coupled controller sets the commands.
+    There they are the command and its applied part, of a coupled controller the latter alone, as it sets the commands.
     """
     if function.name != "output":
         return ()

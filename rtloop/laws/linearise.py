@@ -82,7 +82,10 @@ def _place(error: Exception, law: type[Controller]) -> str:
 
 
 def _reachable_states(a: Real, b: Real) -> npt.NDArray[np.bool_]:
-    """Return which states an input reaches, (n,); with Aᵀ and Cᵀ, which states reach an output."""
+    """Return a mask (n,), True for states that an input reaches by non-zero elements of `a` (n, n) and `b` (n, inputs).
+
+    With Aᵀ and Cᵀ it is True for the states that reach an output.
+    """
     reachable = np.any(b != 0, axis=1)
     while True:
         wider = reachable | np.any((a != 0) & reachable, axis=1)

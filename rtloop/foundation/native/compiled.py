@@ -173,7 +173,8 @@ def c_library_function(name: str, signature: str, uncompiled: Callable[..., Any]
 def cfunc(signature: str) -> Callable[[Callable[..., Any]], Any]:
     """Decorate a kernel: make it a C function whose `.address` other compiled code may call.
 
-    The result is a CFunction; numba's own C function outside of rtloop, and an UncompiledFunction if UNCOMPILED.
+    `signature` is numba's, as a text. The result is a CFunction; numba's own C function outside of rtloop, and an
+    UncompiledFunction if UNCOMPILED.
     """
 
     def compile_function(function: Callable[..., Any]) -> Any:
@@ -190,7 +191,10 @@ def cfunc(signature: str) -> Callable[[Callable[..., Any]], Any]:
 
 
 def python_entry(signature: str) -> Callable[[Callable[..., Any]], Entry]:
-    """Decorate a kernel that Python calls with integers and addresses: the result is an Entry."""
+    """Decorate a kernel that Python calls with integers and addresses: the result is an Entry.
+
+    `signature` is a text such as "int64(intp, uint64)".
+    """
     return lambda function: Entry(function, signature)
 
 
@@ -210,6 +214,7 @@ def native_address(kernel: Any, signature: Any) -> int:
 def cached_address(kernel: Any, name: str, signature: Callable[[], Any]) -> int:
     """Return the address of a kernel, loaded from the cache by `name`, or compiled and stored under that name.
 
-    Raises numba's errors for a function that cannot be compiled.
+    `signature()` is called for a compilation alone; it returns numba's signature. Raises numba's errors for a function
+    that cannot be compiled.
     """
     return machine_code.load(name) or compile_kernel(kernel.py_func, signature(), name, kernel.options)

@@ -169,7 +169,9 @@ def _suggestion(error: BaseException) -> str:
 
 
 def _streams() -> list[tuple[int, Any]]:
-    """Return inode and Python object of each standard stream, to tell later whether a law replaced one."""
+    """Return (inode, Python object) of stdin, stdout and stderr, in this order, to tell later whether a law replaced
+    one.
+    """
     return [(os.fstat(number).st_ino, getattr(sys, name)) for number, name in STREAMS.items()]
 
 

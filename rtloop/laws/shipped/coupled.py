@@ -146,11 +146,11 @@ class Coupled(CoupledController):
         return SampledCoupledSystem(system.transform(after=decoupling), self.period_s), tracking
 
     def build(self) -> Mapping[str, Any]:
-        """Return the matrices of the discrete controller with its decoupling, of its anti-windup and of its entry.
+        """Return `order`, `count` (of axes), `a`, `b`, `c`, `d` of the discrete controller with its decoupling, and the
+        coefficients of its anti-windup and of its entry.
 
         `tracking` is the anti-windup matrix M, `share` the fraction of it that is applied in a tick, `steady_state` the
         states (states, axes) per error at rest; `row_start` and `row_stop` bound the non-zero columns of a row of A.
-
         Raises ValueError for too high an order, an unstable anti-windup, and options that cannot be discretised.
         """
         from rtloop.linear.antiwindup import tracking_share

@@ -46,8 +46,7 @@ class IntegralResonant(Controller):
 
         `tracking` is the part of (v_applied − v) that the lag takes over in a tick: T/`tracking_s`, at most 1. The
         integral takes over d times as much.
-
-        Raises ValueError for a feedthrough that is not above the plant's gain at 0 Hz.
+        Raises ValueError for a feedthrough that is not above the magnitude of the model's gain at 0 Hz.
         """
         options: IntegralResonantOptions = self.options
         if self.model is not None and (gain := abs(self.model.transfer().dc_gain)) >= options.feedthrough:

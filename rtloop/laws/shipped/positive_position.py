@@ -46,11 +46,11 @@ class PositivePosition(Controller):
     state = MappingProxyType({"filter": (float, 2), "integral_um": float})
 
     def build(self) -> Mapping[str, Any]:
-        """Return A and b of the discretised filter, gain = g, ki = ki_per_s T and tracking, for the period T.
+        """Return a (2, 2) and b (2,) of the discretised filter, gain = g, ki = ki_per_s T and tracking, for the period
+        T.
 
         `tracking` is the part of (v_applied − v) that the integral takes over in a tick: T/`tracking_s`, at most 1.
-
-        Raises ValueError for a gain that, times the plant's gain at 0 Hz, is 1 or more.
+        Raises ValueError for a gain that, times the magnitude of the model's gain at 0 Hz, is 1 or more.
         """
         options: PositivePositionOptions = self.options
         if self.model is not None and (gain := options.gain * abs(self.model.transfer().dc_gain)) >= 1:

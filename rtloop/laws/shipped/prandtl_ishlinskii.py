@@ -156,10 +156,12 @@ class PrandtlIshlinskii(Feedforward):
     output, update, enter = inverse_drive, update_model, enter_at_drive
 
     def build(self) -> Mapping[str, Any]:
-        """Return thresholds and weights of the model and of its inverse, each (plays,), play count and dead band.
+        """Return thresholds and weights of the model and of its inverse, `play_count`, `dead_band_v` and
+        `dead_band_threshold_v`.
 
-        `play_count` is rounded up to a multiple of LANES; the record has zeros behind the arrays. `dead_band_v` is 0
-        unless the option `dead_band` is "exact".
+        The former are `model_thresholds_v`, `model_weights_um_per_v`, `inverse_thresholds_um` and
+        `inverse_weights_v_per_um`, each (plays,); the record has zeros behind them. `play_count` is rounded up to a
+        multiple of LANES. `dead_band_v` is 0 unless the option `dead_band` is "exact".
         """
         options: PrandtlIshlinskiiOptions = self.options
         forward, inverse = options.models()

@@ -120,7 +120,8 @@ class Repetitive(Controller):
     def update(c: Any, s: Any, told: Any) -> None:
         """Add the smoothed sum of a period ago to the error, and advance the integral by the result.
 
-        The result is stored for the next period; 0 is stored if the command was limited.
+        The result is stored for the next period; if the command was limited, 0 is stored, and the integral is moved to
+        the applied command as well.
         """
         place, recalled_um = s.at + c.ahead, 0.0
         for j in range(c.count):

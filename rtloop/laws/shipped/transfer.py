@@ -147,7 +147,8 @@ class TransferController(Controller):
         return discretise_controller(options.transfer(), self.period_s, options.method, options.prewarp_hz)
 
     def build(self) -> Mapping[str, Any]:
-        """Return the coefficients of C(z) and of its anti-windup, with the states in the kernels' order.
+        """Return the values of COEFFICIENTS by name: C(z), its anti-windup and its entry, with the states in the
+        kernels' order.
 
         Raises ValueError for too high an order, an unstable anti-windup, and a C(s) that cannot be discretised.
         """
