@@ -15,9 +15,9 @@ def dataclass_fields(value: Any) -> dict[str, Any]:
 
 
 def to_jsonable(value: Any) -> Any:
-    """Convert a value for JSON: numbers, text, lists and dictionaries.
+    """Return a value as JSON has it: numbers, text, lists, and dictionaries whose keys are text, nested ones too.
 
-    Complex numbers become [real, imaginary], real numbers that are not finite null, dataclasses and named tuples
+    Complex numbers become [real, imaginary], real numbers that are not finite None, dataclasses and named tuples
     dictionaries, paths text, arrays lists. An object with a method `for_json` is replaced by the result of that method;
     any other value stays.
     """

@@ -25,8 +25,8 @@ class Connection:
 
     The service records each command under the name of this connection, and the first command takes the lock. While
     another client holds the lock, the service accepts `stop` alone. As a context manager the connection releases the
-    lock at its end. Every method raises UnavailableError if no service answers, and RtloopError with the service's
-    message if it refuses.
+    lock at its end. Every method raises UnavailableError if no service answers, HostRefusal for a server that is not
+    trusted, and RtloopError with the service's message if it refuses.
     """
 
     def __init__(self, client: Client) -> None:
@@ -60,11 +60,16 @@ class Connection:
         return self._client.get("/metrics")
 
     def watch(self) -> Iterator[dict[str, Any]]:
-        """Yield state, faults, lock, measurement (`measuring`) and newest signals, about 20 times a second."""
+        """Yield {state, faults, lock, measuring, recovery, tick, mode, trip, trip_reason, axes, condition}, each as in
+        `status`, about 20 times a second, until the service ends. The keys from `tick` on are missing without a loop.
+        """
         return self._client.watch()
 
     def take(self, emergency_key: str | None = None) -> dict[str, Any]:
-        """Take the lock, with the emergency key also from another holder. Returns its holder, as `status["lock"]`."""
+        """Take the lock, with the emergency key also from another holder.
+
+        Returns the new holder: {name, since_unix_s, until_unix_s: end without a further command}, in s since 1970.
+        """
         return self._client.lock(emergency_key)
 
     def release(self) -> None:
@@ -97,7 +102,8 @@ class Connection:
     def reload(self) -> dict[str, Any]:
         """Let the service read its configuration file again and apply it to the running loop.
 
-        Returns {changed: ["axis.NAME", …]}, the parts that changed.
+        Returns {changed: ["axis.NAME", …]}, the axes that changed; [] if none did. If the loop refuses one axis after
+        others were changed, these stay changed, and the message names them.
         """
         return self._client.post("/reload")
 
@@ -137,9 +143,12 @@ class Connection:
         return self._command("/tune", axis=axis, section=section, values=values)
 
     def preview(self, axis: str, section: str, **values: Any) -> dict[str, Any]:
-        """Return {before, after}: margins, step figures, tolerated shift of the resonance, without and with a `tune`.
+        """Return {before, after}: figures of the axis's loop without and with a `tune`; changes nothing.
 
-        Changes nothing.
+        Keys of each: crossover_hz, phase_margin_deg, gain_margin_db, modulus_margin, overshoot_percent, settling_ms,
+        static_error_percent, tolerated_shift_percent ([down ≤ 0, up ≥ 0]: the shift of the resonance within which the
+        loop is stable), step ({t_ms, y}) and problems (sentences). All but `problems` are None for an unstable loop or
+        a law that is not linear.
         """
         return self._client.post("/preview", {"axis": axis, "section": section, "values": values})
 
@@ -150,8 +159,8 @@ class Connection:
     def controller(self, axis: str, controller: Mapping[str, Any] | Path | str) -> int:
         """Swap in another controller: an [axis.controller] as a mapping, or a configuration file that has one.
 
-        The service verifies it, then swaps bumplessly. Returns the tick of the swap. Raises ConfigError for a file
-        without controller for this axis.
+        The service verifies it, then swaps bumplessly. Returns the tick of the swap. Raises InputFileError for a file
+        that cannot be read, ConfigError for an invalid one or one without a controller for this axis.
         """
         section = controller if isinstance(controller, Mapping) else read_controller(Path(controller), axis)
         return self._command("/controller", axis=axis, controller=dict(section))
@@ -160,9 +169,10 @@ class Connection:
         """Measure the closed loop of an axis with multisines about the reference that it holds.
 
         Options: `amplitude_um` (largest added motion), `from_hz`, `to_hz`, `period_s`, `near_hz` (expected lightly
-        damped mode), `resonance_only`, `gain_um`. Returns `margins`, `resonance`, `gain` and the open loop and
-        sensitivity at each line (`response`), as `rtloop ctl response --json`. After Ctrl-C the axis is set to its old
-        reference, and LoopFault is raised.
+        damped mode), `resonance_only`, `gain_um`. Returns the object of `rtloop ctl response --json`, a dict, among
+        others with `margins`, `resonance` and `gain` (None if not found or not measured), and `response`: lists with
+        the open loop, `loop`, and `sensitivity` at each frequency, complex values as [real, imaginary]. After Ctrl-C
+        the axis is set to its old reference, and LoopFault is raised.
         """
         body = {"axis": axis, "duration_s": duration_s, **options}
         return self._client.measure("/response", body, RESPONSE_TIMES * duration_s + RESPONSE_MARGIN_S)
@@ -178,10 +188,10 @@ class Connection:
     ) -> dict[str, Any]:
         """Play one period of a scan (µm, a tick a sample) again and again, and correct it by its error each cycle.
 
-        Refused unless the error shrinks for every resonance within `resonance_percent` of the model's. Returns `cycles`
-        (`rms_um`, `largest_um` of each), `ended` (the reason) and the best table: `reference_um`, `command_um`. The
-        best table keeps playing unless `keep` is False. After Ctrl-C the axis holds its old reference, and LoopFault is
-        raised.
+        Refused unless the error shrinks for every resonance within `resonance_percent` of the model's. Returns {cycles:
+        [{rms_um, largest_um} of the error, …], the first without correction, ended: reason, reference_um, command_um:
+        lists of the best table}. The best table keeps playing unless `keep` is False; then the axis returns to its old
+        reference. After Ctrl-C the axis holds its old reference, and LoopFault is raised.
         """
         body = {"axis": axis, "samples": _floats(samples), "cycles": cycles, "resonance_percent": resonance_percent}
         return self._client.measure("/learn", body | {"keep": keep})
@@ -192,7 +202,8 @@ class Connection:
         Options, as in `rtloop.client.retuning.RetuneRequest`: `amplitude_um`, `gain_um`, `bound_percent`,
         `within_percent` and `spec`. The loop moves for the measurement. A gain that is not measured, or not precisely
         enough, is replaced by the model's. Raises ConfigError for an axis or model that does not allow it, LoopFault if
-        no resonance is found or a used value is too far from the model's, NoDesign if no taps meet the specification.
+        no resonance is found or a used value is too far from the model's, NoDesign if no taps meet the specification,
+        InputFileError for a `spec` that cannot be read.
         """
         from rtloop.client.retuning import RetuneRequest, propose_taps
 
@@ -227,8 +238,8 @@ class Connection:
 
         The file is NAME.capture-TICK.mcap beside the run's recording, or in `folder`. It begins with the ticks since
         the law's last recorded state, at most a second, so that it replays alone. Raises ValueError for invalid
-        arguments, RtloopError if no trigger comes or the tick lies too far ahead, UnavailableError if the run is not
-        recorded.
+        arguments, RtloopError if no trigger comes or the tick lies too far ahead, RecordingError for ticks that are not
+        in the run, OutputError if the file cannot be written, UnavailableError if the run is not recorded.
         """
         from rtloop.client.capture.triggered_capture import capture_span
 

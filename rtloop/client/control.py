@@ -162,8 +162,8 @@ class Client:
     def measure(self, resource: str, body: Mapping[str, Any], timeout_s: float = LONGEST_MEASUREMENT_S) -> Any:
         """Post a measurement that moves `body["axis"]` and return the response.
 
-        After Ctrl-C the axis is set to the constant reference that it had before, in µm, and LoopFault is raised; its
-        message says if the reference is not restored. Raises the errors of `post`.
+        After Ctrl-C the axis is set to the constant reference, µm, that it had at the call, and LoopFault is raised,
+        also where this fails; its message says so then. Raises the errors of `post`.
         """
         axis = body["axis"]
         held_um = self.get("/status").get("axes", {}).get(axis, {}).get("reference_um")
@@ -181,11 +181,11 @@ class Client:
             raise LoopFault(f"interrupted; axis {axis} holds {held_um:g} µm as before") from None
 
     def watch(self) -> Iterator[dict[str, Any]]:
-        """Yield state, faults, lock, measurement and newest signals, about 20 times a second, until the service ends
-        the connection.
+        """Yield {state, faults, lock, measuring, recovery, tick, mode, trip, trip_reason, axes, condition}, each as in
+        `/status`, about 20 times a second, until the service ends the connection.
 
-        Raises UnavailableError if no service answers or the connection breaks, HostRefusal for a service that is not
-        trusted.
+        The keys from `tick` on are missing without a loop, and before its first tick. Raises UnavailableError if no
+        service answers or the connection breaks, HostRefusal for a service that is not trusted.
         """
         from websockets.exceptions import WebSocketException
         from websockets.sync.client import connect

@@ -52,11 +52,11 @@ class MeasuredStage(NamedTuple):
     resonance: dict[str, Any]
     """Measured mode: hz, hz_std, damping, damping_std, from_hz, to_hz, misfit."""
     percent: float
-    """Distance of the resonance's frequency."""
+    """Distance of the resonance's frequency; above 0 if it is higher than the model's."""
     gain: dict[str, Any] | None
     """Measured gain in µm of position per µm of command: value, std, from_um, to_um; None if it was not measured."""
     gain_percent: float | None
-    """Distance of the gain; None if the model's gain is used instead."""
+    """Distance of the gain, above 0 if it is larger than the model's; None if the model's gain is used instead."""
 
 
 class Proposal(NamedTuple):
@@ -152,8 +152,9 @@ def swap_in(client: Client, axis: str, proposal: Mapping[str, Any]) -> int:
 def _measure_stage(client: Client, request: RetuneRequest, subject: Subject) -> MeasuredStage:
     """Measure resonance and gain, and return them with their distances from the model's.
 
-    A gain whose standard deviation exceeds GAIN_CERTAIN_PERCENT is not used. Raises ConfigError for a model without
-    resonance, LoopFault if no resonance was found or a distance exceeds the request's bound.
+    The loop moves. `gain_percent` is None for a gain that was not measured, or only with a standard deviation above
+    GAIN_CERTAIN_PERCENT. Raises ConfigError for a model without resonance, LoopFault if no resonance was found or a
+    distance exceeds the request's bound.
     """
     model_hz = resonance_hz(subject.plant)
     if model_hz is None:
@@ -184,7 +185,8 @@ def _measure_stage(client: Client, request: RetuneRequest, subject: Subject) -> 
 
 
 def _require_near(quantity_text: str, percent: float, bound_percent: float) -> None:
-    """Raise LoopFault if a measured value is `percent` from the model's, and so by more than ±`bound_percent`.
+    """Raise LoopFault if a measured value differs from the model's by `percent`, of either sign, and |percent| is above
+    `bound_percent`.
 
     `quantity_text` states quantity and value in the message, such as "gain is 1.0200".
     """
@@ -249,7 +251,7 @@ def _interpolate_taps(old: Taps, new: Taps, part: float) -> Taps:
 
 
 def _pad_rows(*rows: np.ndarray) -> list[np.ndarray]:
-    """Return the rows (n,), padded with zeros to the length of the longest."""
+    """Return copies of the rows (n,), in their order, padded with zeros at the end to the length of the longest."""
     length = max(row.size for row in rows)
     return [np.pad(row, (0, length - row.size)) for row in rows]
 

@@ -22,10 +22,11 @@ if TYPE_CHECKING:
 class AxisJudgement:
     """Limits, analyses and verdict of one axis.
 
-    `shifts` are the ranges, in percent, by which the resonance may move while the loop stays stable: "continuous" for
-    C(s), "running" for the loop as it runs. `is_stable_on_rig` is None where configuration and simulated rig agree and
-    the loop is stable there, and where no rig or loop is known; `verification` is None without a specification or loop.
-    `spent` is the delay that this host adds, and the loop's delay margin; None without a measurement or a stable loop.
+    `shifts` are the ranges (down, up), percent, both ≥ 0, by which the resonance may move while the loop stays stable:
+    "continuous" for C(s), "running" for the loop as it runs; an end is None if the search found no limit.
+    `is_stable_on_rig` is None where configuration and simulated rig agree and the loop is stable there, and where no
+    rig or loop is known; `verification` is None without a specification or loop. `spent` is the delay that this host
+    adds, and the loop's delay margin; None without a measurement or a stable loop.
     """
 
     axis: AxisOptions
@@ -112,10 +113,11 @@ def _verify_axis(prepared: Prepared, axis: AxisOptions, check: AxisCheck) -> Ver
 
 
 def _tolerated_shifts(check: AxisCheck) -> dict[str, PercentRange]:
-    """Return {continuous, running}: ranges, in percent, by which the model's resonance may move in a stable loop.
+    """Return {continuous, running}: ranges (down, up), percent, both ≥ 0, by which the model's resonance may move while
+    the loop stays stable.
 
-    "continuous" belongs to C(s), and is missing for other laws; "running" belongs to the loop as it runs. {} without a
-    loop on a model with a resonance.
+    (0, 0) for an unstable loop; an end is None if the search found no limit there. "continuous" belongs to C(s), and is
+    missing for other laws; "running" belongs to the loop as it runs. {} without a loop on a model with a resonance.
     """
     if check.plant is None or check.on_model is None:
         return {}

@@ -118,7 +118,9 @@ def _second_opinion_faults(prepared: Prepared) -> list[str]:
 
 
 def _loops(check: AxisCheck) -> dict[str, Loop]:
-    """Return the loops of an axis by label: C(s) on the model, if there is one, and as it runs; {} without a loop."""
+    """Return the loops of an axis, "continuous C(s)" on the model, if there is a C(s), then "as it runs"; {} without
+    one.
+    """
     if check.on_model is None:
         return {}
     loops = {"as it runs": check.on_model}

@@ -64,7 +64,9 @@ class DesignResult(Result):
 
     @property
     def achieved(self) -> float:
-        """Norm of the weighted closed loop with the controller of reduced order."""
+        """‖F_l(P, C)‖∞, the norm of the weighted closed loop with the controller of reduced order; at most 1 meets the
+        specification.
+        """
         return self.synthesis.achieved
 
     @property
@@ -154,7 +156,7 @@ class DesignResult(Result):
         """Write a configuration with the controller and a simulated rig of its plant. Returns its path.
 
         The path is also stored as `output`. An existing file is replaced. `axis` is the name of the axis. Raises
-        ConfigError for a configuration that cannot run, OutputError if the system refuses.
+        ConfigError for a configuration that cannot run, with nothing written; OutputError if the system refuses.
         """
         target = as_path(path, "write: path")
         source, text, design = self.specification
@@ -228,7 +230,7 @@ def _slicot_gamma(synthesis: Synthesis, design: DesignOptions) -> float:
 
 
 def controller_fields(controller: Transfer) -> dict[str, Any]:
-    """Return the JSON fields of a controller: gain, zeros and poles as [real, imaginary], in 1/s."""
+    """Return {gain, zeros, poles} of a controller for JSON; the roots as lists of [real, imaginary], in 1/s."""
     roots = {"zeros": controller.zeros, "poles": controller.poles}
     fields = {name: [[root.real, root.imag] for root in values] for name, values in roots.items()}
     return {"gain": controller.gain, **fields}

@@ -41,9 +41,10 @@ if TYPE_CHECKING:
 class DynamicsResult(IdentifiedModel):
     """Identified dynamics: `fit` has D(s) and the evidence, `runs` and `loops` the recordings and their closed loops.
 
-    `excitation` is the input and output of the first recording, without free motion, `actuator` the model of the
-    hysteresis before the dynamics, for the input "hysteresis". `response` is a measured frequency response,
-    `comparison` the model's deviation from it; None without a recording to compare.
+    `loops` has None for a recording in open loop. `excitation` is the input and output of the first recording, without
+    free motion, `actuator` the model of the hysteresis before the dynamics; None for another input than "hysteresis".
+    `response` is a measured frequency response, `comparison` the model's deviation from it; None without a recording to
+    compare.
     """
 
     fit: DynamicsFit

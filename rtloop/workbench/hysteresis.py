@@ -38,8 +38,9 @@ Memory = Literal["auto", "rest", "unknown"]
 class HysteresisResult(IdentifiedModel):
     """Identified plays: `fit` has the model and the errors of the fit, `judgements` the held-out errors.
 
-    `judgements` are those of the fitted recordings `runs`, then those of recordings that only validate the model.
-    `extra` are fields of the JSON report that depend on the start of the recordings.
+    `judgements` are two lists: of the fitted recordings `runs`, then of recordings that only validate the model.
+    `extra` are fields of the JSON report that depend on the start of the recordings: `unexplained_um` from rest, else
+    those of `_parts_fields`.
     """
 
     fit: HysteresisFit
@@ -60,7 +61,7 @@ class HysteresisResult(IdentifiedModel):
 
     @property
     def error_um(self) -> float:
-        """Error of the model on all fitted recordings, µm rms, each held out of the fit."""
+        """Error of the model on all fitted recordings, µm rms, each held out of the fit; NaN if none can be judged."""
         return combine_errors([judgement.rms_um for judgement in self.judgements[0]]).rms_um
 
     @property

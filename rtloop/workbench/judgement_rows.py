@@ -13,8 +13,10 @@ from rtloop.design.identification.hysteresis.judgement import Judgement
 def judgement_row(judgement: Judgement, fitted: bool) -> dict[str, Any]:
     """Return the report's row on the model's held-out error in one recording, which is `fitted` or validates only.
 
-    Its values are errors in µm and in % of the range, offset and drift, and from when and for which part, in %, the
-    memory of the hysteresis is known, so that the errors are judged.
+    Keys: recording (name), fitted, rms_error_um, as_written_rms_um (of the plays alone), max_error_um and
+    max_error_percent (of range_um), offset_um, drift_um, memory ("rest" or "unknown"), known_from_s (time from which
+    the memory of the hysteresis is known, None: never), unsettled, unsettled_um, judged_percent (part with known
+    memory), early_max_error_percent (of the part before). Errors are NaN where their part is empty.
     """
     return {
         "recording": judgement.name,
@@ -38,9 +40,9 @@ def judgement_row(judgement: Judgement, fitted: bool) -> dict[str, Any]:
 def validation_comments(rows: Sequence[dict[str, Any]], extra: dict[str, Any]) -> list[str]:
     """Return comment lines for the model's section of a configuration.
 
-    They state the largest held-out error of `rows` (of `judgement_row`; one at least has a judged part), the effects
-    left out of the model, such as creep, and the largest stroke, V, for which the model is valid. The last two are in
-    `extra`, fields of the report that only recordings with unknown memory have; without these fields there is one line.
+    The first states the largest held-out error of `rows` (of `judgement_row`; one at least has a judged part). From
+    `extra`, fields that only recordings with unknown memory have, follow lines on the effects left out of the model,
+    such as creep, and, if plays may be missing, on the largest stroke, V, for which the model is valid.
     """
     worst_row = max((row for row in rows if row["judged_percent"]), key=lambda row: row["max_error_percent"])
     name, memory = Path(worst_row["recording"]).name, worst_row["memory"]

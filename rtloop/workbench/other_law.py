@@ -31,10 +31,10 @@ def replay_with_other_law(
 ) -> dict[str, Any]:
     """Compare the recorded outputs with the outputs of the law in `config` on the recorded inputs, from rest.
 
-    Returns {recording, config, ticks, problems, signals: {name: {max, at_tick, rms}}, trip}; `trip` is {tick, causes}
-    of the first trip of the law, or None. `progress` receives the number of ticks so far. Raises RecordingError,
-    InputFileError for a file that cannot be read, ConfigError for an invalid one or other axes or another rate,
-    DriverError if its driver's library is missing.
+    Returns {recording, config, ticks, problems, signals: {name: {max, at_tick, rms}}, trip}: `max` and `rms` are those
+    of |difference|, in the signal's unit; `trip` is {tick, causes} of the first trip of the law, or None. `progress`
+    receives the number of ticks so far. Raises RecordingError, InputFileError for a file that cannot be read,
+    ConfigError for an invalid one or other axes or another rate, DriverError if its driver's library is missing.
     """
     recording, configuration = _load_recording(files), load_configuration(config, "replay")
     differences = compare_law(recording, _configured_law(configuration, recording), progress)
@@ -49,8 +49,9 @@ def replay_on_the_rig(
 ) -> dict[str, Any]:
     """Run the recorded reference through law and simulated rig of `config`, or the recorded ones for None.
 
-    Returns {recording, config, ticks, problems, trips, axes}: `axes` has tracking figures of the recorded and the
-    resimulated run, `trips` their first trips {tick, causes} or None. `progress` receives the number of ticks so far.
+    Returns {recording, config (None: the recorded one), ticks, problems, trips: {recorded, resimulated}, axes: [{name,
+    recorded, resimulated}, …]}: `trips` are the first trips {tick, causes} or None, `axes` the tracking figures of
+    both runs. `progress` receives the number of ticks so far.
     `trust` names recorded laws that may run; None: none. Raises RecordingError, also for a recorded law that is not
     trusted, ConfigError for an invalid configuration or one without the simulated rig.
     """

@@ -110,12 +110,12 @@ class LawComparison(Result):
 
     @property
     def signals(self) -> dict[str, dict[str, Any]]:
-        """Difference of each signal by its name: max, at_tick and rms, in the signal's unit."""
+        """Difference of each signal by its name: {max, at_tick, rms}; `max` and `rms` of |difference|, in its unit."""
         return self.report["signals"]
 
     @property
     def trip(self) -> dict[str, Any] | None:
-        """First trip of the other law: tick and causes; None without a trip."""
+        """First trip of the other law, {tick, causes}; None without a trip."""
         return self.report["trip"]
 
     @property
@@ -153,12 +153,15 @@ class Resimulation(Result):
 
     @property
     def axes(self) -> dict[str, dict[str, Any]]:
-        """Tracking figures of each axis by its name: `recorded` and `resimulated`, a dict each, and the name."""
+        """Tracking figures by the axis's name: {name, recorded, resimulated}, the last two {rms_error_um,
+        max_abs_error_um, max_abs_drive_v, steps}; the errors are None if the loop was never closed, `steps` without
+        one.
+        """
         return {axis["name"]: axis for axis in self.report["axes"]}
 
     @property
     def trips(self) -> dict[str, dict[str, Any] | None]:
-        """First trip of the `recorded` and of the `resimulated` run: tick and causes; None without a trip."""
+        """{recorded, resimulated}: the first trip of each run, {tick, causes}, None without a trip."""
         return self.report["trips"]
 
     @property

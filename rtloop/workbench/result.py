@@ -34,5 +34,5 @@ class Result(ABC):
         return render_text(self.print_text)
 
     def _repr_html_(self) -> str:
-        """Return the text with its colours as HTML, which a notebook shows."""
+        """Return the text of `print_text` with its colours as HTML, which a notebook shows."""
         return render_html(self.print_text)

@@ -32,7 +32,8 @@ class RunResult(Result):
     """Result of a run: outcome, trips, ticks, lateness and steps; `recording` has the signals.
 
     `summary` has the figures of `rtloop info`; None without a recording. `supervised` is the end of the loop and of its
-    recorder; None if a signal came before the loop began. `startup_s` is the time from the call to the first tick.
+    recorder; None if a signal came before the loop began. `startup_s` is the time from the call to the first tick; None
+    without a tick.
     """
 
     prepared: Prepared
@@ -77,7 +78,7 @@ class RunResult(Result):
 
     @property
     def trips(self) -> list[TripSummary]:
-        """Trips of the loop, with tick, causes and reason; [] without a recording."""
+        """Trips of the loop, with tick, causes and reason, in their order; [] without a trip or a recording."""
         return [] if self.summary is None else self.summary.trips
 
     @property
@@ -100,7 +101,7 @@ class RunResult(Result):
 
     @cached_property
     def steps(self) -> dict[str, StepMetrics]:
-        """Overshoot, settling time and static error of the steps of each axis, by its name.
+        """Medians and worst cases of overshoot, settling time and static error of the steps of each axis, by its name.
 
         {} after a trip, and for a recording of more than MAX_STEP_ANALYSIS_TICKS; axes without steps are missing.
         """

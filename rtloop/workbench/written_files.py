@@ -22,7 +22,7 @@ def write_output(path: Path, content: bytes) -> None:
 def write_configuration(path: Path, text: str) -> None:
     """Write a configuration once `prepare` accepts it; an existing file is replaced.
 
-    Raises ConfigError for a configuration that cannot run, OutputError if the system refuses.
+    Raises ConfigError for a configuration that cannot run, with nothing written; OutputError if the system refuses.
     """
     from rtloop.configuration.file import parse
     from rtloop.configuration.prepare import prepare
@@ -39,7 +39,7 @@ def path_from(file: Path, target: Path) -> str:
 def write_outputs(folder: Path, contents: Mapping[str, bytes]) -> list[Path]:
     """Write a report's files to `folder`, by name, also over existing ones. Returns their paths.
 
-    Raises OutputError if the system refuses.
+    Raises OutputError if the system refuses one; the files before it are written then.
     """
     for name, content in contents.items():
         write_output(folder / name, content)

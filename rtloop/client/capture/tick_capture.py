@@ -70,9 +70,9 @@ def capture_ticks(client: Client, file: Path, first: int, end: int, folder: Path
     """Wait until ticks `first` … `end` − 1 of the run with the recording `file` are written, and cut them out.
 
     The new file is NAME.capture-FIRST.mcap beside the run's recording, or in `folder`; an existing one is never
-    replaced. Returns the report of `cut`: among others `output`, the new path, and `gaps`, the missing ticks. Raises
-    RecordingError for ticks that the run does not have, OutputError if the file cannot be written, UnavailableError if
-    the ticks are not recorded in time.
+    replaced. Returns the report of `cut`: among others `output`, the new path as text, and `gaps`, [(first tick,
+    count)] of the missing ticks. Raises RecordingError for ticks that the run does not have, OutputError if the file
+    cannot be written, UnavailableError if the ticks are not recorded in time or the recording was interrupted.
     """
     _await_written(client, file, end)
     attempt = 1

@@ -108,8 +108,8 @@ class Trigger:
     def feed(self, stretch: Stretch) -> list[Sweep]:
         """Process the next ticks and return the sweeps that end in them, oldest first; [] if there are none.
 
-        The first ticks of a new run discard the open sweep; call `close` before to get it. Raises ValueError if the
-        stretch lacks the condition's signal.
+        A sweep that begins in them and ends later is stored in `open_sweep`. The first ticks of a new run discard the
+        open sweep; call `close` before to get it. Raises ValueError if the stretch lacks the condition's signal.
         """
         values = stretch[self._condition.source]
         if len(stretch) == 0:

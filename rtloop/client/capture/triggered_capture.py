@@ -31,8 +31,9 @@ def capture_span(
 ) -> Recording:
     """Save a span of the running loop as a recording and return it, as `Connection.capture` describes it.
 
-    The call returns once the span's last tick is written. Raises ValueError for both `condition` and `center_tick`, for
-    values out of range and an unknown signal; RtloopError for a tick or trigger later than `timeout_s`;
+    `center_tick` is its argument `at`. The call returns once the span's last tick is written. Raises ValueError for
+    both `condition` and `center_tick`, for values out of range and an unknown signal; RtloopError for a tick or trigger
+    later than `timeout_s`; RecordingError for ticks that are not in the run; OutputError if the file cannot be written;
     UnavailableError if the run is not recorded, or the loop is started again meanwhile.
     """
     _require(

@@ -26,11 +26,11 @@ class BlockMapping:
         self.identity = _identity(os.fstat(fd))
 
     def tick_ring(self) -> Ring:
-        """Return the ring of ticks as read-only arrays."""
+        """Return the ring of ticks as read-only views of the block; `slots` (capacity, signals) holds the records."""
         return Ring(*(self._array(f"ticks_{part}") for part in Ring._fields))
 
     def event_ring(self) -> Ring:
-        """Return the ring of events as read-only arrays."""
+        """Return the ring of events as read-only views of the block; `slots` (capacity,) of MESSAGE."""
         head, marks = (self._array(f"events_{part}") for part in ("head", "marks"))
         return Ring(head, marks, self._array("events_slots", MESSAGE))
 

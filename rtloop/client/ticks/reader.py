@@ -42,11 +42,12 @@ class Reader:
         """Ticks that were overwritten before they could be read, in all runs."""
 
     def read(self) -> Stretch | None:
-        """Return the next ticks, at most MAX_TICKS, without waiting; None if there are none.
+        """Return a copy of the next ticks, at most MAX_TICKS, without waiting; None if there are none.
 
-        Once the mapped block has no more ticks and another one lies at the path, a new run begins. Raises HostRefusal
-        for a block that another user may have written, UnavailableError for one that cannot be opened or has another
-        number of signals than `read_columns` returns, and the errors of `read_columns`.
+        Ticks that were overwritten before are skipped, and counted in the stretch's `lost` and in `lost_ticks`. Once
+        the mapped block has no more ticks and another one lies at the path, a new run begins. Raises HostRefusal for a
+        block that another user may have written, UnavailableError for one that cannot be opened or has another number
+        of signals than `read_columns` returns, and the errors of `read_columns`.
         """
         stretch = self._read_mapped()
         if stretch is not None or (self._mapping is not None and is_current(self._mapping, self._path)):

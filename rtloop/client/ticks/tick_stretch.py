@@ -41,7 +41,9 @@ class Stretch:
         return self.first + len(self.rows)
 
     def periods(self, rate_hz: float) -> Real:
-        """Return the number of the period in which each tick ran, floats (n,); missed periods leave holes."""
+        """Return the number of the period in which each tick was due, from the start of the run: whole numbers as
+        floats (n,). A missed period has no tick: the numbers skip it.
+        """
         return np.rint(self[DEADLINE_NS] * (rate_hz / 1e9))
 
 

@@ -60,7 +60,10 @@ class Events:
 
     @property
     def references(self) -> dict[str, dict[str, Any]]:
-        """Return {axis: {kind, text, value}} of the references that play now, as far as they are known."""
+        """Return {axis: {kind, text, value}} of the references that play now, as `PlayedReference` describes them.
+
+        `value` is None unless the reference is constant; an axis whose reference is unknown is missing.
+        """
         return {axis: reference._asdict() for axis, reference in self._run_state.references.items()}
 
     def append(self, messages: Any, loop: Description, run: int) -> None:

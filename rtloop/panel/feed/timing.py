@@ -73,8 +73,10 @@ class Timing:
     def frame(self) -> bytes:
         """Return the binary message "timing" with the figures of the last minute, up to the newest tick.
 
-        Lateness: histogram, worst, p50, p99 in µs; execution time: p50, p99 in µs; numbers of seconds, ticks and missed
-        periods; `advice`, a list of warnings. A quantile is None without ticks, and in virtual time.
+        Header: `window_s` (number of seconds with ticks), `ticks` (those with a lateness), `periods_missed`;
+        `worst_us`, `p50_us` and `p99_us` of the lateness; `exec_p50_us` and `exec_p99_us` of the execution time;
+        `advice`, a list of warnings. Quantiles are None and `worst_us` is 0 if no tick has a measured time, as in
+        virtual time. Arrays: `counts` (bins,), the histogram of the lateness, over `edges_us` (bins + 1,).
         """
         self._count(self._batch.take())
         seconds = [second for second in self._seconds if second.number > self._seconds[-1].number - WINDOW_S]

@@ -107,7 +107,10 @@ class Spectrum:
                 self._feed_stages(samples)
 
     def density(self, min_averages: int = 1) -> Density:
-        """Return the density of all stages with at least `min_averages` averages; empty if there are none."""
+        """Return the density of all stages with at least `min_averages` averages, and not less than one.
+
+        Without such a stage it has no bands: `edges_hz` is (1,), all other arrays are empty, and every rms is 0.
+        """
         stages = [stage for stage in self._stages if stage.averages >= max(min_averages, 1)]
         hz, edges, amplitude, averages, powers = [], [np.array([self._rate_hz / 2])], [], [], []
         for number, stage in enumerate(stages):

@@ -141,10 +141,10 @@ class Scope:
         return self._pack_sweep(sweep, past, is_complete)
 
     def _pack_sweep(self, sweep: Sweep, past: TickHistory, is_complete: bool) -> bytes:
-        """Return the binary message "sweep" of a sweep: the extremes of each signal at each point of the screen.
+        """Return the binary message "sweep": arrays NAME:low and NAME:high, the extremes of each signal at each point
+        of the screen, and `offset`, each point's first tick, counted from the trigger (below 0 before it).
 
-        The array `offset` has each point's first tick, counted from the trigger. `is_complete` is False for a sweep
-        that still grows.
+        `is_complete` is False for a sweep that still grows.
         """
         signals = self.subscription.signals
         points = past.points(signals, sweep.first, sweep.end, self.subscription.pixels)

@@ -119,7 +119,8 @@ class Viewer:
         return frames
 
     def _apply(self, name: str, value: Any) -> None:
-        """Apply the validated `value` of a message's field `name`: a subscription, a setting or an action.
+        """Apply the validated `value` of a message's field `name`: a subscription (None ends its view), a setting or an
+        action.
 
         Before the first loop, a subscription is only stored. An action with the value False, or without the view that
         it concerns, has no effect. Raises ValueError as `_build`.
@@ -164,8 +165,9 @@ class Viewer:
                 setattr(self, {"view": "_scope", "spectrum": "_analyser", "xy": "_xy_plot"}[name], None)
 
     def _state_frame(self) -> bytes:
-        """Return the binary message "state": the service's state, the references that play, and how far the feed is
-        behind.
+        """Return the binary message "state": the keys of `StateListener.status`, and of the feed `unix_s` (now),
+        `age_s` (time since the newest tick, s; None if unknown), `lost` (ticks), `run`, `fault` (None if there is none)
+        and `references` (those that play).
         """
         feed = self._feed
         feed_fields = {"age_s": feed.age_s, "lost": feed.lost_ticks, "run": feed.run, "fault": feed.fault}
@@ -178,7 +180,8 @@ class Viewer:
         return None if self._scope is None or self._is_held or past is None else self._scope.frame(past)
 
     def _events_frame(self) -> bytes | None:
-        """Return the binary message "events" with all rows that are new or changed since the last such message.
+        """Return the binary message "events" with all rows, `events`, that are new or changed since the last such
+        message.
 
         None without such rows.
         """
@@ -189,7 +192,7 @@ class Viewer:
         return pack_frame("events", {"events": [event for _, event in events]})
 
     def _refuse(self, name: str, error: str) -> None:
-        """Queue a binary message "refused" for field `name` with the reason `error`; drop it beyond MAX_REFUSALS."""
+        """Queue a binary message "refused", {wish: field `name`, error: the reason}; drop it beyond MAX_REFUSALS."""
         frame = pack_frame("refused", {"wish": name[:100], "error": error[:2000]})
         if len(self._refusals) < MAX_REFUSALS:  # Another thread may have taken the list away meanwhile.
             self._refusals.append(frame)

@@ -46,9 +46,10 @@ class XyPlot:
     def frame(self, past: TickHistory) -> bytes | None:
         """Return the binary message "xy" of the last seconds; None while less than 1/NEW_PART of its ticks is new.
 
-        It has drive (V) and position (µm), empty if all ticks were lost; `loop_percent`, the relative height 100·h/H of
-        the measured loop, None at rest, without motion and without a whole loop; and with a hysteresis model its curve,
-        moved by `offset_um` to the mean of the measured one.
+        Its arrays are `drive_v` and `position_um`, empty if all ticks were lost; with a hysteresis model also its
+        curve, `model_drive_v` and `model_position_um`, moved by `offset_um` to the mean of the measured one. The header
+        also has `axis`, `run`, `end` (the tick after the last), `at_rest`, and `loop_percent`, the relative height
+        100·h/H of the measured loop: None at rest, without motion and without a whole loop.
         """
         first, end = past.end - self._ticks, past.end
         if self._shown[0] == past.run and end < self._shown[1] + self._ticks / NEW_PART:

@@ -81,14 +81,14 @@ class Recordings:
 
     @with_error_responses
     async def info(self, request: Request) -> Response:
-        """Respond with the JSON of `rtloop info --json` for the recording in the address."""
+        """Respond with the JSON of `rtloop info --json` for the recording in the address, or 422 with its error."""
         return PlainJSONResponse(
             await self._processes.run("rtloop", "info", await self._recording_path(request), "--json")
         )
 
     @with_error_responses
     async def plot(self, request: Request) -> Response:
-        """Respond with the PNG of `rtloop plot` for the recording in the address.
+        """Respond with the PNG of `rtloop plot` for the recording in the address, or 422 with its error.
 
         The query may give `from` and `until`, in s since the start of the run.
         """

@@ -27,7 +27,7 @@ class CaptureBody(BaseModel):
 
     @model_validator(mode="after")
     def _check(self) -> Self:
-        """Require either `seconds`, or both `first` and `end` with first < end."""
+        """Return this body; ValueError unless it has either `seconds`, or both `first` and `end` with first < end."""
         if (self.first is None) != (self.end is None) or (self.seconds is None) == (self.first is None):
             raise ValueError("ticks to capture: not clear; allowed: either `seconds` alone, or `first` with `end`")
         if self.first is not None and self.end is not None and self.end <= self.first:

@@ -131,7 +131,7 @@ def is_public(path: str) -> bool:
 
 
 def host_name(host: str) -> str:
-    """Return the name in a Host header without its port; empty for an invalid header."""
+    """Return the name in a Host header, in lower case, without port and brackets; "" for an invalid header."""
     try:
         parts = urlsplit(f"//{host}")
         return (parts.hostname or "") if parts.netloc == host and parts.port != 0 and "@" not in host else ""
