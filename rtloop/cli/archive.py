@@ -96,7 +96,7 @@ def _examine(
     The code is STOPPED if Ctrl-C left recordings out, 1 if a recording's verdict is not the good one, else 0. `jobs` is
     the number of worker processes, `scheduler` the address of a Dask scheduler in place of them, `out` the folder that
     stores the verdicts; each may be None. Raises UsageError for both `jobs` and `scheduler`, and the errors of
-    `find_recordings` and `examine`.
+    `find_recordings`, `examine` and `DaskWorkers`.
     """
     if jobs and scheduler:
         raise click.UsageError("--jobs: not allowed with --scheduler, whose workers are counted")

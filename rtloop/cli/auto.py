@@ -91,7 +91,8 @@ def write_design(
 
     `hysteresis` records a slow sine from rest, `step` a step; `specs` is the specification. `axis` None: the only one;
     `order` None: searched. Raises NoDesign if no controller exists, OutputError for an existing `out`, ConfigError for
-    an invalid specification or a result that cannot run, other RtloopError for files that are unreadable or unsuitable.
+    an invalid specification or a result that cannot run, other RtloopError for files that are unreadable or unsuitable;
+    then nothing is written.
     """
     from rtloop.design.chain import configuration_text, design_controller, identify_stage
     from rtloop.design.identification.axis_recording import read_axis_recording
@@ -112,8 +113,9 @@ def write_robust_design(
 ) -> RobustChain:  # fmt: skip
     """Write a configuration as `write_design` does, with a controller that damps the resonance, and with taps.
 
-    Takes the parameters of `write_design`, and `progress`, which receives lines of text. Returns and raises as it does;
-    where a controller exists and taps do not, it writes the configuration without taps, and raises NoDesign.
+    Takes the parameters of `write_design`, and `progress`, which receives lines of text. Returns all results, and
+    raises as `write_design`; but where a controller exists and taps do not, it writes the configuration without taps,
+    and then raises NoDesign.
     """
     from rtloop.design.chain import identify_stage
     from rtloop.design.identification.axis_recording import read_axis_recording

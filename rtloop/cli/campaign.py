@@ -54,7 +54,7 @@ def worker_options(command: Callable[..., Any]) -> Callable[..., Any]:
 def choose_workers(jobs: int | None, scheduler: str | None) -> Iterator[Workers]:
     """Start `jobs` worker processes, None: one for each processor, or use the workers of a Dask scheduler, for a block.
 
-    Raises UsageError for both. At the end of the block the workers are closed.
+    The block receives the workers, which are closed at its end. Raises UsageError for both, and as `DaskWorkers`.
     """
     if jobs and scheduler:
         raise click.UsageError("--jobs: not allowed with --scheduler, whose workers are counted")
@@ -206,15 +206,19 @@ class CampaignView(StatusLine):
 
 
 def write_page(page: Path, html: str) -> None:
-    """Write an HTML page, and print its path on stderr. Raises OutputError if the system refuses."""
+    """Write an HTML page, over an existing file, and print its path on stderr. Raises OutputError if the system
+    refuses.
+    """
     write_output(page, html.encode("utf-8", "replace"))
     click.echo(page, err=True)
 
 
 def _report(folder: Path, worst_count: int, as_json: bool, page: Path | None) -> int:
-    """Print the summary of a campaign's results in `folder`, with `worst_count` rigs; write it to `page` if given.
+    """Print the summary of a campaign's results in `folder`, with its `worst_count` worst rigs; then write it as HTML
+    to `page`, if given, over an existing file.
 
-    Returns the exit code: 1 if a rig failed or crashed its worker, or none passed, else 0.
+    Returns the exit code: 1 if a rig failed or crashed its worker, or none passed, else 0. Raises InputFileError for a
+    folder without results or with damaged ones, MissingExtra without pyarrow, OutputError if `page` cannot be written.
     """
     from rtloop.campaigns.summary import summarise_campaign
 

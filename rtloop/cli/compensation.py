@@ -55,9 +55,10 @@ def compensation_report(
 ) -> dict[str, Any]:
     """Bound and simulate the hysteresis that the inverse in `config` leaves in the identified `actuator`.
 
-    Returns the JSON report. Its `bounds` have a row for each choice of the gain ρ: ρ, the bound ξ (µm) and the largest
-    simulated |Ω| = |y − ρ v| (µm), y being the output for a command v. `axis` None is the first axis. `command_um` is
-    the largest |v| (None: the axis's limit). Writes a picture to `plot`, if given. Raises ConfigError for a file
+    Returns the JSON report. Its `bounds` have a row for each choice of the gain ρ: {gain ("eq_2", "best" or "unity"),
+    rho, xi_um: the bound ξ, simulated_um: {sine, random, worst_case}, the largest |Ω| = |y − ρ v|, y being the output
+    for a command v}. `axis` None is the first axis. `command_um` is the largest |v| (None: the axis's limit). Writes a
+    picture to `plot`, if given. Raises ConfigError for a file
     without a hysteresis model of the axis and for a compensator whose loading curve does not increase, RecordingError
     for an unreadable file, OutputError and MissingExtra for the picture.
     """

@@ -297,7 +297,7 @@ def print_preview(axis: str, answer: dict[str, Any]) -> None:
 
 
 def _format_shift(figures: dict[str, Any]) -> str:
-    """Return the range of shifts of the resonance that a loop tolerates, in %, as text; "–" where it is unknown.
+    """Return the shifts of the resonance that a loop tolerates, in %, as text: "-3.0 … +4.5"; "–" where it is unknown.
 
     `figures` are the loop's figures in a response of `/preview`.
     """

@@ -148,7 +148,9 @@ def _print_latency(latency: Latency) -> None:
 
 
 def _histogram_classes(latency: Latency) -> list[dict[str, Any]]:
-    """Return the number of ticks in each class of lateness, [{below_us, count}, …], ascending by the upper limit."""
+    """Return the number of ticks in each class of lateness, [{below_us, count}, …], ascending by the upper limit, which
+    is None for the last class.
+    """
     from rtloop.recording.views.histogram import TimeHistogram
 
     histogram = TimeHistogram()
@@ -166,7 +168,9 @@ def _report(
 ) -> dict[str, Any]:
     """Return the JSON report of an examination, as `rtloop doctor --json` prints it.
 
-    `objections` are the reasons why the host is not suitable.
+    `objections` are the reasons why the host is not suitable. Keys: suitable, reasons, rate_hz, spin_us, findings,
+    lateness_us (quantiles), lateness_histogram, ticks, periods_missed, late_share (0 … 1), stolen_s, axes, applied
+    (`writes`) and versions.
     """
     from rtloop.doctor.software import library_versions
 

@@ -297,7 +297,7 @@ def _write_report(
     """Write report.html, report.json and a PNG of each picture in each theme to `folder`; return the paths, HTML first.
 
     `recordings` are the paths, by file name, to which the HTML page links; `skipped` are reasons by experiment. Raises
-    OutputError if a file cannot be written.
+    OutputError if a file cannot be written; those before it are written then.
     """
     from rtloop.experiments.page import render_report
 

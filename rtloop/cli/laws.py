@@ -55,9 +55,9 @@ def new(name: str, out: Path) -> None:
 def list_laws() -> list[dict[str, Any]]:
     """Return for each registered kind {kind, slot, about (the docstring's first line), shipped, problem, defined_in}.
 
-    `slot` is "controller" or "feedforward", `defined_in` the module. `problem` is the reason that prevents the law's
-    use, else None; with a problem, slot and about are None. Laws of other packages run first in the limited process,
-    which is killed if a law does not return.
+    `slot` is "controller" or "feedforward", `defined_in` the module; `about` is None without a docstring. `problem` is
+    the reason that prevents the law's use, else None; with a problem, slot and about are None. Laws of other packages
+    run first in the limited process, which is killed if a law does not return.
     """
     from rtloop.laws.limited.trial import try_limited
     from rtloop.laws.registry import BUILT_IN, find_law, kinds, law_class

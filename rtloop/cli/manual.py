@@ -28,7 +28,10 @@ COMPLETIONS = {
 
 
 def main(folder: Path) -> None:
-    """Write all man pages and completion scripts below `folder`. Raises OutputError if the system refuses."""
+    """Write all man pages and completion scripts below `folder`, over existing files.
+
+    Raises OutputError if the system refuses.
+    """
     for context in commands(click.Context(rtloop, info_name=NAME)):
         name = context.command_path.replace(" ", "-")
         write_output(folder / "man" / "man1" / f"{name}.1", man_page(context).encode())

@@ -151,7 +151,8 @@ def _measure(context: click.Context, request: Mapping[str, Any]) -> dict[str, An
 def _report_response(content: dict[str, Any], out: Path | None, plot: Path | None, as_json: bool) -> None:
     """Print a measured closed loop, write it as JSON to the new file `out`, draw it to `plot`.
 
-    Raises OutputError for an existing `out`, or if the system refuses; MissingExtra for `plot` without matplotlib.
+    The files are written first. Raises OutputError for an existing `out`, or if the system refuses; MissingExtra for
+    `plot` without matplotlib, when `out` is written already.
     """
     from rtloop.design.identification.model_sections import write_new_file
     from rtloop.design.identification.plot_response import plot_response
@@ -167,7 +168,10 @@ def _report_response(content: dict[str, Any], out: Path | None, plot: Path | Non
 
 
 def _report_resonance(content: dict[str, Any], as_json: bool) -> None:
-    """Print the lightly damped mode of a measured closed loop. Raises UnsuitableData where it shows none."""
+    """Print the lightly damped mode of a measured closed loop, `content`, as text or as JSON {resonance}.
+
+    Raises UnsuitableData where it shows none.
+    """
     from rtloop.design.identification.axis_recording import UnsuitableData
 
     if content["resonance"] is None:

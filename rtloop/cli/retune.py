@@ -77,7 +77,8 @@ def retune_axis(client: Client, request: RetuneRequest, yes: bool, as_json: bool
     """Measure, design, print and, with consent, swap better taps in. Returns 0 if the new taps are in force, else 1.
 
     `yes` swaps without asking; with `as_json` the user is not asked, and without `yes` the old taps stay. Raises
-    RtloopError as `propose_taps` and `swap_in`.
+    RtloopError as `propose_taps`, with the taps unchanged, and as `swap_in`: the stages before a refused one stay in
+    force.
     """
     from rtloop.client.retuning import propose_taps, swap_in
 

@@ -70,7 +70,8 @@ def run(
 def run_configuration(
     config: Path, duration_s: float | None, paced: bool, out: Path | None, as_json: bool, interruption: Interruption
 ) -> int:
-    """Run a configuration, record it and print the result. Returns the exit code: 1 also after a trip.
+    """Run a configuration, record it and print the result. Returns `RunResult.exit_code`: 0 for a good run and for one
+    that did not begin, 1 also after a trip, else the code of the failure.
 
     `paced` is False for virtual time. The imports take a second; `interruption` catches a Ctrl-C meanwhile, and then no
     loop is started. Raises RtloopError, DriverError if the run cannot start.

@@ -254,8 +254,8 @@ def connect(service: str | Path | None = None, *, as_: str | None = None) -> Con
     """Connect to a service by its name or the path of its control socket; None means the only running service.
 
     Commands are recorded under the name `as_`; without one they are recorded as `operator`. An invalid name is refused
-    at the first command. Raises UnavailableError if no service answers, HostRefusal if another user could have made the
-    socket.
+    at the first command. Raises UnavailableError if no service answers, or if several run and none is named,
+    HostRefusal if another user could have made the socket.
     """
     if isinstance(service, str) and "/" in service:
         service = Path(service)

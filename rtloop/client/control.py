@@ -149,7 +149,7 @@ class Client:
         return self._request("POST", resource, json.dumps(body or {}), timeout_s)
 
     def delete(self, resource: str) -> Any:
-        """Send DELETE and return the response. Raises the errors of `post`."""
+        """Send DELETE and return the response, decoded as by `post`. Raises the errors of `post`."""
         return self._request("DELETE", resource, None)
 
     def lock(self, emergency_key: str | None = None) -> Any:

@@ -231,7 +231,10 @@ def _read_taps(values: dict[str, list[float]]) -> Taps:
 
 
 def _taps_in_force(axis: AxisOptions) -> Taps:
-    """Return the taps of a configured axis, both rows padded to one length; without taps, reference 1 and command 0."""
+    """Return the taps of a configured axis, with overshoot 0: both rows (n,), padded with zeros to one length.
+
+    Without configured taps the rows are [1] for the reference and [0] for the command.
+    """
     rows = axis.prefilter.taps or (1.0,), axis.prefilter.command_taps or (0.0,)
     reference, command = _pad_rows(*(np.asarray(row, float) for row in rows))
     return Taps(reference, command, 0.0)

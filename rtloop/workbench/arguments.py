@@ -108,7 +108,7 @@ def require_count(value: Any, argument: str, least: int, largest: int | None = N
 
 
 def require_numbers(value: Any, argument: str) -> list[float]:
-    """Return finite numbers as a list of floats, [] for none. Raises RtloopError, naming `argument`, for other values."""
+    """Return finite numbers as a list of floats; [] for none. Raises RtloopError, naming `argument`, for others."""
     try:
         numbers = [float(number) for number in value]
     except (TypeError, ValueError):

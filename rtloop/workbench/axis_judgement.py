@@ -56,7 +56,7 @@ class AxisJudgement:
 
     @property
     def missed(self) -> list[str] | None:
-        """Labels of the requirements that the running loop misses; None without a specification or a loop.
+        """Labels of the requirements that the running loop misses, [] if none; None without a specification or a loop.
 
         They are those on the simulated rig where the axis contradicts the rig.
         """

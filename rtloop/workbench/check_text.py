@@ -66,7 +66,7 @@ def print_axis(out: Console, judgement: AxisJudgement, sensor: Channel) -> None:
 
 
 def _command_text(axis: AxisOptions) -> str:
-    """Return the command's range in µm as text: "±40", or "0 … 40" for a drive of one sign."""
+    """Return the command's range in µm as text: "±40"; for a drive of one sign "0 … 40" or "-40 … 0"."""
     command_um = axis.limits.command_um
     down_um, up_um = drive_ends_um(axis)
     if down_um < 0 < up_um or down_um == up_um:

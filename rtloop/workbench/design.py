@@ -64,8 +64,8 @@ class DesignResult(Result):
 
     @property
     def achieved(self) -> float:
-        """‖F_l(P, C)‖∞, the norm of the weighted closed loop with the controller of reduced order; at most 1 meets the
-        specification.
+        """‖F_l(P, C)‖∞, the norm of the weighted closed loop with the controller of reduced order. Above 1, each
+        requirement is met only if it is relaxed by this factor.
         """
         return self.synthesis.achieved
 

@@ -16,7 +16,7 @@ def judgement_row(judgement: Judgement, fitted: bool) -> dict[str, Any]:
     Keys: recording (name), fitted, rms_error_um, as_written_rms_um (of the plays alone), max_error_um and
     max_error_percent (of range_um), offset_um, drift_um, memory ("rest" or "unknown"), known_from_s (time from which
     the memory of the hysteresis is known, None: never), unsettled, unsettled_um, judged_percent (part with known
-    memory), early_max_error_percent (of the part before). Errors are NaN where their part is empty.
+    memory), early_max_error_percent (of the other part). Errors are NaN where their part is empty.
     """
     return {
         "recording": judgement.name,

@@ -51,7 +51,7 @@ class RunResult(Result):
     def exit_code(self) -> int:
         """Exit code of the command for this run: 0 for a good run, else the code of the failure.
 
-        It is LoopFault's after a trip and for an incomplete recording.
+        It is LoopFault's, 1, after a trip and for an incomplete recording.
         """
         code = 0 if self.supervised is None else self.supervised.exit_code
         return code or (LoopFault.exit_code if self.trips else 0)

@@ -92,7 +92,10 @@ class Edge(Condition):
         self._falling = Crossing() if slope != Slope.RISING else None
 
     def find(self, values: Real, gap: bool) -> Indices:
-        """Return the indices in `values` (n,) at which the level is reached; `gap`: ticks before them were lost."""
+        """Return the indices, ascending, in `values` (n,) at which the level is reached in the chosen slope.
+
+        `gap`: ticks before `values` were lost.
+        """
         level, hysteresis, indices = self._level, self._hysteresis, []
         if self._rising is not None:
             indices.append(self._rising.find(values < level - hysteresis, values >= level, gap))
