@@ -74,7 +74,10 @@ class OutputError(RtloopError):
 
 @contextmanager
 def output_errors(target: object) -> Iterator[None]:
-    """Convert an OSError inside the block to an OutputError that names `target`, such as a path, and the cause."""
+    """Convert an OSError inside the block to an OutputError that names `target`, such as a path, and the cause.
+
+    Its `number` is the errno, 0 without one.
+    """
     try:
         yield
     except OSError as error:

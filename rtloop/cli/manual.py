@@ -83,7 +83,7 @@ def _command_records(context: click.Context) -> list[tuple[str, str]]:
 
 
 def _see_also(context: click.Context) -> str:
-    """Return references to the pages of the group above a command and of the commands below it."""
+    """Return references, in troff, to the pages of the group above a command and of the commands below it."""
     above = [context.parent.command_path] if context.parent else []
     below = [f"{context.command_path} {name}" for name, _ in _command_records(context)]
     return ",\n".join(f".BR {_escape(path.replace(' ', '-'))} (1)" for path in [*above, *below]).replace(",\n", " ,\n")

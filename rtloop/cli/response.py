@@ -139,7 +139,7 @@ def recording_resonance(run: Path, axis: str | None, near_hz: float | None, as_j
 
 
 def _measure(context: click.Context, request: Mapping[str, Any]) -> dict[str, Any]:
-    """Let the service measure a closed loop, and return its response to `/response`.
+    """Let the service measure a closed loop, and return its response to `/response`, as `LoopMeasurement.for_json`.
 
     `request` are the command's options; options that are None are left out. After Ctrl-C the reference is restored and
     LoopFault is raised. Raises as `Client.measure`.

@@ -42,8 +42,9 @@ class Connection:
 
     @property
     def status(self) -> dict[str, Any]:
-        """The response of `/status`: among others state, lock holder (`lock`), rate, lateness, faults, `recording` and
-        the newest signals.
+        """The response of `/status`: among others `state`, `armed`, `faults` (sentences), `lock` (its holder, None if
+        free), `recording`, `rate_hz`, `lateness_us`, and the newest signals: `tick`, `mode`, `trip` (causes) and
+        `axes`, {axis: {signal: value}}. Those from `rate_hz` on are missing without a loop.
         """
         return self._client.get("/status")
 

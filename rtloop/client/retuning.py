@@ -79,8 +79,9 @@ class Proposal(NamedTuple):
     def for_json(self) -> dict[str, Any]:
         """Return the proposal as plain values, as `rtloop ctl retune --json` prints it and `swap_in` takes it.
 
-        Keys: resonance, percent_from_model, gain, gain_percent_from_model, before, after, better, settling_ms, replaces
-        (the taps in force), prefilter (the new taps).
+        Keys: resonance, percent_from_model, gain, gain_percent_from_model (fields of `stage`), before, after (dicts of
+        step figures), better, settling_ms, replaces (the taps in force) and prefilter (the new taps), both {taps,
+        command_taps}.
         """
         return {
             "resonance": self.stage.resonance,
@@ -262,7 +263,7 @@ def _pad_rows(*rows: np.ndarray) -> list[np.ndarray]:
 def _step_at_gain_bounds(stage: MeasuredStage, subject: Subject, taps: Taps) -> StepMeasures | None:
     """Return the larger value of each figure in two steps with `taps`, the gain off by ± its standard deviation.
 
-    None if the model's gain is used.
+    None if the model's gain is used. Raises NoDesign if a loop with such a gain is unstable.
     """
     if stage.gain is None or stage.gain_percent is None:
         return None

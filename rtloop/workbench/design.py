@@ -190,8 +190,9 @@ def design(specification: FileName, *, model: FileName | None = None, cross_chec
 
     `model` is a file with [axis.model], as `identify` writes it, in place of the specification's [plant]; its
     [axis.feedforward] goes into the configuration that `write` writes. `cross_check` computes γ_opt with SLICOT too.
-    Raises InputFileError for a file that cannot be read, ConfigError for an invalid or incomplete specification,
-    NoDesign where no controller meets it, MissingExtra for `cross_check` without slycot.
+    A controller may miss the specification: see `verdict`. Raises InputFileError for a file that cannot be read,
+    ConfigError for an invalid or incomplete specification, NoDesign where no controller has γ up to the specification's
+    `largest_gamma` or none runs at the rate, MissingExtra for `cross_check` without slycot.
 
     >>> result = rtloop.design("deploy/paper-spec.toml")
     >>> result.order, result.full_order, round(result.gamma_opt, 3)

@@ -45,7 +45,10 @@ class RestDetector:
         """Reference and mode of the newest tick, (2, 1); (2, 0) before the first."""
 
     def feed(self, reference: Real, mode: Real) -> None:
-        """Add the reference and mode, each (n,), NaN for lost ticks, of the next ticks to `at_rest`."""
+        """Take reference and mode, each (n,), NaN for lost ticks, of the next ticks.
+
+        Sets `at_rest` to False, until `reset`, unless both stand still or the mode is off.
+        """
         samples = np.hstack([self._last, [reference, mode]])
         self.at_rest = self.at_rest and is_at_rest(*samples)
         self._last = samples[:, -1:]

@@ -46,7 +46,7 @@ class Pages(StaticFiles):
     """Files of the page, which browsers revalidate each time, because they change with the program."""
 
     def file_response(self, *args: Any, **kwargs: Any) -> Response:
-        """Return the file, or the status 304 if the browser's copy is current."""
+        """Return the file, or the status 304 if the browser's copy is current, with `cache-control: no-cache`."""
         response = super().file_response(*args, **kwargs)
         response.headers["cache-control"] = "no-cache"
         return response

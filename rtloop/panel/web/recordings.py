@@ -117,7 +117,8 @@ class Recordings:
 
     @with_error_responses
     async def capture(self, request: Request) -> Response:
-        """Save ticks of the running loop as a recording, replay it, and respond with the report of `tick_capture`.
+        """Save ticks of the running loop as a recording, replay it, and respond with {file (name), first, end, ticks
+        (number), gaps, problems, replay (verdict)}.
 
         The body is a CaptureBody. 410 if the loop was started again since the run that it names.
         """
