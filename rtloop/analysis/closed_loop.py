@@ -39,7 +39,8 @@ class Injection(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Loop:
-    """C and D as state spaces; `period_s` is None in continuous time. `static_gain` is L at 0 Hz.
+    """C and D as state spaces; `period_s` is None in continuous time. `static_gain` is L at 0 Hz, ±inf if it
+    integrates.
 
     `roots` (k,), in rad/s, are zeros and poles of C and D, near which `frequencies` is dense. `between` is D's position
     within a period, from its states and its input; None in continuous time, and where only the samples are known.

@@ -24,8 +24,8 @@ class LoopAnalysis:
     unstable.
 
     `max_re_pole` (rad/s) is NaN in discrete time, `max_abs_pole` in continuous time. `static_error_percent` is the
-    final error of a step, relative to its height. The settling time is to ±5 % of the final value, and overshoot counts
-    from it.
+    magnitude (≥ 0) of the final error of a step, relative to its height. The settling time is to ±5 % of the final
+    value, and overshoot counts from it.
     """
 
     period_s: float | None

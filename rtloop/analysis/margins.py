@@ -45,7 +45,8 @@ class Margins(NamedTuple):
     """Frequencies in Hz, phase margin in degrees, gain margin as a factor, largest |S|.
 
     Where |L| never crosses 1, the crossover is NaN and the phase margin inf. Where no larger gain makes the loop
-    unstable, the gain margin is inf and its frequency NaN.
+    unstable, the gain margin is inf and its frequency NaN. The phase margin is 0 … 180° and the gain margin above 1 for
+    an unstable loop, too: they do not show that it is unstable.
     """
 
     crossover_hz: float

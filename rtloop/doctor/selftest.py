@@ -93,12 +93,14 @@ class SelfTest:
             )
 
     def run(self, tolerances: Tolerances | None, progress: Callable[[str], None]) -> dict[str, Any]:
-        """Drive the outputs, measure, and return the report of `_report` with `realtime` and `real` as JSON values.
+        """Drive the outputs, measure, and return the report of `_report` as JSON values, with `realtime` (the host's
+        grants), `real` (whether the hardware is no simulation), and `exchange` as `_measure_exchanges` returns it.
 
         `passed` with tolerances: whether all wires are within them. Without: False if a position falls as its drive
-        rises, else None. Where it is True, the measured delay of each wire is stored for this host. `progress` receives
-        a text for each rate. Raises LoopFault for a run that trips, ends early or whose drive did not stand still;
-        RtloopError and DriverError if a run cannot start, or the delay cannot be stored.
+        rises, else None. Where it is True, the measured delay of each wire is stored for this host; whatever `passed`
+        is, so is the delay that exchanges with a node add. `progress` receives a text before the exchanges and for each
+        rate. Raises LoopFault for a run that trips, ends early or whose drive did not stand still, and if a node
+        answers no exchange; RtloopError and DriverError if a run cannot start, or a delay cannot be stored.
         """
         configuration = self._configuration
         exchange = self._measure_exchanges(progress)
@@ -184,8 +186,10 @@ class SelfTest:
     ) -> dict[str, Any]:
         """Return the report, one JSON object, of measured pairs and of rates with their fractions of missed periods.
 
-        Keys: configuration, driver, rate_hz, axes, highest_rate_hz, rates, tolerances, passed. An axis has: axis,
-        output, input, lowest_v, highest_v, gain, offset_v, noise_v, delay_ticks, slope_um_per_v, passed.
+        Keys: configuration, driver, rate_hz, axes, highest_rate_hz (None if all rates miss too many periods), rates
+        ([{rate_hz, missed_share}, …]), tolerances ({gain, offset_v} or None), passed. Each of the list `axes` has:
+        axis, output, input, lowest_v, highest_v, gain, offset_v, noise_v, delay_ticks, slope_um_per_v, passed; delay
+        and slope are None where the reading does not follow the drive. `passed` is True, False or None as in `run`.
         """
         configuration, rows = self._configuration, []
         for staircase in self._staircases:

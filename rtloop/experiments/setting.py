@@ -105,10 +105,10 @@ class Setting:
         )
 
     def largest_drive(self, direction: float) -> tuple[float, str]:
-        """Return the largest magnitude in V of a slow drive from 0 V towards ±1, and the key that limits it.
+        """Return the largest magnitude ≥ 0, in V, of a slow drive from 0 V, and the key that limits it.
 
-        The key comes with its value, such as "limits.drive_v = 10": the drive's limit, or the interlock that trips
-        earlier, by the initial loading curve.
+        `direction` is 1 for drives above 0 V, −1 for those below. The key is the drive's limit, or the interlock that
+        trips earlier, by the initial loading curve; it comes with its value, such as "limits.drive_v = 10".
         """
         limits = self.axis.limits
         largest_v, reason = (limits.drive_v, f"limits.drive_v = {limits.drive_v:g}")
@@ -123,7 +123,9 @@ class Setting:
 
     @property
     def drive_range_v(self) -> tuple[float, float]:
-        """Lowest and highest slow drive in V: within its limits, and below the interlocks of position and sensor."""
+        """Lowest (≤ 0) and highest (≥ 0) slow drive in V, within its limits, that trips neither the position interlock
+        nor the sensor's.
+        """
         return -self.largest_drive(-1.0)[0], self.largest_drive(1.0)[0]
 
     @property

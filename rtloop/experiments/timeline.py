@@ -111,7 +111,8 @@ class Timeline:
             self._append("depolarise", "raw", sine(half_v, DEPOLARISING_HZ, half_v, 90.0), half_s)
 
     def schedule(self, axis: str) -> list[dict[str, Any]]:
-        """Return entries of [[schedule]] for all segments but the first: references of `axis`, and changes of mode.
+        """Return entries of [[schedule]] for all segments but the first: {at_tick, axis, reference} for each, and
+        {at_tick, mode} where the mode changes.
 
         A mode holds for the whole loop, not for `axis` alone.
         """

@@ -115,11 +115,11 @@ class Desk:
     ) -> int:
         """Send a command of the `current_requester`, wait until it took effect, and return the tick of the effect.
 
-        `axis` is a number from 0, by default all axes; `kind` and `values` as in `Kind`; `change` describes a change of
-        a law in words, for `change_text`. Raises Refusal if the requester has no permission (a stop and a reset need
-        none, unless `may_always_stop` is False), or without an acknowledgement in time (the command is withdrawn);
-        RefusedByLoop if the loop refuses it; UnconfirmedCommand if the loop took it and stands still; QueueFull if too
-        many commands wait for the loop.
+        `axis` is a number from 0, by default all axes; `kind` and `values` as in `Kind`, or a Note, which the loop only
+        records; `change` describes a change of a law in words, for `change_text`. Raises Refusal if the requester has
+        no permission (a stop and a reset need none, unless `may_always_stop` is False), or without an acknowledgement
+        in time (the command is withdrawn); RefusedByLoop if the loop refuses it; UnconfirmedCommand if the loop took it
+        and stands still; QueueFull if too many commands wait for the loop.
         """
         requester = current_requester()
         command = message(cast(Kind, kind), axis=axis, origin=requester.origin, values=values)

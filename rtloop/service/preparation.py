@@ -25,7 +25,8 @@ def prepare_actuator(options: ServiceOptions, supervisor: Supervisor, live: Live
     make the present mean reading of each axis its position 0 (tare).
 
     Waits until that is done; the outputs are then at their safe values. Raises Refusal after a trip and if the loop
-    executes no ticks in time, and as `LiveReferences.play_raw`, `LiveLaw.tare` and `Desk.submit`.
+    executes no ticks in time, and as `LiveReferences.play_raw`, `LiveLaw.tare` and `Desk.submit`; what was done before
+    the error stays, as in `depolarise`.
     """
     axes = range(len(live.prepared.plan.axes))
     if options.depolarise is not None:
@@ -41,7 +42,8 @@ def depolarise(options: DepolariseOptions, supervisor: Supervisor, live: LiveLaw
     until the outputs are at their safe values.
 
     Clients' references are refused meanwhile. Raises Refusal after a trip, if the loop executes no ticks in time and if
-    a client sets another mode, and as `LiveReferences.play_raw` and `Desk.submit`.
+    a client sets another mode, and as `LiveReferences.play_raw` and `Desk.submit`. An error leaves the mode and the
+    references as they are then: in mode raw, a loop that goes on plays the sine to its end, and holds 0 V.
     """
     rate_hz = live.prepared.plan.pacing.rate_hz
     sine_v = decaying_sine(options, rate_hz)
@@ -62,7 +64,8 @@ def decaying_sine(options: DepolariseOptions, rate_hz: float) -> npt.NDArray[np.
 
 
 def await_ticks(supervisor: Supervisor, count: int, rate_hz: float, raw_from_tick: int | None = None) -> None:
-    """Wait until `count` more ticks were executed. Raises Refusal after a trip or the time limit.
+    """Wait until `count` more ticks were executed. Raises Refusal after a trip, and after TIMEOUT_FACTOR times their
+    nominal time plus 1 s.
 
     With `raw_from_tick`, raises Refusal also if a tick after that one has another mode than raw: a client set it.
     """
@@ -84,7 +87,7 @@ def _has_left_raw(supervisor: Supervisor, from_tick: int) -> bool:
 def _await_rest(supervisor: Supervisor) -> None:
     """Wait, after mode off was set, until no output ramps any more: all are then at their safe values.
 
-    Raises Refusal after a trip or the time limit.
+    Raises Refusal after a trip, and after TIMEOUT_FACTOR + 1 seconds.
     """
     start_s, limit_s = time.monotonic(), 1.0 + TIMEOUT_FACTOR
     while (row := supervisor.latest()) is None or int(row[signals.FLAGS]) & Flag.RAMPING:
@@ -107,7 +110,7 @@ def _require_progress(supervisor: Supervisor, start_s: float, limit_s: float) ->
 def _mean_inputs_v(supervisor: Supervisor, count: int, axis_count: int) -> list[float]:
     """Wait for `count` ticks, at most half of the ring's length, and return the mean reading (ADC) of each axis, V.
 
-    Raises Refusal after a trip or the time limit.
+    The axes are in the order of their numbers. Raises as `await_ticks`.
     """
     count = min(count, len(supervisor.block["ticks_slots"]) // 2)
     await_ticks(supervisor, count, supervisor.prepared.plan.pacing.rate_hz)

@@ -46,10 +46,10 @@ def park_configuration(config: Path, name: str | None = None) -> str:
     last run; if the configuration names another board, that board is parked as well. A failure of one board does not
     keep the other from being parked.
 
-    Raises at once, with nothing parked, UnavailableError while the service is alive or if its shared block cannot be
-    used, and HostRefusal for a block that another user may have written. After all boards were tried,
-    ConfigError if the hardware is unknown, DriverError, HostRefusal; one RtloopError with all texts for several
-    failures, and for one beside parked outputs or remarks.
+    Raises with nothing parked: UnavailableError while the service is alive or if its shared block cannot be used,
+    HostRefusal for a block that another user may have written, and, if the hardware is unknown, the ConfigError,
+    InputFileError or DriverError of the configuration. Raises DriverError or HostRefusal after all boards were tried.
+    Several failures, and one beside parked outputs or remarks, become one RtloopError with all texts.
     """
     account = ParkingAccount(name or config.stem)
     boards = _find_boards(config, account.name, account)

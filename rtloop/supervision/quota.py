@@ -31,7 +31,10 @@ BEFORE_S, AFTER_S = 10.0, 30.0
 
 
 class FileContents(NamedTuple):
-    """Contents of a finished file: run (name, start in ns), ticks `first` to `end` - 1, tick ranges around trips."""
+    """Contents of a finished file: run (name, start in ns since 1970), ticks `first` to `end` - 1.
+
+    `trips` has the range of ticks (first, last) to keep around each trip.
+    """
 
     run: tuple[str, int]
     first: int

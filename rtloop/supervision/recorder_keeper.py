@@ -59,7 +59,8 @@ class RecorderKeeper:
         self.failure: RtloopError | None = None
         """Why recording could not start; None otherwise."""
         self.totals: dict[str, Any] | None = None
-        """The recorder's report with the list `paths` of all files; None before the end."""
+        """The recorder's report: path, paths (of all files), complete, error (a text or None) and its counts, as texts
+        and JSON values; None before the end."""
         self.replacements = 0
         self.notes: list[str] = []
         self.quota: Quota | None = None

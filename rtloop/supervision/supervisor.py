@@ -62,7 +62,8 @@ OUTCOME_MESSAGES = {
 class RunResult:
     """Result of a run. `outcome`: done, stopped, driver_failed, heartbeat_lost, law_failed, failed or killed.
 
-    `recorder` are the totals of the recorder, `error` is None for a run without one.
+    `recorder` is the recorder's report (`RecorderKeeper.totals`), `notes` are sentences about the recorder and its
+    files, `error` is None for a run without one.
     """
 
     recordings: list[Path]

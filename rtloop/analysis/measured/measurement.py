@@ -45,8 +45,9 @@ class LoopMeasurement:
     def figures(self) -> dict[str, Any]:
         """Return values for status and metrics, without curves, null for NaN.
 
-        Keys: periods, lines (their number), from_hz, to_hz, moved_um, margins, resonance, gain, model; None for parts
-        that do not exist.
+        Keys: periods, lines (their number), from_hz, to_hz, moved_um, margins ({name: {value, std}}), resonance (the
+        fields of LightMode), gain (those of StaticGain), model ({margins: {name: value}, gain_ratio}). The last three
+        are None where there is none.
         """
         measured = self.response
         return to_jsonable(
@@ -67,7 +68,8 @@ class LoopMeasurement:
         """Return `figures` and, under `response`, the values of every line, for JSON.
 
         `response` has the fields of MeasuredResponse, loop (L), loop_spread, sensitivity (S), tracking (T),
-        sensitivity_spread; with a model also model_loop and model_sensitivity. Spreads are relative to the magnitude.
+        sensitivity_spread; with a model also model_loop and model_sensitivity. Spreads are relative to the magnitude;
+        complex values are [real, imaginary], null where not finite.
         """
         measured, loop = self.response, self.loop.loop
         curves = dataclass_fields(measured) | {"loop": loop, "loop_spread": self.loop.spread}

@@ -141,7 +141,7 @@ def _row(
 
 
 def _step_rows(run: RecordedRun, error: Real, model: Real | None, amplitude_um: float) -> list[Row]:
-    """Return rows of largest error, static error and, with a limit, settling time after a step, in nm and ms.
+    """Return rows of largest error, settling time (only with a limit), and static error after a step, in nm and ms.
 
     `error` (n,) and the `model`'s, None without one, are in µm, from the step on. A step contains every frequency: a
     limit up to some frequency applies to its end alone.
@@ -187,9 +187,9 @@ def _settling_ms(error: Real, limit_um: float, rate_hz: float) -> float:
 
 
 def _frequency_curves(run: RecordedRun, amplitude_um: float) -> dict[str, Any]:
-    """Return model and limit over frequency, for the picture: {hz, model_nm, asked_nm, asked_hz}.
+    """Return model and limit over frequency, for the picture: {hz (n,), model_nm (n,), asked_nm, asked_hz}.
 
-    Without a model or a limit, its value is None; the limit applies up to asked_hz.
+    `model_nm` is None without a model, `asked_nm` without a limit, which applies up to `asked_hz`.
     """
     hz = np.geomspace(0.1, min(1000.0, 0.4 * run.rate_hz), 2000)
     rejection = run.model.rejection(hz) if run.model else None

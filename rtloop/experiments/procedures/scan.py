@@ -50,7 +50,8 @@ def triangle(period_ticks: int, amplitude_um: float) -> Real:
 def runs(options: ScanOptions, setting: Setting) -> list[Run]:
     """Plan the first run, in closed loop: unlearned triangles at each frequency in turn.
 
-    Raises UnsuitableLoop like `_learning_gains`, ConfigError for a frequency whose period is no whole number of ticks.
+    Raises UnsuitableLoop without a model that has a stable loop of this axis alone, and if learning would not converge;
+    ConfigError for a frequency whose period is no whole number of ticks.
     """
     lengths = [_period_ticks(hz, setting.rate_hz) for hz in options.frequencies_hz]
     for ticks in lengths:
@@ -64,7 +65,7 @@ def plan_next_run(run_records: Sequence[RecordedRun], options: ScanOptions, sett
     """Plan the next run, with the tables learned from the recordings so far; None after the last.
 
     `run_records` are in order, cycle 0 first. At a frequency where the error grew beyond MAX_ERROR_GROWTH of the least
-    one, the table of the least error is played again. Raises UnsuitableLoop as `_learning_gains`.
+    one, the table of the least error is played again. Raises UnsuitableLoop as `runs`.
     """
     if len(run_records) > options.cycles:
         return None

@@ -45,7 +45,7 @@ def runs(options: StepsOptions, setting: Setting) -> list[Run]:
 
 
 class Step(NamedTuple):
-    """Result of one step: its levels, its figures, and the largest command per height."""
+    """Result of one step: its levels, its figures, and the largest change of the command per height (`peak`)."""
 
     before_um: float
     level_um: float

@@ -40,8 +40,8 @@ def authorise(
     """Return a context in which the action of a request runs under its requester's name, with the lock if
     `request.sender` needs it.
 
-    A stop needs neither a lock nor a valid name. Raises ConfigError for an invalid name, Refusal while another name
-    holds the lock.
+    A stop needs neither a lock nor a valid name. The call raises ConfigError for an invalid name; entering the context
+    raises Refusal while another name holds the lock.
     """
     if request.sender is Sender.STOPPER or (body is not None and body.is_stop):
         try:

@@ -26,7 +26,7 @@ EVENTS_AT_ONCE = 64
 
 
 class ActiveReference(NamedTuple):
-    """Reference of one axis: kind of its generator (None: unknown), whether it is in V, and its newest value."""
+    """Reference of one axis: kind of its generator (None: unknown), whether it is in V (else µm), its newest value."""
 
     kind: Generator | None
     in_volts: bool
@@ -76,7 +76,8 @@ class ActiveReferences:
     def follow(self) -> None:
         """Read the loop's new events, and apply them to references, mode and trip.
 
-        If some were overwritten before they were read, all references are unknown until they are set again.
+        If some were overwritten before they were read, the mode is unknown until its next event, and each reference
+        until it is set again after that.
         """
         ring = self._staging.block.ring("events")
         with self._lock:

@@ -109,8 +109,8 @@ class LiveLaw:
     def undo(self, axis: str) -> tuple[int, str]:
         """Undo the last change of an axis, or of the controller that it shares: load the options from before it.
 
-        The reference stays; the change leaves the history. Returns the tick of the load, and the undone change in
-        words. Raises ConfigError for an unknown axis, Refusal if there is no change, and as `_swap`.
+        The reference stays; the change leaves the history, except after an error. Returns the tick of the load, and the
+        undone change in words. Raises ConfigError for an unknown axis, Refusal if there is no change, and as `_swap`.
         """
         with self._build_lock:
             number, configuration = self.axis_number(axis), self.prepared.configuration
@@ -170,7 +170,7 @@ class LiveLaw:
         """Make `offset_v` the reading at position 0 of axis `number`, now and after later changes.
 
         Returns the tick at which it took effect. Raises Refusal while an earlier change is unsettled, and as
-        `Desk.submit`.
+        `Desk.submit`; `offsets_v` has the new value even then, and the axis's next change or start loads it.
         """
         with self._staging.lock:
             self.offsets_v[number] = offset_v

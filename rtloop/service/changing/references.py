@@ -32,7 +32,10 @@ Samples = np.ndarray[Any, Any]
 
 
 class Setting(NamedTuple):
-    """A reference: [kind, *parameters] of its generator, in V or µm, and the samples of a table outside the plan."""
+    """A reference: [kind, *parameters] of its generator, in V or µm, and the samples of a table that a client set.
+
+    `samples` (n,) are column after column; None for a configured table, and for generators without a table.
+    """
 
     values: tuple[float, ...]
     in_volts: bool
@@ -221,9 +224,10 @@ class LiveReferences:
         return reference.value
 
     def generator(self, options: ReferenceOptions) -> tuple[list[Any], Samples]:
-        """Return [kind, *parameters] of a generator, and the samples of its table, which are empty for other kinds.
+        """Return [kind, *parameters] of a generator, and the samples (n,) of its table, column after column.
 
-        Raises ConfigError for a table that cannot be read and for invalid values.
+        The samples are empty for other kinds than steps and table. Raises ConfigError for a table that cannot be read
+        and for invalid values.
         """
         table, prepared = TableOfSamples(), self._prepared()
         configuration = prepared.configuration

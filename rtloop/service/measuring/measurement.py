@@ -136,8 +136,8 @@ def measure_response(supervisor: Supervisor, live: LiveLaw, axis: str, request: 
 
 
 def require_room(axis: AxisOptions, ends_um: tuple[float, float], hold_um: float, amplitude_um: float) -> None:
-    """Raise ConfigError for a motion about the setpoint `hold_um` that would trip the position interlock or leave the
-    sensor's range, whose ends are `ends_um`.
+    """Raise ConfigError for a motion by ±`amplitude_um` about the setpoint `hold_um` that would trip the position
+    interlock or leave the sensor's range, `ends_um` (lowest, highest).
     """
     position_um, sensor = axis.interlocks.position_um, "interlocks.sensor_min_v and sensor_max_v"
     allowed_um, limit = min(
@@ -198,7 +198,8 @@ class _ExcitationRun:
         """Play multisines, the last for `periods` periods, and return the signals of the last, as `play` does.
 
         Each attempt is shaped by the response to the one before, so that the position's motion approaches
-        `amplitude_um`. Raises Refusal, also after MAX_TRIES attempts with too much motion.
+        `amplitude_um`. Raises Refusal, also for too much motion in the first attempt, or in MAX_TRIES of the later
+        ones, which are repeated with less amplitude until then.
         """
         period = excitation.first_period(lines, amplitude_um)
         amplitude_ratios, remaining_tries = [*excitation.AMPLITUDE_RATIOS], MAX_TRIES

@@ -129,8 +129,8 @@ class Player:
         """Wait for `count` ticks from tick `first` on and return their records (count, columns).
 
         `check_position` receives the positions (n,), µm, of new records and may raise Refusal. Raises Refusal for a
-        tick that cannot be used (tripped, not in closed loop, clipped), after lost ticks, another reference or the time
-        limit, and ClientDisconnected.
+        tick that cannot be used (tripped, not in closed loop, clipped), after lost ticks, for another reference, and
+        READ_MARGIN_S after the ticks were due; ClientDisconnected. The reference that plays is not changed.
         """
         ring = self._supervisor.block.ring("ticks")
         rows = np.empty((count, ring.slots.shape[1]))

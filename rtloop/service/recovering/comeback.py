@@ -79,7 +79,7 @@ def come_back(
 
     The caller's requester sends all commands. `sine`, unless it is None, depolarises after the reset; `on_step` is
     called after each step. Raises Refusal after another trip and for an unknown reference, ReferenceReplaced if a
-    client sets a reference, and as `Desk.submit`.
+    client sets a reference, and as `Desk.submit`. What was done before the error, such as the reset or the mode, stays.
     """
     supervisor, live, desk = loop
     desk.submit(Kind.RESET_TRIP)
