@@ -54,7 +54,9 @@ class ControllerComparison:
     warnings: list[str]
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the comparison as values for JSON, null for NaN."""
+        """Return the fields by name as values for JSON, null for NaN; `shifts` is a list of {kind, frequency_hz,
+        discrete_hz, damping}.
+        """
         return to_jsonable(self)
 
 

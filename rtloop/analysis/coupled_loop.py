@@ -121,7 +121,7 @@ class SimultaneousMargins(NamedTuple):
     command_disk_margin_hz: float
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the margins as values for JSON, null for NaN."""
+        """Return the margins by name as values for JSON, null for NaN."""
         return to_jsonable(self)
 
 

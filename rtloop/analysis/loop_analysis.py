@@ -49,7 +49,7 @@ class LoopAnalysis:
     poles: tuple[complex, ...]
 
     def as_dict(self) -> dict[str, Any]:
-        """Return values for JSON: poles as [real, imaginary], null for undefined and infinite values."""
+        """Return the fields by name for JSON: poles as [real, imaginary], null for undefined and infinite values."""
         return to_jsonable(self)
 
 

@@ -81,8 +81,8 @@ class Timeline:
     def add(self, label: str, mode: ModeName, reference: Reference, duration_s: float, **values: Any) -> None:
         """Append a segment of `duration_s`, at least one tick; `reference` is about 0, and moved to the middle.
 
-        Before the first of them, segments APPROACH are appended that lead to a middle other than 0. `values` are facts
-        for the analysis.
+        Before the first segment that is added, segments APPROACH are appended that lead to a middle other than 0.
+        `values` are facts for the analysis.
         """
         if any(self.middle) and not any(segment.label == APPROACH for segment in self.segments):
             half = (self.middle.v if mode == "raw" else self.middle.um) / 2
@@ -126,12 +126,15 @@ class Timeline:
 
 
 def hold(value: float) -> Reference:
-    """Return a constant reference, in V in mode raw, else in µm."""
+    """Return a constant reference, {kind: "hold", value}, in V in mode raw, else in µm."""
     return {"kind": "hold", "value": float(value)}
 
 
 def sine(amplitude: float, frequency_hz: float, offset: float = 0.0, phase_deg: float = 0.0) -> Reference:
-    """Return a sine about `offset` as a reference, in V in mode raw, else in µm."""
+    """Return the reference {kind: "sine", amplitude, frequency_hz, offset, phase_deg}, in V in mode raw, else in µm.
+
+    The sine is about `offset`; for phase 0 it begins there and rises.
+    """
     return {
         "kind": "sine",
         "amplitude": float(amplitude),

@@ -174,7 +174,7 @@ class Service:
         return live
 
     def ctl(self, command: str) -> str:
-        """Return the text of a command line of `rtloop ctl` for this service, in backticks."""
+        """Return the command line of `rtloop ctl` for this service in backticks; `command` is such as "start"."""
         return f"`rtloop ctl {command}`" if self._name is None else f"`rtloop ctl --name {self._name} {command}`"
 
     def arm(self) -> None:

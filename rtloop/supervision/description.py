@@ -23,9 +23,9 @@ PACKAGES = ("rtloop", "numpy", "numba", "llvmlite", "mcap", "zstandard")
 def recording_header(prepared: Prepared, realtime: dict[str, Any]) -> dict[str, Any]:
     """Return the header of a recording of `prepared`, which begins now, as JSON values.
 
-    Besides name, time, axes, columns, rate and mode it has the configuration with its digest, the layout of the law,
-    and `extras`, `driver`, `realtime`, `versions`, `host`, and `around` if the configuration has an event window. The
-    argument `realtime` are the settings that the host granted the loop.
+    Keys: format, name, created_unix_ns, axes, observed, columns, rate_hz, paced, ticks_expected, mode, configuration
+    (its text), folder, configuration_sha256, law (its layout), extras, driver, realtime, versions, host, and `around`
+    if the configuration has an event window. The argument `realtime` are the settings that the host granted the loop.
     """
     plan, configuration = prepared.plan, prepared.configuration
     around = configuration.recording.around

@@ -199,8 +199,9 @@ class Supervisor:
     def start(self) -> None:
         """Send both processes their orders, wait until both are ready and the recording is open; let the loop begin.
 
-        Sets `realtime`, and `startup_s`, the age of this process then. Raises as `_await_ready`, and OutputError if the
-        recording cannot be opened.
+        Sets `realtime`, and `startup_s`, the age of this process then. Raises RtloopError with the failure that the
+        loop's process reports, LoopFault if a process ends without report, UnavailableError after START_TIMEOUT_S in
+        which nothing was compiled, OutputError if the recording cannot be opened: the loop has executed no tick then.
         """
         self.newest(0)  # Compile or load the function before it is needed in time.
         self._loop.send(pickle.dumps(self.prepared.plan))

@@ -81,8 +81,10 @@ class LoopMeasurement:
         return to_jsonable(self.figures() | {"response": curves})
 
     def _model_figures(self) -> dict[str, Any] | None:
-        """Return the model's `margins`, and `gain_ratio`, the median of measured |L| over the model's at the lines
-        whose spread is below MAX_LINE_SPREAD, NaN without such a line; None without a model.
+        """Return {margins: {name: value}, gain_ratio} of the model; None without a model.
+
+        `gain_ratio` is the median of measured |L| over the model's at the lines whose spread is below MAX_LINE_SPREAD,
+        NaN without such a line.
         """
         if self.model is None:
             return None

@@ -84,9 +84,10 @@ def analyse(recordings: Sequence[RecordedRun], options: CompensationOptions) -> 
 
 
 def _modelled_output(run: RecordedRun, drive: Real, rest: Segment, segment: Segment) -> Real:
-    """Return the position of [axis.feedforward]'s actuator in a segment and behind it, relative to `rest`, in µm.
+    """Return the position (n,) of [axis.feedforward]'s actuator, relative to `rest`, in µm.
 
-    Its memory begins at the rest at 0, or, for a run about another middle, with the recording, before the way there.
+    It begins with the segment and ends with the recording; `drive` (ticks,), V, is of the whole recording. The model's
+    memory begins at the rest at 0, or, for a run about another middle, with the recording, before the way there.
     """
     start = 0 if run.middle_um else rest.start_tick
     output_um = model_output(run.actuator_model, drive[start:])

@@ -162,7 +162,8 @@ def _measure_response(service: Service, body: ResponseBody) -> dict[str, Any]:
 def _learn(service: Service, body: LearnBody) -> dict[str, Any]:
     """Learn the table for one period of the reference. Returns `LearnResult.for_json` after all cycles.
 
-    With `keep` the best table plays on. Raises Refusal unless the loop runs, and as `learn`.
+    With `keep` the best table plays on, else the loop returns to its setpoint. Raises Refusal unless the loop runs, and
+    as `learn`.
     """
     running_loop, current_measurement = _require_running(service, "learn"), service.current_measurement
     with current_measurement.begin("learn", body.axis, body.cycles):

@@ -25,9 +25,10 @@ def differences(before: AxisOptions, after: AxisOptions) -> str:
 
 
 def _section_differences(section: str, before: Any, after: Any) -> Iterator[str]:
-    """Yield a text for each key that differs between two values of one section, such as "limits.drive_v 10 → 9".
+    """Yield a text for each key that differs between two values of `section`, such as "limits.drive_v 10 → 9".
 
-    For lists and tables the text is "… changed", without values. Of laws of different kinds, only the kinds are given.
+    If a value is no table, yield one text, without a key; nothing for equal values. For lists and tables the text is "…
+    changed", without values. Of laws of different kinds, only the kinds are given.
     """
     if before == after:
         return

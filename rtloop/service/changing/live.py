@@ -75,8 +75,11 @@ class LiveLaw:
     def tune(self, axis: str, section: str, changes: Mapping[str, Any]) -> int:
         """Build and verify the law with other values of keys of [axis.SECTION], `changes`, and load it.
 
-        Returns the tick of the load; `undo` takes the change back. Raises as `_swap`; ConfigError also for an unknown
-        axis, a section that is not in TUNABLE_SECTIONS and invalid values: the law then stays.
+        Returns the tick of the load; `undo` takes the change back. Raises ConfigError for an unknown axis, a section
+        that is not in TUNABLE_SECTIONS, invalid values and a law that fails verification, DriverError, UnavailableError
+        if the build takes too long or its process fails, Refusal if a restart is needed or the loop refuses: the law
+        then stays. Raises UnconfirmedCommand if the loop stands still: the change then counts as loaded, since the loop
+        may still load it.
         """
         with self._build_lock:
             return self._apply_change(*self._axis_with_keys(axis, section, changes), f"{section}: {', '.join(changes)}")
@@ -84,8 +87,8 @@ class LiveLaw:
     def load_controller(self, axis: str, controller: Mapping[str, Any]) -> int:
         """Replace [axis.controller] as a whole: build, verify and load it. Returns the tick of the load.
 
-        `controller` are all its keys with their values; `undo` takes the change back. Raises as `_swap`; ConfigError
-        also for an unknown axis and invalid keys: the law then stays.
+        `controller` are all its keys with their values; `undo` takes the change back. Raises as `tune`, ConfigError
+        also for invalid keys.
         """
         with self._build_lock:
             return self._apply_change(
@@ -110,7 +113,7 @@ class LiveLaw:
         """Undo the last change of an axis, or of the controller that it shares: load the options from before it.
 
         The reference stays; the change leaves the history, except after an error. Returns the tick of the load, and the
-        undone change in words. Raises ConfigError for an unknown axis, Refusal if there is no change, and as `_swap`.
+        undone change in words. Raises ConfigError for an unknown axis, Refusal if there is no change, and as `tune`.
         """
         with self._build_lock:
             number, configuration = self.axis_number(axis), self.prepared.configuration

@@ -73,9 +73,9 @@ class LiveReferences:
     def set(self, axis: str, reference: Mapping[str, Any], *, restores: bool = False) -> int:
         """Start a generator, {kind, …} as in [axis.reference], on the axis of this name. Returns its first tick.
 
-        `restores`: the reference was active before, so a position interlock that was narrowed since does not refuse it.
-        Raises ConfigError for an unknown axis, invalid keys, a table that cannot be read and values beyond the limits;
-        Refusal within `reserved`, and as `Desk.submit`.
+        Its values are in µm, in raw mode in V. `restores`: the reference was active before, so a position interlock
+        that was narrowed since does not refuse it. Raises ConfigError for an unknown axis, invalid keys, a table that
+        cannot be read and values beyond the limits; Refusal within `reserved`, and as `Desk.submit`.
         """
         try:
             options = type_adapter(ReferenceOptions).validate_python(dict(reference))

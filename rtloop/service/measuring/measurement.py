@@ -62,7 +62,7 @@ class MeasurementHistory:
 
     @property
     def newest(self) -> dict[str, Any]:
-        """Figures of the last measurement; there must be one."""
+        """`LoopMeasurement.figures` and unix_time_s (s since 1970) of the last measurement; there must be one."""
         return self._figures[-1]
 
     def for_json(self) -> dict[str, Any]:
