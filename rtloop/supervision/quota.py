@@ -91,8 +91,8 @@ class Quota:
     def enforce(self, budget_s: float = BUDGET_S) -> list[Removal]:
         """Remove files, oldest first, until the quota holds or no more may be removed. Returns the removed files.
 
-        `budget_s` limits the time for reading new files; unread ones stay. An OSError, and files of other users, are
-        reported in `failure`. Also updates `total_bytes`, `removed_files` and `removed_bytes`.
+        `budget_s` limits the time for reading new files; unread ones stay. An OSError ends the work; it is reported in
+        `failure`, as are files of other users. Also updates `total_bytes`, `removed_files` and `removed_bytes`.
         """
         removals: list[Removal] = []
         self.failure = None

@@ -112,8 +112,8 @@ class Supervisor:
     ) -> None:
         """Create the shared block and start the heartbeat; the processes wait for `start`.
 
-        A paced loop without a tick for `stall_s`, and at least STALL_PERIODS periods, is killed. Raises ConfigError as
-        `refuse_simulated_lateness` and `require_margins` do.
+        A paced loop without a tick for `stall_s`, and at least STALL_PERIODS periods, is killed. Raises ConfigError,
+        before anything is created, as `refuse_simulated_lateness` and `require_margins` do.
         """
         refuse_simulated_lateness(prepared)
         require_margins(prepared)

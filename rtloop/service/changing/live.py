@@ -185,8 +185,8 @@ class LiveLaw:
 
         `prepared` is then the new one; the undo history is cleared if an axis changed. Returns the changed axes as
         ["axis.NAME", …], [] if none changed. Raises Refusal if the new one needs a restart, ConfigError for a reference
-        that is invalid or beyond the limits, and as `Desk.submit`. An RtloopError after the first axis becomes a
-        Refusal that names the axes changed already: these stay changed.
+        that is invalid or beyond the limits, and as `Desk.submit`. An RtloopError after the first change of an
+        axis becomes a Refusal that names the axes changed already: these stay changed, and the history stays.
         """
         with self._build_lock, self._staging.lock:
             old, new = self.prepared.configuration, prepared.configuration

@@ -182,7 +182,8 @@ class Recovery:
     def confirm(self, supervisor: Supervisor, live: LiveLaw) -> Return | None:
         """Judge the newest readings if a confirmation is due; return a Return once all confirmations have succeeded.
 
-        None before. Also None if an obstacle is found then: the recovery latches (no return before `reset`).
+        The recovery is RETURNING then, and later calls return None. None also before, and if an obstacle is found at
+        the end: the recovery latches (no return before `reset`).
         """
         with self._guard:
             options, former = self._options, self._former
