@@ -236,8 +236,8 @@ class Service:
         """Ramp the outputs to safe and keep them there; disarm if service.arm is set.
 
         Returns the tick at which the ramp begins, or a later one if the outputs ramp already, as after a trip. Raises
-        Refusal without a loop and if the driver refuses every write, and as `Desk.submit`; the service then stays
-        armed.
+        Refusal without a loop and if the driver refuses every write, and as `Desk.submit`; `armed` is then not
+        changed.
         """
         tick = self.set_mode("off")
         self.armed = not self.configuration.service.arm
@@ -247,7 +247,7 @@ class Service:
         """Clear latched trips and faults; the outputs stay off, and the service is disarmed if service.arm is set.
 
         Returns the tick at which the trip was cleared. Raises Refusal unless tripped, or without a loop, and as
-        `Desk.submit`; the faults then stay, but a recovery under way has ended.
+        `Desk.submit`; if the loop refuses, the faults stay, but a recovery under way has ended.
         """
         if self.state is not State.TRIPPED:
             raise Refusal(f"reset: there is no trip; the state of the service is {self.state}")

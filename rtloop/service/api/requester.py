@@ -69,8 +69,10 @@ async def watch_client(request: Request) -> AsyncIterator[None]:
 
 @asynccontextmanager
 async def call_at_disconnect(request: Request, action: Callable[[], object]) -> AsyncIterator[None]:
-    """Call `action` if a request's connection ends before the work within does; the request's body must have been
-    read."""
+    """Call `action` if a request's connection ends before the work within does.
+
+    The request's body must have been read.
+    """
 
     async def watch() -> None:
         """Wait for the end of the connection, then call `action`."""
