@@ -297,7 +297,7 @@ class Recovery:
     @property
     def pause_s(self) -> float:
         """Pause before the next start of a loop, s: `wait_s`, doubled with each further failure, at most
-        LONGEST_PAUSE_S.
+        LONGEST_PAUSE_S, which it is without [service.recover].
         """
         wait_s = LONGEST_PAUSE_S if self._options is None else self._options.wait_s
         return min(wait_s * 2.0 ** min(max(self._failures - 1, 0), 10), LONGEST_PAUSE_S)
