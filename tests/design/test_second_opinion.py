@@ -41,7 +41,7 @@ def test_python_control_agrees_and_a_wrong_gain_or_delay_is_found(name: str) -> 
         later = check.loop(check.plant, check.delay_ticks + 1)
         for faults in (disagreements(check.on_model, louder), disagreements(later, opinion)):
             assert faults[0].startswith("closed-loop poles:")
-            assert any(fault.startswith("step: differs by") for fault in faults)
+            assert any(fault.startswith("step response: rtloop and python-control differ by") for fault in faults)
         assert disagreements(later, second_opinion(numbers._replace(delay_ticks=check.delay_ticks + 1))) == []
 
 
@@ -106,4 +106,4 @@ def test_a_disagreement_is_a_fault_of_the_command(monkeypatch, command) -> None:
     monkeypatch.setattr(second_opinion_module, "STEP_TOLERANCE", -1.0)
     result = CliRunner().invoke(main, [*command, str(DEPLOY / "board.toml")])
     assert result.exit_code == 78
-    assert "axis.x: step: differs by" in result.stderr
+    assert "axis.x: step response: rtloop and python-control differ by" in result.stderr
