@@ -150,8 +150,9 @@ def _open_last_block(path: Path, account: ParkingAccount) -> Iterator[SharedBloc
         block = None
         try:
             with _block_errors(path):
-                block = SharedBlock.attach(fd, lambda: True)
-            _ = block["last_drive_v"], block["words"]
+                found = SharedBlock.attach(fd, lambda: True)
+            _require_drives(found)
+            block = found
         except EOFError:  # The service died before it had written the block.
             pass
         except UNREADABLE as error:
@@ -165,6 +166,15 @@ def _open_last_block(path: Path, account: ParkingAccount) -> Iterator[SharedBloc
         yield block
     finally:
         close_descriptor(fd)
+
+
+def _require_drives(block: SharedBlock) -> None:
+    """Raise one of UNREADABLE unless the block has control words and the last drives as this version writes them."""
+    words, drives_v = block["words"], block["last_drive_v"]
+    if words.dtype != np.uint64 or words.ndim != 1 or words.size < len(Word):
+        raise ValueError(f"words: {words.dtype} {words.shape}; allowed: uint64, at least {len(Word)}")
+    if drives_v.dtype != np.float64 or drives_v.ndim != 1:
+        raise ValueError(f"last_drive_v: {drives_v.dtype} {drives_v.shape}; allowed: float64, one an axis")
 
 
 @contextmanager

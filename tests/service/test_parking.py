@@ -491,7 +491,19 @@ def test_a_loop_that_cannot_be_killed_keeps_no_other_board_from_being_parked(par
     assert hardware.written[-1] == 0.0
 
 
-@pytest.mark.parametrize("text", [b"{", b"{}", b'{"words": 3}', b"{" + bytes(range(256)) * 40])
+WORDS = '"words": [8192, "<u8", [64]]'
+OTHER_BLOCKS = ("", ', "last_drive_v": [8704, "<U1", [1]]', ', "last_drive_v": [8704, "<f8", [1, 1]]',
+                ', "last_drive_v": [8704, "<f8", []]')  # fmt: skip
+OTHER_WORDS = ('[8192, "<f8", [64]]', '[8192, "<u8", [8]]', '[8192, "<u8", [8, 8]]')
+
+
+@pytest.mark.parametrize(
+    "text",
+    [b"{", b"{}", b'{"words": 3}', b"{" + bytes(range(256)) * 40,
+     *(f"{{{WORDS}{drives}}}".encode().ljust(16384, b"\0") for drives in OTHER_BLOCKS),
+     *(f'{{"words": {words}, "last_drive_v": [8704, "<f8", [1]]}}'.encode().ljust(16384, b"\0")
+       for words in OTHER_WORDS)],
+)  # fmt: skip
 def test_a_block_that_is_not_understood_counts_as_none(parked, tmp_path, text):
     hardware, park = parked(ReadableCard)
     (tmp_path / "run" / "lab.block").write_bytes(text)

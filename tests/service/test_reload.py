@@ -186,3 +186,27 @@ def test_a_reference_that_is_none_is_a_fault_of_the_request(live, reference: dic
     with pytest.raises(ConfigError, match="reference"):
         live.references.set(FIRST, reference)
     assert live._staging.desk.taken == []
+
+
+def test_a_refused_tare_does_not_come_with_the_next_change(live):
+    def loaded_offsets_v() -> list[float]:
+        size = live.prepared.plan.coefficients.dtype.itemsize
+        staged = live._staging.block["staged"][: 2 * size].tobytes()
+        return np.frombuffer(staged, live.prepared.plan.coefficients.dtype)["offset_v"].tolist()
+
+    desk = live._staging.desk
+    assert live.tare(0, 0.25) == 7
+    desk.refuses.add((Kind.LOAD_LAW, 0))
+    with pytest.raises(Refusal):
+        live.tare(0, 0.5)
+    desk.refuses.clear()
+    live.replace_all(prepared(TIGHTER))
+    assert loaded_offsets_v() == [0.25, 0.0]
+    desk.deaf_to.add(Kind.LOAD_LAW)
+    with pytest.raises(UnconfirmedCommand):
+        live.tare(0, 0.75)  # the loop may have loaded it, so the next change must not take it back
+    desk.deaf_to.clear()
+    live._staging.block["ticks_head"][0] = 10  # the loop goes on
+    live.tare(1, 0.1)
+    live.replace_all(prepared())
+    assert loaded_offsets_v() == [0.75, 0.1]

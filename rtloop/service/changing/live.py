@@ -172,13 +172,20 @@ class LiveLaw:
     def tare(self, number: int, offset_v: float) -> int:
         """Make `offset_v` the reading at position 0 of axis `number`, now and after later changes.
 
-        Returns the tick at which it took effect. Raises Refusal while an earlier change is unsettled, and as
-        `Desk.submit`; `offsets_v` has the new value even then, and the axis's next change or start loads it.
+        Returns the tick at which it took effect. Raises Refusal, also while an earlier change is unsettled: the earlier
+        offset stays. Raises UnconfirmedCommand: the loop may still load the new one, which counts as loaded.
         """
         with self._staging.lock:
+            axis, earlier_v = self.prepared.configuration.axes[number], dict(self.offsets_v)
             self.offsets_v[number] = offset_v
-            axis = self.prepared.configuration.axes[number]
-            return self._stage(number, self.prepared, axis, f"position 0 µm is now at a reading of {offset_v:.4g} V")
+            try:
+                return self._stage(
+                    number, self.prepared, axis, f"position 0 µm is now at a reading of {offset_v:.4g} V"
+                )
+            except Refusal:
+                self.offsets_v.clear()
+                self.offsets_v.update(earlier_v)
+                raise
 
     def replace_all(self, prepared: Prepared) -> list[str]:
         """Load the options and references of another configuration, axis by axis, where they differ from the present.
