@@ -115,6 +115,21 @@ def test_an_old_copy_that_cannot_be_removed_refuses_a_new_one(
         kind(part)
 
 
+@pytest.mark.parametrize("kind", [recover, cut], ids=["recover", "cut"])
+def test_a_second_copy_at_the_same_time_is_refused_and_the_first_one_is_whole(part: Path, kind: Callable[..., Any]):
+    refusals: list[str] = []
+
+    def start_again(_: int) -> None:
+        with pytest.raises(OutputError) as refused:
+            kind(part)
+        refusals.append(str(refused.value))
+
+    report = kind(part, progress=start_again)
+    assert report["ticks"] == len(load(report["output"])) == TICKS
+    assert refusals
+    assert {refusal.partition(": ")[2] for refusal in refusals} == {"another process writes the same recording"}
+
+
 def test_a_folder_that_cannot_be_synced_does_not_undo_a_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     fsync = os.fsync
     monkeypatch.setattr(os, "fsync", lambda fd: refuse() if os.path.isdir(f"/proc/self/fd/{fd}") else fsync(fd))

@@ -10,12 +10,11 @@ import json
 from pathlib import Path
 from typing import Any
 
-from rtloop.errors import output_errors
 from rtloop.recording.cutting.seek import ChunkSeeker
 from rtloop.recording.cutting.source import RunSource, TickRange
 from rtloop.recording.errors import RecordingError
 from rtloop.recording.file.copy_account import CopyAccount
-from rtloop.recording.file.recover import is_being_written
+from rtloop.recording.file.recover import remove_leftover
 from rtloop.recording.file.run_readers import RecordingPaths, ReportTicks, find_files, open_run
 from rtloop.recording.file.topics import format
 from rtloop.recording.file.topics.contents import Message
@@ -177,13 +176,10 @@ def _write_copy(
 ) -> tuple[RangeCopy, int]:
     """Copy a range of ticks into the new recording `output`. Returns the copy and its number of ticks.
 
-    A leftover of an earlier attempt is removed. Raises OutputError if the output exists or cannot be written,
-    RecordingError if the source cannot be read; no output is left then.
+    A leftover of an earlier attempt is removed. Raises OutputError if the output exists, another process is writing it
+    or it cannot be written, RecordingError if the source cannot be read; no output is left then.
     """
-    unfinished_path = output.with_name(output.name + UNFINISHED_SUFFIX)
-    with output_errors(output):
-        if unfinished_path.exists() and not is_being_written(unfinished_path):
-            unfinished_path.unlink()
+    remove_leftover(output, UNFINISHED_SUFFIX)
     log_time = header["created_unix_ns"] if header["paced"] else 0
     writer = Writer(
         output, header, log_time, message_index=True, min_free_bytes=min_free_bytes, suffix=UNFINISHED_SUFFIX

@@ -5,12 +5,13 @@ The original is never changed. A chunk is copied whole or not at all, by its che
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 from pathlib import Path
 from typing import Any
 
-from rtloop.errors import output_errors
+from rtloop.errors import OutputError, output_errors
 from rtloop.foundation.trusted import close_descriptor, is_own, open_user_file
 from rtloop.recording.errors import RecordingError
 from rtloop.recording.file.copy_account import CopyAccount
@@ -116,8 +117,8 @@ def recover(
 
     `output` is `recovered_path` if None; an unfinished output of an earlier attempt is removed. Returns {recording,
     output, ticks, gaps [(first tick, count)], problems, complete}: `complete` is True for a finished run without a
-    loss. Raises RecordingError if a recorder is writing `path` or it cannot be read, OutputError if the output exists
-    or cannot be written completely; an incomplete output is removed.
+    loss. Raises RecordingError if a recorder is writing `path` or it cannot be read, OutputError if the output exists,
+    another process is writing it or it cannot be written completely; an incomplete output is removed.
     """
     path = Path(path)
     output = recovered_path(path) if output is None else Path(output)
@@ -125,8 +126,7 @@ def recover(
         raise RecordingError(f"{path}: a recorder is writing this file; recover it after the run")
     with Reader(path, tolerant=True, opener=opener) as reader:
         header = {key: value for key, value in reader.header.items() if key != "configuration_sha256"}
-        with output_errors(output):
-            output.with_name(output.name + UNFINISHED_SUFFIX).unlink(missing_ok=True)
+        remove_leftover(output, UNFINISHED_SUFFIX)
         log_time = header["created_unix_ns"] if header["paced"] else 0
         writer = Writer(output, header, log_time, message_index=True, suffix=UNFINISHED_SUFFIX)
         try:
@@ -147,6 +147,19 @@ def recover(
             "problems": reader.problems,
             "complete": final_event["kind"] == FINISHED and final_event["what"]["complete"],
         }
+
+
+def remove_leftover(output: Path, suffix: str) -> None:
+    """Remove the unfinished file, `output` plus `suffix`, of an earlier attempt to write `output`, if there is one.
+
+    Raises OutputError if another process is writing it or it cannot be removed, RecordingError if its lock cannot be
+    tested.
+    """
+    leftover = output.with_name(output.name + suffix)
+    if is_being_written(leftover):
+        raise OutputError(f"{leftover}: another process writes the same recording", errno.EWOULDBLOCK)
+    with output_errors(output):
+        leftover.unlink(missing_ok=True)
 
 
 def is_being_written(path: Path) -> bool:
