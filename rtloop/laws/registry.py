@@ -132,12 +132,15 @@ def law_from_text(text: str, file: str, kind: str | None = None) -> LawReference
 def law_class(law: LawReference) -> type[Law]:
     """Return the class of a law; its text is run once in a process, one that fails at each call.
 
-    Raises ValueError if the text cannot be run or has a mistake, KeyError if it does not define this kind, or for a law
-    without a text that is not shipped.
+    Raises ValueError if the text cannot be run, has a mistake or does not define this kind, KeyError for a law without
+    a text that is not shipped.
     """
     if law.text:
         announce(law.kind, law.file)
-        return _law_classes(_module(law.text, law.file))[law.kind]
+        classes = _law_classes(_module(law.text, law.file))
+        if law.kind not in classes:
+            raise ValueError(f"{law.file}: does not define the law {law.kind!r}")
+        return classes[law.kind]
     module, _, name = BUILT_IN[law.kind].partition(":")
     return getattr(import_module(module), name)
 

@@ -190,6 +190,15 @@ def test_a_text_that_is_not_the_one_that_ran_is_refused(tmp_path: Path):
         replay(rtloop.load(path), trust=TrustedLaws(recorded=True))
 
 
+def test_a_text_that_does_not_define_the_named_law_is_refused(tmp_path: Path):
+    def renamed(header: dict) -> None:
+        next(law for law in header["law"]["laws"] if law["name"] == "mine")["name"] = "other"
+
+    path = recorded(tmp_path, law_text(), renamed)
+    with pytest.raises(RecordingError, match=r"run\.mcap: law 'other': .*run\.mcap: does not define the law 'other'"):
+        replay(rtloop.load(path), trust=TrustedLaws(recorded=True))
+
+
 def test_another_law_by_the_same_records_does_not_replay_as_it(tmp_path: Path):
     """The text decides: another text has another digest than the recording."""
     path = recorded(tmp_path, law_text())

@@ -113,7 +113,7 @@ def _find_law(entry: Mapping[str, Any], recording: Recording, trust: TrustedLaws
     try_limited(law.file, law_class, law)
     try:
         law_layout([law])
-    except (ValueError, KeyError) as error:
+    except ValueError as error:
         raise RecordingError(f"{location}: {error}") from None
     return law
 
