@@ -11,7 +11,10 @@ from rtloop.engine.memory import SharedBlock, Word
 from rtloop.errors import LOW_SPACE
 from rtloop.values import count_text
 
-REASONS = {LOW_SPACE: "the free space on the disk is below recording.min_free_mib"}
+REASONS = {
+    LOW_SPACE: "too little space is free on the disk; recording continues once recording.min_free_mib, a quarter of it "
+    "and 1 MiB are free"
+}
 BEHIND_DIVISOR = 4
 """A recorder that is behind by more than a quarter of the ring (some seconds) is dead or stuck."""
 QUIET_S = 1.0

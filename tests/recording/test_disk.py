@@ -21,6 +21,7 @@ from rtloop.recording.file.topics.format import chunk_rows
 from rtloop.recording.load import load
 from rtloop.recording.replay.replay import replay
 from rtloop.recording.views.summary import summarise
+from rtloop.supervision.recording_state import recording_state
 from tests.recording.disk import PLENTY_BYTES, Disk, missing
 from tests.recording.hand_made_loop import HandMadeLoop, RecorderProcess, make_header, make_rows
 from tests.recording.real_loop import RecordedRun, rows_of
@@ -142,6 +143,8 @@ def test_recording_resumes_once_more_than_the_minimum_is_free(disk: Disk, tmp_pa
     for tick, free_bytes in ((15_000, 64 * MIB - 1), (25_000, 64 * MIB + 4096)):  # The latter would be full at once.
         disk.free_bytes = free_bytes
         run.run_to(tick)
+    reason = recording_state(run.loop.block)["reason"]
+    assert "a quarter of it and 1 MiB are free" in reason  # The minimum itself is free.
     disk.free_bytes = 128 * MIB
     totals = run.end(45_000)
     (gap,) = check(totals, 45_000)
