@@ -129,7 +129,8 @@ def load_frames(options: BusOptions) -> dict[str, Frame]:
 def choose_exchange(frames: dict[str, Frame], channels: int, options: BusOptions) -> Exchange:
     """Return the pair Drive…, Sample… with the fewest bytes that has room for `channels`, classic or FD by `options`.
 
-    Raises ValueError if no pair has room. A Drive… without its Sample… is left out.
+    A Drive… without its Sample… is left out. Raises ValueError if no pair has room, or if the signals of the pair are
+    not Sequence, Drive_0, … and Sequence, Age, Sample_0, ….
     """
     pairs = [
         Exchange(frame, frames[f"Sample{name.removeprefix('Drive')}"], channels)
@@ -143,7 +144,20 @@ def choose_exchange(frames: dict[str, Frame], channels: int, options: BusOptions
             f"channels: {channels} axes; the DBC file has no {kind} frames DriveNAME and SampleNAME with room for "
             f"{channels} axes; add both frames, or set another dbc"
         )
-    return min(pairs, key=lambda pair: pair.drive.length + pair.sample.length)
+    exchange = min(pairs, key=lambda pair: pair.drive.length + pair.sample.length)
+    numbers = range(exchange.channel_capacity)
+    require_signals(exchange.drive, ["Sequence", *(f"Drive_{i}" for i in numbers)], options)
+    require_signals(exchange.sample, ["Sequence", "Age", *(f"Sample_{i}" for i in numbers)], options)
+    return exchange
+
+
+def require_signals(frame: Frame, names: Sequence[str], options: BusOptions) -> None:
+    """Raise ValueError, naming the DBC file, unless the frame has the signals `names` in the order of their bits."""
+    if [*frame.signals] != [*names]:
+        raise ValueError(
+            f"dbc: {options.dbc}: {frame.name} has the signals {', '.join(frame.signals)}; "
+            f"allowed, in the order of their bits: {', '.join(names)}"
+        )
 
 
 def _raw_range(signal: Any) -> tuple[int, int]:

@@ -16,7 +16,7 @@ import numpy as np
 from rtloop.drivers.can.bus import BUS_ERRORS, error_text, open_bus, require_interface
 from rtloop.drivers.can.driver import LISTEN_S
 from rtloop.drivers.can.extra import can
-from rtloop.drivers.can.frames import Frame, choose_exchange, load_frames
+from rtloop.drivers.can.frames import Frame, choose_exchange, load_frames, require_signals
 from rtloop.drivers.can.options import CanOptions
 from rtloop.drivers.errors import DriverError
 from rtloop.hil.free_running import FreeRunningRig
@@ -24,6 +24,8 @@ from rtloop.hil.free_running import FreeRunningRig
 RIG_RATE_HZ = 20_000.0
 IDLE_S, RAMP_S = 0.01, 0.001
 SAFE_V, STARTING = 0.0, 0.0
+ANNOUNCED = ("Channels", "Serving", "Watchdog", "Identity")
+"""Signals of the frame Node."""
 
 
 class RigNode:
@@ -32,12 +34,15 @@ class RigNode:
     def __init__(self, bus: can.BusABC, options: CanOptions, axes: Sequence[str]) -> None:
         """Build the rig at rest and compile it; nothing is sent.
 
-        Raises ValueError if rig, axes and DBC do not fit together, KeyError if the DBC has no frame Node.
+        Raises ValueError if rig, axes and DBC do not fit together, and if the DBC has no frame Node with ANNOUNCED.
         """
         self._bus, self._options = bus, options
         frames = load_frames(options)
         self._exchange = choose_exchange(frames, len(axes), options)
+        if "Node" not in frames:
+            raise ValueError(f"dbc: {options.dbc}: has no message Node, which this node sends; add it")
         self._announcement: Frame = frames["Node"]
+        require_signals(self._announcement, ANNOUNCED, options)
         self._rig = FreeRunningRig(options, axes, RIG_RATE_HZ)
         self.drive_v = self._rig.drive_v
         self._target_v = np.full(len(axes), SAFE_V)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 import signal
 import sys
 from pathlib import Path
@@ -13,6 +14,9 @@ import pytest
 import rtloop as project
 from rtloop.configuration.file import load
 from rtloop.configuration.prepare import prepare
+from rtloop.drivers.can.frames import DBC
+from rtloop.drivers.can.node import serve
+from rtloop.drivers.can.options import CanOptions
 from rtloop.errors import ConfigError
 from tests.asked import answer, run
 from tests.drivers.can_bench import configuration, free_port
@@ -81,6 +85,31 @@ def test_a_bad_configuration_is_refused(config, fault):
     replace_text(config, old, new)
     with pytest.raises(ConfigError, match=message):
         prepare(load(config))
+
+
+OWN_DBC = {
+    "another name in Drive1": (r"(BO_ 256 (.*\n)+?.*)Drive_0", r"\1Volt_0", "Drive1 has the signals Sequence, Volt_0"),
+    "no Age in Sample1": (r"(BO_ 384 (.*\n)+?) SG_ Age.*\n", r"\1", "Sample1 has the signals Sequence, Sample_0"),
+    "no Node": (r"BO_ 1024 (.*\n)+?\n", "", "has no message Node"),
+    "no Identity in Node": (r" SG_ Identity .*\n", "", "Node has the signals Channels, Serving, Watchdog;"),
+}
+
+
+@pytest.mark.parametrize("case", OWN_DBC)
+def test_a_dbc_with_other_signals_is_refused_by_name(config: Path, case: str):
+    pattern, replacement, message = OWN_DBC[case]
+    changed, count = re.subn(pattern, replacement, DBC.read_text(), count=1)
+    assert count == 1
+    dbc = config.with_name("own.dbc")
+    dbc.write_text(changed)
+    replace_text(config, "wait_s = 60", f'dbc = "{dbc}"')
+    if "Node" not in case:
+        with pytest.raises(ConfigError, match=rf"driver\.dbc: {dbc}: {message}"):
+            prepare(load(config))
+    options = load(config).driver_options
+    assert isinstance(options, CanOptions)
+    with pytest.raises(ValueError, match=f"^dbc: {dbc}: {message}"):
+        serve(options, ["x"], lambda: True)
 
 
 def test_a_rate_above_the_bus_is_refused_by_the_command(tmp_path):
