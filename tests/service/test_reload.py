@@ -75,6 +75,21 @@ def test_what_one_axis_refused_is_not_noted_and_comes_with_the_next_reload(live)
     assert live.replace_all(prepared(TIGHTER)) == []
 
 
+@pytest.mark.parametrize(
+    ("old", "new", "place"),
+    [
+        ("rate_hz = 10000", "rate_hz = 10000\nspin_us = 7.0", "loop"),
+        ("seed = 1", "seed = 77", "driver"),
+        ("um_per_v = ", "um_per_v = 1", "driver.channels"),
+    ],
+)
+def test_a_part_that_needs_a_restart_is_named_as_in_the_file(live, old: str, new: str, place: str):
+    assert old in TEXT
+    other = prepare(parse(TEXT.replace(old, new, 1), "lab", DEPLOY, "lab.toml"), paced=False)
+    with pytest.raises(Refusal, match=rf"^{place}: changed in the file; restart the service$"):
+        live.replace_all(other)
+
+
 def test_what_is_known_of_a_loop_is_that_of_the_law_that_runs(live):
     before, other = live.prepared.checks, prepared(("gain = 0.016", "gain = 0.012"))
     live._staging.desk.refuses.add((Kind.LOAD_LAW, 1))

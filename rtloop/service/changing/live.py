@@ -28,8 +28,15 @@ from rtloop.service.changing.references import LiveReferences, axis_number, inva
 from rtloop.service.changing.staging import Staging
 from rtloop.service.desk import Desk, Refusal, UnconfirmedCommand
 
-FIXED_PARTS = ("loop", "driver_kind", "driver_options", "channels", "inputs", "outputs")
-"""Fields of `Configuration` that only a restart can change."""
+FIXED_PARTS = {
+    "loop": "loop",
+    "driver_kind": "driver.kind",
+    "driver_options": "driver",
+    "channels": "driver.channels",
+    "inputs": "inputs",
+    "outputs": "outputs",
+}
+"""Fields of `Configuration` that only a restart can change, and their places in the file."""
 CONTROLLER_AXES_CHANGED = (
     "controller.axes: differs from the running loop, whose axes share controllers in another way; restart the service"
 )
@@ -197,7 +204,7 @@ class LiveLaw:
         """
         with self._build_lock, self._staging.lock:
             old, new = self.prepared.configuration, prepared.configuration
-            fixed_parts = [part for part in FIXED_PARTS if getattr(old, part) != getattr(new, part)]
+            fixed_parts = [place for part, place in FIXED_PARTS.items() if getattr(old, part) != getattr(new, part)]
             if fixed_parts or prepared.plan.axes != self.prepared.plan.axes:
                 raise Refusal(f"{', '.join(fixed_parts) or 'axes'}: changed in the file; restart the service")
             if old.owners != new.owners:
