@@ -29,12 +29,12 @@ class Desk:
         axes = [SimpleNamespace(name="x", adapt=adapts), SimpleNamespace(name="y", adapt=None)]
         self.service: Any = SimpleNamespace(state=State.RUNNING, configuration=SimpleNamespace(axes=axes))
         self.ran: list[list[str]] = []
-        self._answer = subprocess.CompletedProcess([], code, json.dumps(answer), stderr)
+        self.answer = subprocess.CompletedProcess([], code, json.dumps(answer), stderr)
         self.schedule = RetuneSchedule(self.service, Path("/run/lab.sock"), self._run)
 
     def _run(self, command: Any) -> subprocess.CompletedProcess[str]:
         self.ran.append(list(command))
-        return self._answer
+        return self.answer
 
     def looks(self, *times_s: float) -> int:
         """How often it was retuned so far."""
@@ -79,3 +79,10 @@ def test_the_journal_has_what_was_done_and_what_was_refused(caplog: pytest.LogCa
         ("INFO", f"axis x keeps its taps: {resonance}; new taps would be no better"),
         ("WARNING", f"axis x is not retuned: {refusal}"),
     ]
+
+
+def test_a_command_that_was_killed_while_it_printed_does_not_end_the_schedule(caplog: pytest.LogCaptureFixture):
+    desk = Desk(-9)
+    desk.answer.stdout = desk.answer.stdout[:20]
+    assert desk.looks(0.0, 60.0, 120.0) == 2
+    assert [record.getMessage().startswith("axis x is not retuned: ") for record in caplog.records] == [True, True]

@@ -89,10 +89,10 @@ class RetuneSchedule:
             command += [f"--{name.replace('_', '-')}", repr(getattr(options, name))]
         try:
             process = self._run(command)
-        except (OSError, subprocess.TimeoutExpired) as error:
+            report = json.loads(process.stdout or "{}")
+        except (OSError, ValueError, subprocess.TimeoutExpired) as error:  # ValueError: it was killed while it printed.
             log.warning("axis %s is not retuned: %s", axis, error)
             return
-        report = json.loads(process.stdout or "{}")
         if "better" in report:
             log.info("axis %s %s", axis, _outcome_text(report))
         else:
