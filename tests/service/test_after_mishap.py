@@ -13,11 +13,12 @@ import numpy as np
 import pytest
 
 from rtloop.configuration.recording import RecordingOptions
+from rtloop.configuration.schedule import ScheduleOptions
 from rtloop.engine.memory import ProcessState, SharedBlock, Sizes, Word
-from rtloop.errors import LoopFault, OutputError
+from rtloop.errors import LoopFault, OutputError, UnavailableError
 from rtloop.recording.capture.requester_names import RequesterNames
 from rtloop.service import service as service_module
-from rtloop.service.service import Service
+from rtloop.service.service import Service, State
 from rtloop.service.status import status
 from rtloop.supervision import parking, recorder_keeper
 from rtloop.supervision.recorder_keeper import RecorderKeeper
@@ -220,6 +221,22 @@ def test_the_loop_after_one_that_died_begins_with_its_outputs_off(monkeypatch):
     with pytest.raises(LoopFault, match="the loop ended too often"):
         service.run()
     assert resting == [service.configuration.service.arm, True, True]
+
+
+def test_a_schedule_does_not_drive_the_outputs_after_a_start_that_failed(monkeypatch):
+    service, resting = dying_loops(monkeypatch, after_s=1.0, loops=2)
+    service.configuration = replace(service.configuration, schedule=[ScheduleOptions(at_tick=5, mode="off")])
+    episode = service._run_loop
+
+    def start(at_rest: bool) -> Any:
+        result = episode(at_rest)
+        if len(resting) == 1:
+            raise UnavailableError("no board")
+        return result
+
+    monkeypatch.setattr(service, "_run_loop", start)
+    service.run()
+    assert (resting, service.state) == ([False, True], State.TRIPPED)
 
 
 def test_a_status_without_a_tick_says_why_it_has_no_axes(monkeypatch):
