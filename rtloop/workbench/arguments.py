@@ -110,7 +110,7 @@ def require_count(value: Any, argument: str, least: int, largest: int | None = N
 def require_numbers(value: Any, argument: str) -> list[float]:
     """Return finite numbers as a list of floats; [] for none. Raises RtloopError, naming `argument`, for others."""
     try:
-        numbers = [float(number) for number in value]
+        numbers = [math.nan] if isinstance(value, str | bytes) else [float(number) for number in value]
     except (TypeError, ValueError):
         numbers = [math.nan]
     if not all(map(math.isfinite, numbers)):

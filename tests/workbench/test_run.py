@@ -182,6 +182,7 @@ def test_a_check_judges_each_axis_as_the_command_does(command):
         (lambda: rtloop.identify("a.mcap", operators=65), r"identify: operators: value is 65; allowed: .* 1 to 64"),
         (lambda: rtloop.identify("a.mcap", weights="none"), r"identify: weights: value is 'none'; allowed"),
         (lambda: rtloop.identify("a.mcap", thresholds=["a"]), r"identify: thresholds: value is"),
+        (lambda: rtloop.identify("a.mcap", thresholds="123"), r"identify: thresholds: value is '123'; allowed: a list"),
         (lambda: rtloop.identify([], "dynamics"), r"identify: recordings: value is \[\]"),
         (lambda: rtloop.identify("a.mcap", "dynamics", delay=17), r"identify: delay: value is 17; allowed"),
         (lambda: rtloop.identify("a.mcap", "dynamics", outside=3), r"identify: outside: value is 3"),
