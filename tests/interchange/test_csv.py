@@ -102,6 +102,7 @@ def test_dates_are_times(tmp_path: Path):
             "line 203 has 2 columns; allowed: 3, as in the first line",
         ),
         ("2024-03-01 23:59:59,1\n" * 200 + "yesterday,1\n", "line 201 has no date"),
+        ("2024-03-01 23:59:59,1\n" * ROWS_AT_ONCE + ",1\n", f"line {ROWS_AT_ONCE + 1} has no date"),
         ("t,u\n" + "0,1\n" * 100 + "\0" * 100, "neither text nor another known kind"),
     ],
 )

@@ -182,13 +182,13 @@ def _column_numbers(path: Path, dialect: CsvDialect, values: Any) -> np.ndarray[
 
 
 def _dates_ns(path: Path, dialect: CsvDialect, values: Any) -> np.ndarray[Any, Any]:
-    """Return the dates of a column, a series of texts, as ns since 1970, int64.
+    """Return the dates of a column, a series of texts or, without any, of NaN, as ns since 1970, int64.
 
     Raises UnreadableData at the first field without a date.
     """
     import pandas
 
-    dates = pandas.to_datetime(values.str.replace(",", "."), format="ISO8601", utc=True, errors="coerce")
+    dates = pandas.to_datetime(values.astype(str).str.replace(",", "."), format="ISO8601", utc=True, errors="coerce")
     if dates.isna().any():
         row = int(values.index[int(np.argmax(dates.isna()))])
         raise UnreadableData(
