@@ -9,9 +9,11 @@ import numpy as np
 import pytest
 from scipy.io import loadmat, savemat
 
+from rtloop.design.identification import axis_recording
 from rtloop.interchange.isolated_reader import read_table
 from rtloop.interchange.reading import read_in_process
 from rtloop.interchange.sampling import grows_evenly
+from rtloop.recording.errors import RecordingError
 from rtloop.recording.load import load
 from tests.asked import answer, run
 from tests.interchange.controldesk import read_v5, write_controldesk
@@ -99,6 +101,21 @@ def test_a_response_of_an_unknown_loop_is_refused(scan: Path):
     result = run("identify", "response", "scan.mcap")
     assert result.exit_code == 1
     assert "an imported recording does not say which loop was closed" in result.stderr
+
+
+@pytest.mark.parametrize("axis", [(), ("--axis", "x")])
+def test_an_identification_from_a_recording_without_axes_says_how_to_import_it(axis: tuple[str, ...], scan: Path):
+    run("import", scan, "--all")
+    result = run("identify", "hysteresis", "scan.mcap", *axis)
+    assert result.exit_code == 66
+    assert "scan.mcap: the recording has no axis; import drive and position again" in result.stderr
+
+
+def test_a_recording_that_vanishes_during_an_identification_is_one_message(scan: Path, monkeypatch: pytest.MonkeyPatch):
+    run("import", scan, "--map", "x_drive_v=drive_mV", "--map", "x_position_um=pos_nm")
+    monkeypatch.setattr(axis_recording, "require_usable", lambda *_: Path("scan.mcap").unlink())
+    with pytest.raises(RecordingError, match=r"scan\.mcap: No such file"):
+        axis_recording.read_axis_recording(Path("scan.mcap"))
 
 
 def test_all_columns_under_their_own_names(scan: Path):

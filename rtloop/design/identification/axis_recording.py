@@ -288,23 +288,34 @@ def trip_remedy(causes: Sequence[str]) -> str:
 
 
 def select_axis(recording: Recording, axis: str | None, path: Path) -> str:
-    """Return `axis`, or the only axis for None. Raises RecordingError if `axis` is unknown, or None without exactly one
-    axis.
+    """Return `axis`, or the only axis for None. Raises RecordingError if `axis` is unknown, or None with several
+    axes, and for a recording without axes, as an import may be.
     """
     axes = recording.header.get("axes", [])
+    if not axes:
+        raise RecordingError(
+            f"{path}: the recording has no axis; import drive and position again, as in "
+            "--map 'x_drive_v=COLUMN [V]' --map 'x_position_um=COLUMN [µm]'"
+        )
     if axis is None and len(axes) == 1:
         return str(axes[0])
     if axis is None or axis not in axes:
         complaint = "several axes" if axis is None else f"no axis {axis!r}"
-        raise RecordingError(f"{path}: {complaint}; select one of {', '.join(axes) or 'none'} with --axis NAME")
+        raise RecordingError(f"{path}: {complaint}; select one of {', '.join(axes)} with --axis NAME")
     return axis
 
 
 def _digest(paths: tuple[Path, ...]) -> str:
-    """Return the SHA-256 of the files' contents one after the other, in hex. Raises OSError for an unreadable file."""
+    """Return the SHA-256 of the files' contents one after the other, in hex.
+
+    Raises RecordingError for a file that cannot be read.
+    """
     digest = hashlib.sha256()
     for path in paths:
-        with os.fdopen(open_user_file(path), "rb") as file:
-            for block in iter(lambda: file.read(1 << 20), b""):
-                digest.update(block)
+        try:
+            with os.fdopen(open_user_file(path), "rb") as file:
+                for block in iter(lambda: file.read(1 << 20), b""):
+                    digest.update(block)
+        except OSError as error:
+            raise RecordingError(f"{path}: {error.strerror or error}") from None
     return digest.hexdigest()
