@@ -212,9 +212,8 @@ def _record_all(
 ) -> tuple[list[Path], list[str]]:
     """Record run after run until one fails or the user interrupts. Returns recordings and problems, one sentence each.
 
-    A run that is planned from the recording of a finished one follows it at once. An error of a run is raised if no
-    run is recorded yet, else it becomes a problem. The errors of planning such a run, as of a full disk, are
-    raised.
+    A run that is planned from the recording of a finished one follows it at once. An error of a run, or of planning
+    such a run, is raised if no run is recorded yet, else it becomes a problem.
     """
     from rtloop.drivers.errors import DriverError
 
@@ -226,18 +225,18 @@ def _record_all(
             planned = queue.pop(0)
             try:
                 result = _record(planned, folder, paced, interruption, progress)
+                paths += result.recordings
+                if result.error:
+                    problems.append(f"{planned.label}: {result.error}")
+                    break
+                if planned.plan_next and (next_run := planned.plan_next(paths)):
+                    progress.add_run(next_run.run.timeline.ticks)
+                    queue.insert(0, next_run)
             except (RtloopError, DriverError) as error:
                 if not paths:
                     raise
                 problems.append(f"{planned.label}: {error}")
                 break
-            paths += result.recordings
-            if result.error:
-                problems.append(f"{planned.label}: {result.error}")
-                break
-            if planned.plan_next and (next_run := planned.plan_next(paths)):
-                progress.add_run(next_run.run.timeline.ticks)
-                queue.insert(0, next_run)
     return paths, problems
 
 

@@ -68,6 +68,19 @@ def test_a_loop_that_may_be_unstable_learns_nothing(tmp_path):
     assert not list(tmp_path.glob("*.mcap"))
 
 
+def test_a_table_that_cannot_be_written_leaves_the_report_of_the_recorded_runs(made, tmp_path: Path):
+    """Of the next cycle: a folder has its name."""
+    config = made[0] / "slow.toml"
+    (tmp_path / "slow" / "scan-1-50Hz.npy").mkdir(parents=True)
+    ran = run(config, tmp_path, "frequencies_hz=[50.0]", "cycles=1", "amplitude_um=10.0", "resonance_percent=5.0")
+    assert ran.exit_code == 1
+    assert "scan-1-50Hz.npy: Is a directory" in ran.stderr
+    (recording,) = tmp_path.rglob("*.mcap")
+    (section,) = json.loads(ran.stdout)["experiments"]
+    assert section["recordings"] == [recording.name]
+    assert recording.name in (tmp_path / "report.html").read_text(encoding="utf-8")
+
+
 def test_a_frequency_that_the_ticks_do_not_divide(tmp_path):
     ran = run(PAPER, tmp_path, "frequencies_hz=[30.0]")
     assert ran.exit_code == 78
