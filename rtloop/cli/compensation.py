@@ -8,7 +8,7 @@ from typing import Any
 import click
 
 from rtloop.cli.exit_codes import report_errors
-from rtloop.cli.identify import AXIS, PLOT
+from rtloop.cli.identify import PLOT
 from rtloop.cli.options import CONFIG, JSON, OUTPUT
 from rtloop.cli.output import print_result, print_warnings
 from rtloop.errors import ConfigError
@@ -27,7 +27,7 @@ RANDOM_COMMANDS = 20_000
     required=True,
     help="File with the actuator's [axis.feedforward], from another recording than CONFIG's inverse.",
 )
-@AXIS
+@click.option("--axis", help="Name of the axis [the first one].")
 @click.option(
     "--command-um",
     type=click.FloatRange(0, min_open=True),

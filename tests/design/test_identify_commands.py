@@ -209,6 +209,16 @@ def test_an_inverse_leaves_only_the_dead_band_of_its_own_model(tmp_path: Path) -
         assert ("warning: the actuator equals the model" in command(*words).stderr) == is_same
 
 
+def test_of_several_axes_the_compensation_is_that_of_the_first_as_its_help_says(tmp_path: Path) -> None:
+    two = tmp_path / "two.toml"
+    axis = '[[axis]]\nname = "{}"\n[axis.feedforward]\nthresholds_v = [0.0]\nweights_um_per_v = [{}]\n'
+    two.write_text(axis.format("x", 2.0) + axis.format("y", 3.0))
+    words = ("design", "compensation", DEPLOY / "two-axis.toml", "--actuator", two)
+    weights = [report(*words, *option)["weights"] for option in ((), ("--axis", "x"), ("--axis", "y"))]
+    assert weights[0] == weights[1] != weights[2]
+    assert "[the first one]" in command("design", "compensation", "--help").stdout
+
+
 @pytest.mark.parametrize(
     "words",
     [
