@@ -35,8 +35,6 @@ from rtloop.linear.realisation import System
 from rtloop.linear.sampled import SampledController
 from rtloop.linear.transfer import Transfer
 
-GRID_HZ = np.geomspace(0.1, 1.0, 400, endpoint=False)
-
 
 class LinearModel:
     """Plant and loop of an axis with a model.
@@ -167,9 +165,9 @@ class LinearModel:
 
     @cached_property
     def open_peak(self) -> float:
-        """Largest magnitude of the plant's response over its static gain, from 0.1 Hz to half the rate or 10 kHz."""
-        resonances_hz = [self.resonance_hz] if self.resonance_hz else []
-        hz = np.concatenate([*(GRID_HZ * 10.0**decade for decade in range(5)), resonances_hz])
+        """Largest magnitude of the plant's response over its static gain, from 0.1 Hz to half the rate."""
+        resonances_hz = np.abs(self.dynamics.poles[self.dynamics.poles.imag > 0]) / (2 * np.pi)
+        hz = np.concatenate([np.geomspace(0.1, self.rate_hz / 2, 3000), resonances_hz])
         return float(np.abs(self.plant(hz[hz < self.rate_hz / 2])).max() / abs(self.static_gain))
 
     @cached_property

@@ -98,6 +98,18 @@ def test_resonance_and_peaks(model: LinearModel) -> None:
         assert bool(np.abs(np.roots(closed)).max() < 1) is bool(shift > -tolerated.down)
 
 
+@pytest.mark.parametrize(("hz", "zeta"), [(15_000.0, 0.02), (1_234.5, 0.0005)])
+def test_the_peak_of_a_plant_of_two_modes(hz: float, zeta: float) -> None:
+    """The upper one above 10 kHz, or with a narrow peak; against scipy's response of the held plant, densely."""
+    rate_hz, omega = 50_000.0, 2 * np.pi * hz
+    first, second = np.array([1.0, 1.8 * zeta * OMEGA, OMEGA**2]), np.array([1.0, 2 * zeta * omega, omega**2])
+    numerator, denominator = np.polyadd(0.2 * OMEGA**2 * second, 0.8 * omega**2 * first), np.polymul(first, second)
+    model = ModelOptions(form="transfer_function", numerator=tuple(numerator), denominator=tuple(denominator))
+    b, a, _ = signal.cont2discrete((numerator, denominator), 1 / rate_hz, "zoh")
+    _, response = signal.freqz(b.ravel(), a, np.linspace(0.9, 1.1, 20_001) * hz, fs=rate_hz)
+    assert LinearModel(AXIS, model, rate_hz).open_peak == pytest.approx(np.abs(response).max(), rel=0.01)
+
+
 def test_a_harmonic_response_is_promised(model: LinearModel) -> None:
     measured = np.array([0.1, 1.0, 10.0, 250.0, 299.0, 300.0, 1000.0])
     promised = HarmonicPromise(model, measured, RATE_HZ)
