@@ -42,7 +42,8 @@ def export(
 ) -> dict[str, Any]:
     """Write the selected signals and ticks of a recording in format `to`, a key of EXPORT_SUFFIXES.
 
-    `progress` receives the number of ticks so far. `output` is by default beside the recording. Returns {recording,
+    `progress` receives the number of ticks so far; of npz, whose columns are written one after the other, the number of
+    all ticks times the share of the columns so far. `output` is by default beside the recording. Returns {recording,
     output, ticks, bytes, problems}; the problems are damaged parts of the recording, which are left out. Raises
     RecordingError for another format, an unreadable recording, a pattern that fits no signal, a limited time span
     without ticks and a MAT file above 2 GiB; OutputError if the output exists or cannot be written; MissingExtra if the
