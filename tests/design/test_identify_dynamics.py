@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import mpmath
 import numpy as np
 import pytest
+from scipy.optimize import least_squares
 
 from rtloop.design.identification.axis_recording import UnsuitableData
 from rtloop.design.identification.dynamics.identify_dynamics import identify_dynamics
 from rtloop.design.identification.dynamics.innovations import Innovations
 from rtloop.design.identification.dynamics.inverse_hold import continuous_modal
+from rtloop.design.identification.dynamics.markov import fit_residues
 from rtloop.design.identification.dynamics.prediction_error import Excitation, excited_order
 from rtloop.design.identification.dynamics.residuals import residual_tests
 from rtloop.design.identification.frequency_response import compare_responses, estimate_response
@@ -103,6 +107,22 @@ def test_sensitivities_are_the_derivatives_of_the_errors() -> None:
             PAIR_AND_REAL.unpack(values + s * h * np.eye(values.size)[i], noise=True).errors(u, y) for s in (1, -1)
         ]
         assert np.allclose((sides[0] - sides[1]) / (2 * h), row, rtol=1e-5, atol=1e-6 * np.abs(row).max())
+
+
+def test_residues_are_fitted_under_the_noise_model() -> None:
+    """A start of other residues; against scipy's search for the least squared errors, which differentiates these."""
+    random = np.random.default_rng(3)
+    u, noise = random.normal(size=400), 0.01 * random.normal(size=400)
+    y = PAIR_AND_REAL.simulate_output(u) + noise
+
+    def model(values: np.ndarray) -> Innovations:
+        residues = np.array([values[0] + 1j * values[1], values[2]])
+        return dataclasses.replace(PAIR_AND_REAL, residues=residues, offset=float(values[3]))
+
+    best = least_squares(lambda values: model(values).errors(u, y), np.zeros(4), jac="3-point", xtol=1e-14)
+    fitted = fit_residues(model(np.zeros(4)), u, y)
+    assert np.allclose(fitted.residues, model(best.x).residues, atol=1e-8)
+    assert fitted.offset == pytest.approx(best.x[3], abs=1e-8)
 
 
 def test_errors_are_those_of_the_armax_polynomials() -> None:

@@ -91,11 +91,12 @@ class ModeGuesses:
 
 
 def fit_residues(model: Innovations, u: Real, y: Real) -> Innovations:
-    """Return the model with the residues and offset that fit `y` to `u`, each (samples,), by least squares.
+    """Return the model with the residues and offset of least squared prediction errors for input `u` and output `y`.
 
-    Rates and noise gains stay; the fit is right only for noise gains of 0.
+    Both are (samples,). Rates and noise gains stay.
     """
     rows = -model.sensitivities(u, np.zeros_like(u), noise=False)
+    whitened = model.whiten(y, model.predictor_poles())
     values, solved = model.pack(noise=False), []
     i = 0
     for rate in model.rates:
@@ -104,5 +105,5 @@ def fit_residues(model: Innovations, u: Real, y: Real) -> Innovations:
         i += 2 * width
     solved.append(values.size - 1)
     scale = np.sqrt((rows[solved] ** 2).mean(axis=1)) + 1e-300
-    values[solved] = np.linalg.lstsq((rows[solved] / scale[:, None]).T, y, rcond=None)[0] / scale
+    values[solved] = np.linalg.lstsq((rows[solved] / scale[:, None]).T, whitened, rcond=None)[0] / scale
     return model.unpack(values, noise=False)
