@@ -69,7 +69,10 @@ class Frame:
         return [number * scale + offset for number, (scale, offset, _, _) in zip(raw, self._scales, strict=True)]
 
     def message(self, options: BusOptions, values: Sequence[float]) -> can.Message:
-        """Return python-can's message of `values` (see `pack`); CAN FD switches the bitrate if the options say so."""
+        """Return python-can's message of `values`, CAN FD or classic as this frame is in the DBC; raises as `pack`.
+
+        The options say only whether a CAN FD message switches the bitrate.
+        """
         return can.Message(
             arbitration_id=self.identifier,
             data=self.pack(values),

@@ -100,7 +100,10 @@ def _frequencies(transfer: Transfer, limit_hz: float) -> Real:
 
 
 def _light_pairs(roots: Complex) -> list[complex]:
-    """Return the root with positive imaginary part of each pair with a damping ratio below LIGHT_DAMPING."""
+    """Return the root with positive imaginary part of each pair with a |damping ratio| below LIGHT_DAMPING, in order.
+
+    A pair to the right of the imaginary axis counts like its mirror image to the left.
+    """
     return [complex(root) for root in roots if root.imag > 0 and abs(root.real) < LIGHT_DAMPING * abs(root)]
 
 

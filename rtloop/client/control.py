@@ -35,7 +35,9 @@ class _UnixConnection(http.client.HTTPConnection):
         self._path = path
 
     def connect(self) -> None:
-        """Connect to the UNIX socket; raises as `_open_connection`."""
+        """Connect to the UNIX socket. Raises OSError if no process listens or the system refuses, HostRefusal for a
+        server or folder that is not trusted.
+        """
         self.sock = _open_connection(self._path)
         self.sock.settimeout(self.timeout)
 

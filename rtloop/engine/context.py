@@ -138,7 +138,7 @@ def tick_ring(loop):
 
 @jit
 def event_ring(loop):
-    """Return the ring of events, MESSAGE records."""
+    """Return the Ring of events: views of its head, its marks and its slots, which are MESSAGE records."""
     return Ring(
         carray(address_pointer(loop.events_head), 1, np.uint64),
         carray(address_pointer(loop.events_marks), loop.events_capacity, np.uint64),

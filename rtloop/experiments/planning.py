@@ -155,13 +155,15 @@ def _plan_experiment(
         end.
 
         Runs of other experiments, and of the other configuration of a comparison, are ignored. Raises RecordingError
-        for an unreadable file and for a recording that was not made by an experiment, UnsuitableLoop as the
-        experiment's `next_run`, OutputError for a table that cannot be written, ConfigError for an invalid
-        configuration of the run.
+        for an unreadable file and for a recording that was not made by an experiment, UnsuitableData for a run that
+        tripped, was clipped or is not whole, UnsuitableLoop as the experiment's `next_run`, OutputError for a table
+        that cannot be written, ConfigError for an invalid configuration of the run.
         """
         recorded_runs = [
             run for run in load_runs(paths) if (run.experiment, run.is_comparison) == (experiment.name, is_comparison)
         ]
+        for recorded in recorded_runs:
+            recorded.require_complete()
         run = experiment.next_run(recorded_runs, options, setting) if experiment.next_run else None
         return None if run is None else plan_run(run, True)
 

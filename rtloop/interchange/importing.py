@@ -283,9 +283,10 @@ def _make_header(path: Path, signals: ImportedSignals, time_base: TimeBase, is_p
 def _write_recording(
     output: Path, header: dict[str, Any], signals: ImportedSignals, rate_hz: float, progress: ReportTicks
 ) -> None:
-    """Write all rows and the final event to the file `output`; `progress` receives the ticks so far.
+    """Write all rows and the final event to the new file `output`; `progress` receives the ticks so far.
 
-    Raises OutputError; an incomplete file is removed after any error.
+    Raises OutputError, also if the file exists, finished or unfinished, which then stays. The incomplete new file is
+    removed after any error.
     """
     columns = [*signals.columns.values()]
     ticks, deadlines = columns[0], columns[1]

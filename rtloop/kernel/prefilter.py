@@ -76,10 +76,10 @@ def _fill_memory(coefficients, state, value):
 
 @jit
 def filter_reference(coefficients, state, value):
-    """Advance the pre-filter by the reference `value`; return target and addition to the command, in µm.
+    """Advance the pre-filter by the reference `value`, in µm. Returns (target, addition to the command), in µm.
 
-    After `refill_prefilter`, the reference first fills the memory. The sections are second-order, in transposed direct
-    form II.
+    The taps make both, the sections filter the target alone; without taps the addition is 0. After `refill_prefilter`,
+    the reference first fills the memory. The sections are second-order, in transposed direct form II.
     """
     if state.tap_index < 0:
         _fill_memory(coefficients, state, value)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -79,6 +80,22 @@ def test_a_table_that_cannot_be_written_leaves_the_report_of_the_recorded_runs(m
     (section,) = json.loads(ran.stdout)["experiments"]
     assert section["recordings"] == [recording.name]
     assert recording.name in (tmp_path / "report.html").read_text(encoding="utf-8")
+
+
+def test_a_cycle_in_which_the_loop_trips_is_the_last(made, tmp_path: Path):
+    """The integrator is slow, and its error trips the loop."""
+    config, text = tmp_path / "slow.toml", (made[0] / "slow.toml").read_text()
+    limits = ("tracking_error_um = 10.0", "tracking_error_um = 3.0"), ("tracking_ticks = 500", "tracking_ticks = 50")
+    for old, new in limits:
+        assert text.count(old) == 1
+        text = text.replace(old, new)
+    config.write_text(text)
+    ran = run(config, tmp_path, "frequencies_hz=[50.0]", "cycles=1", "amplitude_um=10.0", "resonance_percent=5.0")
+    assert ran.exit_code == 1
+    assert re.search(r"the loop tripped at tick \d+ \(tracking\)", ran.stderr)
+    (recording,) = tmp_path.rglob("*.mcap")
+    (section,) = json.loads(ran.stdout)["experiments"]
+    assert section["recordings"] == [recording.name]
 
 
 def test_a_frequency_that_the_ticks_do_not_divide(tmp_path):

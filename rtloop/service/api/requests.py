@@ -190,9 +190,9 @@ def _command_origin(service: Service, query: IdentityQuery) -> dict[str, str | N
 
 
 def _take_lock(service: Service, body: LockBody) -> dict[str, Any] | None:
-    """Take the lock, from its holder with the emergency key. Returns the lock holder as in `Lock.holder`.
+    """Take the lock for the current requester, or renew it; with the body's emergency key also from another holder.
 
-    Raises Refusal as `Lock.take`, with a key as `Lock.break_open`.
+    Returns the lock holder as in `Lock.holder`. Raises Refusal as `Lock.take`, with a key as `Lock.break_open`.
     """
     name = current_requester().name
     if body.emergency_key is None:

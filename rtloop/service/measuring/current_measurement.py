@@ -25,7 +25,11 @@ class CurrentMeasurement:
         self._progress: Progress | None = None
 
     def for_json(self) -> dict[str, Any] | None:
-        """Return the progress as {activity, axis, rms_um, cycles}; None without a measurement."""
+        """Return the progress as {activity, axis, rms_um, cycles}; None without a measurement.
+
+        Of a learning, `rms_um` has the rms error of each finished cycle, in µm, and `cycles` is the number of cycles
+        that it will have; otherwise they are () and None.
+        """
         progress = self._progress
         return None if progress is None else progress._asdict()
 

@@ -283,7 +283,10 @@ class Recovery:
             return self._accept(fault)
 
     def _accept(self, fault: str) -> bool:
-        """Count a failure, and store `fault`, so that the return removes it from the service's faults. Returns True."""
+        """Count a loop that ended or could not start, and store `fault`, the text that the service latches for it.
+
+        The return will remove `fault` from the service's faults. Returns True.
+        """
         self._own_faults.add(fault)
         self._failures += 1
         return True

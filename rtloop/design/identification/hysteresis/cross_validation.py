@@ -74,8 +74,10 @@ def piece_numbers(recording: Equations) -> npt.NDArray[np.intp]:
 
 
 def _errors_by_piece(recordings: Sequence[Equations], limits: Limits) -> list[Real]:
-    """Return errors in µm (blocks, 2) of every recording, each piece judged by a fit without it; NaN where memory is
-    unknown.
+    """Return errors in µm (blocks, 2) of every recording, each piece judged by a fit without it and its fold.
+
+    Column 0: the whole model; column 1: the plays alone, less their mean over each stretch of known memory. NaN where
+    memory is unknown.
     """
     errors_um = [np.full((recording.is_known.size, 2), np.nan) for recording in recordings]
     folds = [np.where(recording.is_known, piece_numbers(recording) % FOLDS, -1) for recording in recordings]
