@@ -211,10 +211,10 @@ def _check_search(runner: CaseRunner, figure: str) -> None:
 def _height(case: CaseResult, figure: str) -> float:
     """Return the value that a search maximises: the case's `figure`, or its ratio if `figure` is empty.
 
-    It is TRIP_RATIO where that value is not finite, as the ratio of a rig that tripped, and 0 for a refused rig, which
-    never ran.
+    It is TRIP_RATIO for a rig that tripped, whatever the figure, and where the value is not finite; 0 for a refused
+    rig, which never ran.
     """
     if case.refusal:
         return 0.0
     height = case.figures[figure] if figure else case.ratio
-    return height if math.isfinite(height) else TRIP_RATIO
+    return height if math.isfinite(height) and not any(case.trips.values()) else TRIP_RATIO

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -63,6 +64,23 @@ def test_the_search_tries_about_as_many_rigs_as_allowed(runner):
     result = find_worst(runner, run_planted, 200)
     assert 168 <= result.rigs <= 232
     assert result.worst.figures["steps.settling_ms"] == result.figure
+
+
+def test_a_rig_that_tripped_is_the_worst_whatever_the_figure(runner):
+    """It trips early, and its figure is small."""
+
+    def evaluate(rigs):
+        cases = run_planted(rigs)
+        tripped = {case.rig for case in cases if case.values[SHIFT] > 0.04}
+        return [
+            replace(case, figures={"steps.settling_ms": 0.0}, trips={"steps": "tracking"}, ratio=math.inf)
+            if case.rig in tripped
+            else case
+            for case in cases
+        ]
+
+    result = find_worst(runner, evaluate, 200, "steps.settling_ms")
+    assert (result.worst.trips, result.figure) == ({"steps": "tracking"}, math.inf)
 
 
 def test_the_boundary_is_where_the_verdict_changes(runner):

@@ -177,6 +177,14 @@ def test_a_full_temporary_folder_is_an_error_with_the_remedy(run: Run, path: Pat
         load(write(path, run.messages))
 
 
+def test_a_temporary_folder_that_does_not_exist_is_an_error_with_the_remedy(
+    run: Run, path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr(tempfile, "tempdir", str(path.with_name("absent")))
+    with pytest.raises(RecordingError, match=r"rewritten\.mcap: no room to convert the file .*set TMPDIR to another"):
+        load(write(path, run.messages))
+
+
 def test_a_copy_that_is_damaged_on_the_way_is_an_error_with_a_sentence(
     run: Run, path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):

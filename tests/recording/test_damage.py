@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import os
 import struct
 from collections.abc import Callable
 from pathlib import Path
@@ -192,6 +194,32 @@ def test_an_invalid_file_gets_one_clear_message(case: str, path: Path):
             use(path)
         text = str(caught.value)
         assert (caught.value.exit_code, str(path) in text, "\n" in text) == (66, True, False)
+
+
+def test_a_file_that_is_refused_is_closed(tmp_path: Path):
+    before = len(os.listdir("/proc/self/fd"))
+    for _ in range(3):
+        with pytest.raises(RecordingError, match="Is a directory"):
+            Reader(tmp_path)
+    assert len(os.listdir("/proc/self/fd")) == before
+
+
+def test_a_chunk_that_cannot_be_dropped_stays(path: Path, monkeypatch: pytest.MonkeyPatch):
+    writer = Writer(path, make_header(), 1)
+    writer.write_ticks(ROWS)
+    chunks, size = len(writer.file), writer.file.size
+    monkeypatch.setattr(os, "ftruncate", refuse_to_truncate)
+    with pytest.raises(OutputError, match="Input/output error"):
+        writer.file.drop_last_chunk()
+    monkeypatch.undo()
+    assert (len(writer.file), writer.file.size) == (chunks, size)
+    writer.finish(lambda logged: final_message(COUNT, logged))
+    with Reader(path) as reader:
+        assert reader.totals["ticks_logged"] == COUNT
+
+
+def refuse_to_truncate(*_: object) -> None:
+    raise OSError(errno.EIO, os.strerror(errno.EIO))
 
 
 def test_the_message_about_a_missing_file_names_its_unfinished_file(finished: bytes, path: Path):

@@ -235,3 +235,10 @@ def test_bands_keep_every_peak(tmp_path: Path):
     assert band.time_s[band.high.argmax()] == pytest.approx(1.2345, abs=0.01)
     short_band = read_bands(recording, ["x_error_um"], 1.2, 1.3, points=5_000)["x_error_um"]
     assert np.array_equal(short_band.low, short_band.high)
+
+
+@pytest.mark.parametrize("every", [0, -2])
+def test_every_nth_tick_is_a_number_from_one_on(path: Path, every: int):
+    for read in (load(path).to_pandas, load(path).to_xarray):
+        with pytest.raises(RecordingError, match=f"^every: {every}; allowed: a whole number of ticks, 1 or more"):
+            read(every=every)

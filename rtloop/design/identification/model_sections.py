@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
@@ -205,7 +206,7 @@ def require_new(path: Path | None) -> None:
 def write_new_file(path: Path, content: str) -> None:
     """Write a text file under a temporary name and rename it to `path`, so that it is there in full or not at all.
 
-    Raises OutputError if `path` exists, with nothing written, or cannot be written: a temporary file may then remain.
+    Raises OutputError if `path` exists, with nothing written, or cannot be written.
     """
     part = path.with_name(f"{path.name}.{os.getpid()}.part")
     try:
@@ -214,4 +215,6 @@ def write_new_file(path: Path, content: str) -> None:
             file.write(content)
         os.replace(part, path)
     except OSError as error:
+        with suppress(OSError):
+            os.unlink(part)
         raise OutputError(f"{path}: {error.strerror or error}") from None

@@ -13,6 +13,7 @@ import os
 import tempfile
 import threading
 from collections import Counter
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
@@ -64,24 +65,34 @@ def _copy(source: McapSource) -> int:
 
     Raises RecordingError if the file holds no recording or several, is damaged, or if there is no room for the copy.
     """
-    with tempfile.TemporaryDirectory(prefix="rtloop-") as folder:
-        conversion = _Conversion(source.path, Path(folder) / "copy.mcap")
-        try:
-            for item in read_messages(source):
-                conversion.add(*item)
-            return open_own(conversion.finish())
-        except DamagedChunk as reason:
-            prefix = "" if conversion.has_begun else "the readable part is not a recording of rtloop: "
-            raise RecordingError(
-                f"{source.path}: {prefix}{reason}; `mcap recover` keeps the undamaged part of a file, `mcap sort` "
-                "sorts the messages"
-            ) from None
-        except (OutputError, OSError) as error:
-            raise RecordingError(
-                f"{source.path}: no room to convert the file ({error}); set TMPDIR to another folder"
-            ) from None
-        finally:
-            conversion.close()
+    try:
+        with (
+            tempfile.TemporaryDirectory(prefix="rtloop-") as folder,
+            closing(_Conversion(source.path, Path(folder) / "copy.mcap")) as conversion,
+        ):
+            return _convert(source, conversion)
+    except (OutputError, OSError) as error:
+        raise RecordingError(
+            f"{source.path}: no room to convert the file ({error}); set TMPDIR to another folder"
+        ) from None
+
+
+def _convert(source: McapSource, conversion: _Conversion) -> int:
+    """Add all messages of a file to its conversion; return the descriptor of the finished copy.
+
+    Raises RecordingError for a damaged file, and for one without a recording or with several; OutputError or OSError
+    for a copy that cannot be written or opened.
+    """
+    try:
+        for item in read_messages(source):
+            conversion.add(*item)
+        return open_own(conversion.finish())
+    except DamagedChunk as reason:
+        prefix = "" if conversion.has_begun else "the readable part is not a recording of rtloop: "
+        raise RecordingError(
+            f"{source.path}: {prefix}{reason}; `mcap recover` keeps the undamaged part of a file, `mcap sort` "
+            "sorts the messages"
+        ) from None
 
 
 class _Conversion:

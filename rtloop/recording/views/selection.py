@@ -29,6 +29,11 @@ class Selection:
     end_s: float = math.inf
     every: int = 1
 
+    def __post_init__(self) -> None:
+        """Raise RecordingError for an `every` below 1."""
+        if self.every < 1:
+            raise RecordingError(f"every: {self.every}; allowed: a whole number of ticks, 1 or more")
+
     def selected_names(self, recording: RecordedSignals) -> tuple[str, ...]:
         """Names of selected and required signals, in recorded order. Raises RecordingError if a pattern fits none."""
         if not self.signals:

@@ -143,11 +143,12 @@ class ChunkFile:
 
         Raises OutputError if the file cannot be cut; the chunk no longer counts then, and the next write overwrites it.
         """
-        chunk = self._chunks.pop()
-        _, _, self.size = index_record_span(chunk.record)
-        self._crc = chunk.crc_before
+        chunk = self._chunks[-1]
+        _, _, begin = index_record_span(chunk.record)
         with self._output_errors():
-            os.ftruncate(self._fd, self.size)
+            os.ftruncate(self._fd, begin)
+        self._chunks.pop()
+        self.size, self._crc = begin, chunk.crc_before
         return chunk.counts
 
     def write_end(self) -> None:

@@ -61,7 +61,7 @@ class McapSource:
 
     def __init__(self, path: Path, opener: Opener = open_user_file) -> None:
         """Open the file by `opener`. Raises RecordingError if it cannot be opened or is no MCAP file."""
-        self.path = path
+        self.path, self._fd = path, -1
         try:
             self._fd = opener(path)
             status = os.fstat(self._fd)
@@ -72,9 +72,10 @@ class McapSource:
         except FileNotFoundError:
             raise RecordingError(f"{path}: no such file{_file_name_hint(path)}") from None
         except OSError as error:
+            self.close()
             raise RecordingError(f"{path}: {error.strerror}") from None
         if magic != MAGIC:
-            close_descriptor(self._fd)
+            self.close()
             description = (
                 "an empty file" if not magic else "cut off in its first bytes" if MAGIC.startswith(magic) else ""
             )
@@ -93,8 +94,9 @@ class McapSource:
             raise RecordingError(f"{self.path}: {error.strerror}") from None
 
     def close(self) -> None:
-        """Close the descriptor of the file."""
-        close_descriptor(self._fd)
+        """Close the descriptor of the file, if it is open."""
+        if self._fd >= 0:
+            close_descriptor(self._fd)
 
 
 def _file_name_hint(path: Path) -> str:
