@@ -33,7 +33,9 @@ class DriverCalls:
         AssertionError if `pointers` has another ABI version, or if `read` or `write` is null; `wait` is not called.
         """
         assert pointers.abi_version == ABI_VERSION, f"ABI version {pointers.abi_version}; allowed: {ABI_VERSION}"
-        assert 0 not in (pointers.read, pointers.write), f"read or write is a null pointer: {pointers}"
+        assert 0 not in (pointers.read, pointers.write), (
+            f"addresses: read {pointers.read}, write {pointers.write}; allowed: addresses other than 0"
+        )
         self._pointers, self._facts = pointers, facts
         self._read, self._write = _FUNCTION(pointers.read), _FUNCTION(pointers.write)
 
@@ -45,16 +47,22 @@ class DriverCalls:
         count = len(self._facts.inputs) + 1 + len(self._facts.observed)
         values = (ctypes.c_double * (count + _GUARD))(*[_UNTOUCHED] * (count + _GUARD))
         status = self._read(self._pointers.context, values)
-        assert values[count:] == [_UNTOUCHED] * _GUARD, f"read wrote more than {count} values: inputs, age, observed"
+        assert values[count:] == [_UNTOUCHED] * _GUARD, (
+            f"read wrote more than its {count} values (inputs, age, observed signals)"
+        )
         is_incomplete = status >= 0 and _UNTOUCHED in values[:count]
-        assert not is_incomplete, f"read gave {values[:count]}; allowed: {count} values, none left out"
+        assert not is_incomplete, (
+            f"read left out at least one of its {count} values (inputs, age, observed signals): {values[:count]}"
+        )
         return status, values[:count]
 
     def write(self, volts: Sequence[float]) -> int:
         """Write `volts` to all outputs and return the status. AssertionError if `write` changes the loop's values."""
         buffer = (ctypes.c_double * len(volts))(*volts)
         status = self._write(self._pointers.context, buffer)
-        assert list(map(str, buffer)) == list(map(str, map(float, volts))), "write changed the loop's values"
+        assert list(map(str, buffer)) == list(map(str, map(float, volts))), (
+            "write changed the voltages that the loop handed over; it may only read them"
+        )
         return status
 
 
@@ -137,7 +145,9 @@ class DriverContract:
         try:
             pointers = driver.open()
             DriverCalls(pointers, driver.facts)
-            assert all(isinstance(address, int) for address in pointers), f"addresses are {pointers}; allowed: integers"
+            assert all(isinstance(address, int) for address in pointers), (
+                f"open returned the addresses {tuple(pointers)}; allowed: integers"
+            )
         finally:
             driver.close()
 
@@ -171,7 +181,7 @@ class DriverContract:
             for _ in range(3):
                 calls.write([channel.safe_v for channel in driver.facts.outputs])
                 status, values = calls.read()
-                assert status >= 0, f"read returned {status}{_error_suffix(driver)}"
+                assert status >= 0, f"read returned status {status}; allowed: 0 or more{_error_suffix(driver)}"
                 inputs = driver.facts.inputs
                 for channel, value in zip(inputs, values[: len(inputs)], strict=True):
                     inside = channel.minimum_v <= value <= channel.maximum_v
@@ -186,7 +196,9 @@ class DriverContract:
             for share in (0.0, 0.25, 0.5, 1.0):
                 volts = [_volts_at_share(channel, share) for channel in driver.facts.outputs]
                 status = calls.write(volts)
-                assert status >= 0, f"write({volts}) returned {status}{_error_suffix(driver)}"
+                assert status >= 0, (
+                    f"write({volts}) returned status {status}; allowed: 0 or more{_error_suffix(driver)}"
+                )
                 self._require_outputs(driver, volts, f"write({volts})")
 
     def test_nothing_outside_the_range_gets_through(self) -> None:
@@ -197,7 +209,7 @@ class DriverContract:
                 calls.write([(c.maximum_v if excess > 0 else c.minimum_v) + excess for c in channels])
                 for channel, volts in zip(channels, self.outputs(driver) or (), strict=False):
                     inside = channel.minimum_v - self.tolerance_v <= volts <= channel.maximum_v + self.tolerance_v
-                    assert inside, f"{channel}: {volts} V got through to the hardware"
+                    assert inside, f"{channel}: {volts} V, outside the range of the channel, reached the hardware"
 
     def test_not_a_number_moves_no_output(self) -> None:
         """A write of NaN leaves every output where it was, whatever status it returns."""
@@ -239,7 +251,7 @@ class DriverContract:
         if outputs_v is not None:
             deviation = max(abs(a - b) for a, b in zip(outputs_v, expected, strict=True))
             assert deviation <= self.tolerance_v, (
-                f"after {event} the outputs are {list(outputs_v)}; allowed: {list(expected)}"
+                f"after {event} the outputs are at {list(outputs_v)} V; allowed: {list(expected)} V"
             )
 
 

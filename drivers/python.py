@@ -72,8 +72,9 @@ class PythonDriver(Driver):
                 row = (*self.read(), self.sample_age_us, *self.observe())
                 if len(row) != value_count:
                     raise ValueError(
-                        f"driver {self.kind!r}: read and observe gave {len(row)} numbers, the age included; allowed: "
-                        f"{value_count}, one for each input and observed signal of its facts, and the age"
+                        f"driver {self.kind!r}: read and observe gave {len(row)} numbers, the sample's age included; "
+                        f"allowed: {value_count}, one for each input and observed signal of the driver's facts, and "
+                        "the age"
                     )
                 for i, value in enumerate(row):
                     values[i] = value

@@ -33,7 +33,9 @@ class BoucWenOptions(Options):
     def _check(self) -> Self:
         """Require |lean_per_v| ≤ decay_per_v; beyond, h would grow without bound."""
         if abs(self.lean_per_v) > self.decay_per_v:
-            raise ValueError(f"lean_per_v: {self.lean_per_v:g}; allowed: up to ±decay_per_v = ±{self.decay_per_v:g}")
+            raise ValueError(
+                f"lean_per_v: {self.lean_per_v:g}; allowed: -{self.decay_per_v:g} to {self.decay_per_v:g} (decay_per_v)"
+            )
         return self
 
 

@@ -32,7 +32,7 @@ class BusOptions(Options):
     def _check_rates(self) -> Self:
         """Require `data_bitrate` with `fd` only, and then at least `bitrate`."""
         if self.data_bitrate is not None and not self.fd:
-            raise ValueError(f"data_bitrate: {self.data_bitrate}; allowed only with fd = true")
+            raise ValueError(f"data_bitrate: {self.data_bitrate} bit/s; allowed with fd = true only")
         if self.data_bitrate is not None and self.data_bitrate < self.bitrate:
             raise ValueError(
                 f"data_bitrate: {self.data_bitrate} bit/s; allowed: at least bitrate = {self.bitrate} bit/s"

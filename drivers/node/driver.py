@@ -234,18 +234,18 @@ class NodeDriver(Driver):
                 lsb_v = abs(scale.volts_per_code)
                 if not lsb_v > 0 or abs(lowest_v - range_v[0]) > 2 * lsb_v or abs(highest_v - range_v[1]) > 2 * lsb_v:
                     raise DriverError(
-                        f"{options.label}: driver.{name} is {list(range_v)}; allowed: the node's range of channel {i}, "
-                        f"[{lowest_v:.6g}, {highest_v:.6g}]"
+                        f"{options.label}: driver.{name} is {list(range_v)} V; allowed: the range of the node's "
+                        f"channel {i}, [{lowest_v:.6g}, {highest_v:.6g}] V"
                     )
         for i, scale in enumerate(welcome.outputs):
             if abs(scale.volts(scale.safe) - options.safe_v) > 2 * abs(scale.volts_per_code):
                 raise DriverError(
                     f"{options.label}: the node parks output {i} at {scale.volts(scale.safe):.6g} V; "
-                    f"driver.safe_v is {options.safe_v:g}"
+                    f"driver.safe_v is {options.safe_v:g} V; allowed: equal values"
                 )
         if self.rate_hz * welcome.period_us > US_PER_S:
             raise DriverError(
-                f"{options.label}: loop.rate_hz is {self.rate_hz:g}; the node allows at most "
+                f"{options.label}: loop.rate_hz is {self.rate_hz:g} Hz; the node allows at most "
                 f"{US_PER_S / welcome.period_us:.6g} Hz"
             )
 
@@ -359,13 +359,13 @@ class SerialDriver(NodeDriver):
                 durations_s.append(time.monotonic() - start_s)
         if len(durations_s) < self.PROBES / 2:
             raise DriverError(
-                f"{self._options.label}: {len(durations_s)} of {self.PROBES} frames were answered; check the line"
+                f"{self._options.label}: the node answered {len(durations_s)} of {self.PROBES} frames; check the line"
             )
         median_s = float(np.median(durations_s))
         if median_s * self.rate_hz > 1:
             raise DriverError(
-                f"{self._options.label}: an exchange takes {median_s * US_PER_S:.0f} µs (median of {self.PROBES}); "
-                f"loop.rate_hz is {self.rate_hz:g}, allowed: at most {1 / median_s:.0f}"
+                f"{self._options.label}: an exchange with the node takes {median_s * US_PER_S:.0f} µs (median of "
+                f"{self.PROBES} exchanges); loop.rate_hz is {self.rate_hz:g} Hz; allowed: at most {1 / median_s:.0f} Hz"
             )
 
 

@@ -10,9 +10,9 @@ RESTARTED, NOT_READY, LINK, SILENT, NOT_A_NUMBER, LINE_GONE = 101, 102, 103, 104
 TEXTS = {
     VERSION_REFUSED: "the node speaks another version of the protocol",
     BUSY: "another controller drives this node; stop the other controller",
-    UNKNOWN: "the node has no session with this loop, so its outputs do not follow; start the loop again",
-    WATCHDOG: "no drive reached the node for longer than watchdog_ms, and its watchdog has parked its outputs",
-    SIZE: "the node has another number of outputs; compare driver.outputs",
+    UNKNOWN: "the node does not know this loop, so the outputs do not follow the loop; start the loop again",
+    WATCHDOG: "no drive reached the node for longer than watchdog_ms, and the node's watchdog has parked the outputs",
+    SIZE: "the number of the node's outputs is not driver.outputs; set driver.outputs to the number of the node",
     RANGE: "the node refused a drive outside its range",
     FLAGS: "the node refused a drive with flags that it does not know",
     RESTARTED: "the node has restarted, and its outputs are at their safe values",

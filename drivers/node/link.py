@@ -159,7 +159,7 @@ class SerialLink(Link):
             close_descriptor(self.fd)
             number = error.args[0] if error.args else 0
             is_locked = number in (errno.EAGAIN, errno.EWOULDBLOCK)
-            reason = "another program has locked it" if is_locked else str(error.args[-1])
+            reason = "another program uses this line; stop that program" if is_locked else str(error.args[-1])
             raise DriverError(f"{options.label}: {reason}") from None
         self._reader = FrameReader()
 

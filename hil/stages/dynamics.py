@@ -149,11 +149,15 @@ def discretise(modal: ModalSystem, period_s: float) -> dict[str, object]:
     selected = modal.poles.imag >= 0
     count = int(selected.sum())
     if count > MAX_MODES:
-        raise ValueError(f"{count} modes (real poles and pole pairs, with the sensor's); allowed: at most {MAX_MODES}")
+        raise ValueError(
+            f"{count} modes (real poles and pole pairs, the sensor's pole included); allowed: at most {MAX_MODES}"
+        )
     poles = discrete.poles[selected]
     residues = np.where(modal.poles[selected].imag > 0, 2.0, 1.0) * discrete.residues[:, selected]
     if not (np.isfinite(poles).all() and np.isfinite(residues).all()):
-        raise ValueError(f"numbers overflow at a period of {period_s:g} s; use slower poles or a shorter period")
+        raise ValueError(
+            f"poles: too fast to compute with a period of {period_s:g} s; use slower poles or a shorter period"
+        )
     padding = np.zeros(MAX_MODES - count)
     true, sensed = residues
     return {

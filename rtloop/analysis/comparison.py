@@ -142,6 +142,6 @@ def _warning(shift: RootShift, discrete: DiscreteController) -> str:
     part = f", {abs(shift.relative) / shift.damping:.1f} times its half-width" if shift.damping > 1e-5 else ""
     return (
         f"{name} moves the {shift.kind} at {shift.frequency_hz:.1f} Hz to {shift.discrete_hz:.1f} Hz "
-        f"({100 * shift.relative:+.2f} %{part}); use method 'tustin' with prewarp_hz = {shift.frequency_hz:.6g}, "
+        f"(by {100 * shift.relative:+.2f} %{part}); use method 'tustin' with prewarp_hz = {shift.frequency_hz:.6g}, "
         "or method 'matched' or 'foh'"
     )

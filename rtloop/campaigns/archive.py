@@ -85,4 +85,4 @@ class Archive:
 
         Raises OutputError if the system refuses.
         """
-        self._table.add(item, {"verdict": CRASHED, "reason": "each worker process that examined it died"})
+        self._table.add(item, {"verdict": CRASHED, "reason": "each worker process that examined this recording died"})

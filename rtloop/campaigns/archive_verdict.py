@@ -77,7 +77,8 @@ def _examine(paths: Sequence[str], version: str, judge: Callable[[list[Path]], R
     """
     if version != __version__:
         raise UnavailableError(
-            f"rtloop: a worker has {__version__}; allowed: {version}, as here; install equal versions on all workers"
+            f"a worker process has rtloop {__version__}; allowed: {version}, the version of this command; "
+            "install equal versions on all workers"
         )
     try:
         row = judge([Path(path) for path in paths])

@@ -64,7 +64,7 @@ class CampaignOptions(Options):
         labels = [experiment.label for experiment in self.experiment]
         for label in labels:
             if labels.count(label) > 1:
-                raise ValueError(f"experiment: two have the name {label!r}; give each a name of its own")
+                raise ValueError(f"experiment: two experiments have the name {label!r}; rename one of them")
         unknown = sorted(set(self.limits) - set(self.figures))
         if unknown:
             raise ValueError(f"limits: {', '.join(unknown)}; allowed: {', '.join(self.figures)}")

@@ -112,7 +112,9 @@ class CaseRunner:
             return value
         nominal = self._builder.nominal_value(key)
         if isinstance(nominal, bool) or not isinstance(nominal, int | float):
-            raise ValueError(f"{key}: {nominal!r} in the configuration; relative = true needs a number")
+            raise ValueError(
+                f"{key}: the configuration has the value {nominal!r}; relative = true needs a number there"
+            )
         return nominal * value
 
     def run(self, rig: int, values: Mapping[str, Any] | None = None) -> CaseResult:
@@ -211,7 +213,7 @@ class CaseRunner:
             return text if text.startswith(key) else f"{key}: {text}"
         if len(rigs) > 1:
             return ""
-        return f"{key}: it has no effect: rigs with {values[1]!r} and {values[2]!r} run alike; remove the key"
+        return f"{key}: has no effect, as rigs with {values[1]!r} and {values[2]!r} run alike; remove the key"
 
     def _experiment_fault(self, experiment: Experiment) -> str:
         """Return the fault of an experiment that the loop's rate does not allow, or that is too short for a figure.

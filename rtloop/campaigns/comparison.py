@@ -77,7 +77,9 @@ def compare_campaigns(first: Path, second: Path) -> Comparison:
     only_first, only_second = (int(np.count_nonzero(a & ~b)) for a, b in (passed, passed[::-1]))
     for part in ("experiments", "limits"):
         if manifests[0][part] != manifests[1][part]:
-            raise ConfigError(source, [f"{part}: they differ; allowed: equal ones; set them in CAMPAIGN.toml"])
+            raise ConfigError(
+                source, [f"{part}: differ between the two campaigns; allowed: equal {part}; set them in CAMPAIGN.toml"]
+            )
     figures = manifests[0]["figures"]
     return Comparison(
         (manifests[0]["campaign"], manifests[1]["campaign"]),

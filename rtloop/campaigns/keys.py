@@ -49,7 +49,8 @@ def _set_value(tables: dict[str, Any], key: str, value: Any) -> None:
         node[last] = value
     else:
         raise ValueError(
-            f"{key}: {last!r} follows the value {node!r}, which is neither a table nor a list; end the key before"
+            f"{key}: {last!r} follows the value {node!r}, which is neither a table nor a list; end the key before "
+            f"{last!r}"
         )
 
 
@@ -63,7 +64,7 @@ def _step(node: Any, part: str, key: str) -> Any:
     if isinstance(node, list):
         return node[_list_index(node, part, key)]
     raise ValueError(
-        f"{key}: {part!r} follows the value {node!r}, which is neither a table nor a list; end the key before"
+        f"{key}: {part!r} follows the value {node!r}, which is neither a table nor a list; end the key before {part!r}"
     )
 
 

@@ -112,7 +112,8 @@ class Store:
             raise ConfigError(
                 str(self.folder),
                 [
-                    f"it has results of campaign {stored['campaign']!r}, which differs from this one in {different}; "
+                    f"the folder has results of campaign {stored['campaign']!r}, which differs from this one in "
+                    f"{different}; "
                     "choose another folder with --out"
                 ],
             )

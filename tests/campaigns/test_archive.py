@@ -261,7 +261,7 @@ def test_an_import_has_no_law(tmp_path):
 
 
 def test_a_worker_of_another_version_is_refused(good):
-    with pytest.raises(UnavailableError, match=r"a worker has .*; allowed: 99\.0"):
+    with pytest.raises(UnavailableError, match=r"a worker process has rtloop .*; allowed: 99\.0"):
         replay_files([str(good)], "99.0")
 
 

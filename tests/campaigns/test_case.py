@@ -185,7 +185,7 @@ def test_a_key_without_effect_or_sense_is_an_error(tmp_path, uncertain, named):
     [
         ({"keys": 'axis = "y"'}, "axis: 'y' is unknown; allowed: x"),
         ({"keys": "rigs = 0"}, "rigs"),
-        ({"experiments": STEPS + STEPS}, "two have the name 'steps'"),
+        ({"experiments": STEPS + STEPS}, "two experiments have the name 'steps'"),
         ({"experiments": STEPS.replace("[10.0]", "[0.0]")}, "no level twice in a row"),
         ({"limits": '"steps.settling" = 3.0'}, "steps.settling; allowed: steps.overshoot_percent, steps.settling_ms"),
         ({"uncertain": ""}, "uncertain"),

@@ -80,7 +80,7 @@ def test_other_experiments_and_other_limits_are_refused(tmp_path):
     limits = store((path, None), tmp_path / "limits", [1, 2])
     path.write_text(path.read_text().replace("levels_um = [10.0]", "levels_um = [5.0]"))
     steps = store((path, None), tmp_path / "steps", [1, 2])
-    with pytest.raises(ConfigError, match="limits: they differ"):
+    with pytest.raises(ConfigError, match="limits: differ between the two campaigns"):
         compare_campaigns(first, limits)
-    with pytest.raises(ConfigError, match="experiments: they differ"):
+    with pytest.raises(ConfigError, match="experiments: differ between the two campaigns"):
         compare_campaigns(limits, steps)

@@ -233,7 +233,7 @@ def test_curves_of_a_measurement_are_those_of_its_loop_and_of_the_models() -> No
 @pytest.mark.parametrize("reference", [np.zeros(5000), np.arange(5000.0), np.repeat([0.0, 5.0, 0.0], 2000)])
 def test_a_reference_without_a_multisine_is_refused(reference: np.ndarray) -> None:
     still = dict.fromkeys(("error_um", "command_um", "position_um"), np.zeros(reference.size))
-    with pytest.raises(ValueError, match="needs a repeated multisine"):
+    with pytest.raises(ValueError, match="record a multisine of several periods"):
         measure_loop({"reference_um": reference, **still}, RATE_HZ)
 
 

@@ -72,7 +72,7 @@ BAD = {
         r"loop\.rate_hz: 5000 Hz; allowed with driver 'can': at most 4761\.9 Hz",
     ),
     "interface": ('"udp_multicast"', '"carrier_pigeon"', "interface: 'carrier_pigeon'; allowed: .*socketcan"),
-    "data rate": ("wait_s = 60", "data_bitrate = 5000000", "data_bitrate: 5000000; allowed only with fd = true"),
+    "data rate": ("wait_s = 60", "data_bitrate = 5000000", "data_bitrate: 5000000 bit/s; allowed with fd = true only"),
     "description": ("wait_s = 60", 'dbc = "/nowhere.dbc"', r"driver\.dbc: /nowhere\.dbc: No such file"),
     "a channel": ('"adc0"', '"adc7"', "'adc7' is not a channel of this driver; allowed: adc0"),
     "hold": ("hold_ticks = 500", "hold_ticks = -1", "hold_ticks: -1"),

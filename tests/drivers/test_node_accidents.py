@@ -186,7 +186,7 @@ def test_the_screen_and_the_recording_say_in_words_that_the_watchdog_bit(node, t
     for pid in loops:
         os.kill(pid, signal.SIGCONT)
     output, errors = run.communicate(timeout=120)
-    reason = "no drive reached the node for longer than watchdog_ms, and its watchdog has parked its outputs"
+    reason = "no drive reached the node for longer than watchdog_ms, and the node's watchdog has parked the outputs"
     assert reason in " ".join((output + errors).split())
     assert run.returncode == 69
     assert abs(node.settled_output_v()) < 1e-5

@@ -93,8 +93,9 @@ def test_a_wrong_number_of_inputs_is_refused_with_a_message():
     driver, calls = opened(MUTANTS["ForgetsAnInput"]())
     assert calls.read()[0] == -1
     assert str(driver.error) == (
-        "driver 'loopback': read and observe gave 3 numbers, the age included; allowed: 4, one for each input and "
-        "observed signal of its facts, and the age"
+        "driver 'loopback': read and observe gave 3 numbers, the sample's age included; allowed: 4, one for each "
+        "input and "
+        "observed signal of the driver's facts, and the age"
     )
 
 

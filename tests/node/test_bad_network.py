@@ -251,7 +251,7 @@ def test_a_cable_that_is_out_and_in_again_moves_nothing(node):
         assert [math.isinf(age) for age in ages] == [False] * 3 + [True] * 77  # noticed while it is out
         answers = [exchange(relay, calls, 5.0)[0] for _ in range(20)]
         assert answers == [-1] * 20
-        assert "its watchdog has parked its outputs" in str(driver.error)
+        assert "the node's watchdog has parked the outputs" in str(driver.error)
         assert relay.applied == []
         assert abs(node.volts(node.outputs[0])) < 1e-5
         assert node.counts[1] == 1

@@ -113,7 +113,9 @@ def measure_loop(
     reference = signals["reference_um"]
     part = find_periodic_part(reference)
     if part is None:
-        raise ValueError("reference: no part of it repeats itself after settling; needs a repeated multisine")
+        raise ValueError(
+            "reference: no section of the recorded reference is periodic; record a multisine of several periods"
+        )
     grid = part.grid(reference, rate_hz)
     is_complete = (
         ~part.reshape_periods(signals["periods_missed"]).any(axis=1) if "periods_missed" in signals else slice(None)

@@ -45,7 +45,10 @@ class PeriodicPart(NamedTuple):
         sizes[0] = 0.0
         excited = np.flatnonzero(sizes > EXCITED_PART * sizes.max())
         if excited.size < LEAST_LINES:
-            raise ValueError(f"reference: {excited.size} frequencies; needs a multisine of at least {LEAST_LINES}")
+            raise ValueError(
+                f"reference: contains {excited.size} frequencies; needs a multisine of at least {LEAST_LINES} "
+                "frequencies"
+            )
         silent = np.setdiff1d(np.arange(max(1, excited[0] - 1), excited[-1] + 2), excited)
         if not silent.size:
             raise ValueError(
