@@ -175,7 +175,7 @@ def test_a_level_below_the_remanence_is_named() -> None:
 
     highest_um = curve([HIGHEST_V])[0]
     allowed = f"0 V … 10 V, allow only {remanence_um:.4g} … {highest_um:.4g} µm"
-    because = " after 35 µm, because the hysteresis keeps the rest"
+    because = " after a motion to 35 µm, because of the hysteresis"
     assert remanence_um > 2.0
     for levels in ((35.0, 0.0), (0.0, 35.0)):
         assert warnings(*levels) == [f"axis.x.reference: 0 … 35 µm; the drive's limits, {allowed}{because}"]

@@ -36,7 +36,7 @@ def test_a_file_that_cannot_be_read(tmp_path, name):
 def test_a_file_that_is_not_text(tmp_path):
     path = tmp_path / "binary.toml"
     path.write_bytes(b"[loop]\n\xff\xfe")
-    with pytest.raises(InputFileError, match="not a text file in UTF-8 \\(byte 7\\)"):
+    with pytest.raises(InputFileError, match="not a text file in UTF-8 \\(fault at byte 7\\)"):
         load(path)
 
 

@@ -104,7 +104,7 @@ def test_a_usage_error_quotes_the_argument(arguments: tuple[object, ...], messag
     ("axis", "file", "message"),
     [
         ("x", PAPER.with_name("own-stage.toml"), "no controller for axis 'x'; axis x has no [axis.controller]"),
-        ("z", PAPER, "no controller for axis 'z'; its axes are x"),
+        ("z", PAPER, "no controller for axis 'z'; the axes of this file are x"),
     ],
 )
 def test_a_configuration_without_the_controller_is_a_fault_of_it(axis: str, file: Path, message: str) -> None:

@@ -58,8 +58,9 @@ def auto(
         print_taps(loop.taps, loop.subject)
         controller_percent, options = loop.design.scenarios.resonance_percent, loop.subject.options
         figures = (
-            f"controller for resonances within ±{controller_percent:g} %, {options.taps} taps per row for "
-            f"±{options.scenarios.resonance_percent:g} %"
+            f"controller for resonances within ±{controller_percent:g} % of the model's, {options.taps} taps per "
+            "row for "
+            f"resonances within ±{options.scenarios.resonance_percent:g} %"
         )
         stage = loop.stage
     else:
@@ -72,7 +73,7 @@ def auto(
         )
     click.echo(f"{out} is written. Identified: {stage.describe()}; {figures}", err=True)
     reference = describe_reference(reference_values(stage, axis))
-    click.echo(f"Its [axis.reference]: {reference}, in place of the recorded excitation", err=True)
+    click.echo(f"[axis.reference] of {out}: {reference}, in place of the recorded excitation", err=True)
     code = verify_configuration(out, None, None, as_json)
     if code and synthesised_norm > 1:
         click.echo(

@@ -123,4 +123,4 @@ def _print_boundary(result: Boundary) -> None:
         "no failure down to the end of the range" if result.low is None else f"{result.low:.6g} ({result.low_cause})",
         "no failure up to the end of the range" if result.high is None else f"{result.high:.6g} ({result.high_cause})",
     ]
-    console().print(f"{escape(result.key)}: {escape(' … '.join(ends))}, by {result.rigs} rigs")
+    console().print(f"{escape(result.key)}: {escape(' … '.join(ends))}; tried: {result.rigs} rigs")

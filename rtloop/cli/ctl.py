@@ -264,7 +264,7 @@ def read_numbers(file: Any) -> list[list[float]]:
         rows += [numbers] if numbers else []
         if numbers and (len(numbers) > 2 or len(numbers) != len(rows[0])):
             fault = f"{file.name}, line {number}: {len(numbers)} numbers"
-            raise click.UsageError(f"{fault}; allowed: one in every line, or two in every line")
+            raise click.UsageError(f"{fault}; allowed: one number in every line, or two numbers in every line")
     return rows
 
 

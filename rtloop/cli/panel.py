@@ -77,7 +77,7 @@ def panel(service: str | None, port: int, opens: bool, token_file: Path | None, 
         try:
             Client(path).get("/status")
         except RtloopError as error:
-            click.echo(f"{error}; the panel waits for it", err=True)
+            click.echo(f"{error}; the panel waits for the service", err=True)
     return serve(path, port, token_file, lambda address: click.echo(f"panel: {address}", err=True), opens, foxglove)
 
 

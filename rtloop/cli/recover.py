@@ -93,7 +93,7 @@ def _print_recovery(report: dict[str, Any]) -> None:
 def _print_cut(report: dict[str, Any]) -> None:
     """Print the range of ticks in the new recording, its missing ticks and problems."""
     out = console()
-    span = f"{report['first']} to {report['end'] - 1}"
+    span = f"ticks {report['first']} to {report['end'] - 1}"
     if report["begin"] < report["first"]:
         span += f", and the ticks before them from tick {report['begin']} on, which a replay needs"
     ticks = count_text(report["ticks"], "tick")

@@ -191,11 +191,12 @@ def _print_response(content: dict[str, Any], files: Sequence[Path]) -> None:
         rows.add_row(label, format_number(margin["value"]), format_number(margin["std"], ".2g"), model_text, unit)
     out.print(rows)
     if model:
-        out.print(f"measured |L| divided by the model's, median: {format_number(model['gain_ratio'])}")
+        out.print(f"measured |L| divided by |L| of the model, median: {format_number(model['gain_ratio'])}")
     if content["resonance"]:
         _print_resonance(content)
     out.print(
-        f"{content['lines']} lines, {content['from_hz']:g} … {content['to_hz']:g} Hz, {content['periods']} periods; "
+        f"multisine of {content['lines']} frequencies, {content['from_hz']:g} … {content['to_hz']:g} Hz, "
+        f"{content['periods']} periods; "
         f"the position moved by {content['moved_um']:.3g} µm"
     )
     for file in files:

@@ -276,7 +276,9 @@ def read_controller(config: Path, axis: str) -> dict[str, Any]:
     axes = {options.name: options.controller for options in load(config).axes}
     section = axes.get(axis)
     if section is None:
-        reason = f"axis {axis} has no [axis.controller]" if axis in axes else f"its axes are {', '.join(axes)}"
+        reason = (
+            f"axis {axis} has no [axis.controller]" if axis in axes else f"the axes of this file are {', '.join(axes)}"
+        )
         raise ConfigError(str(config), [f"no controller for axis {axis!r}; {reason}"])
     return section.model_dump(exclude_unset=True)
 

@@ -20,7 +20,7 @@ def find_control_socket(name: str | None) -> Path:
     folders_text = " or ".join(str(folder) for folder in folders)
     if not sockets:
         subject = "no service" if name is None else f"no service {name!r}"
-        meant = "" if not name or not name.endswith(".toml") else f"; use the name {Path(name).stem!r}, not the file's"
+        meant = "" if not name or not name.endswith(".toml") else f"; use the name of the service, {Path(name).stem!r}"
         raise UnavailableError(
             f"{subject} has a control socket in {folders_text}{meant}; start a service with `rtloop serve CONFIG`"
         )

@@ -129,7 +129,7 @@ def rig_problem(axis: AxisOptions, check: AxisCheck, comparison: RigComparison) 
     if not on_rig.on_model.is_stable:
         is_stable_on_model = check.on_model is not None and check.on_model.is_stable
         is_unexplained = is_stable_on_model and not lines
-        cause = f": its plant or its weights differ from those of axis.{axis.name}" if is_unexplained else ""
+        cause = f": the rig's plant or weights differ from those of axis.{axis.name}" if is_unexplained else ""
         problem = f"the loop is unstable (largest |pole| {np.abs(on_rig.on_model.poles).max():.6f}){cause}"
     return None if problem is None else f"axis.{axis.name}: on the simulated rig, {problem}"
 
@@ -192,7 +192,7 @@ def _beyond_drive(axis: AxisOptions, lowest_um: float, highest_um: float) -> Ite
     if not is_virgin and down_um != -up_um:  # the farther end itself does not limit the other direction
         low_um, high_um = (low_um, up_um) if is_upward else (down_um, high_um)
     is_within_ends = down_um <= lowest_um <= highest_um <= up_um
-    memory = f" after {positions_um[0]:g} µm, because the hysteresis keeps the rest" if is_within_ends else ""
+    memory = f" after a motion to {positions_um[0]:g} µm, because of the hysteresis" if is_within_ends else ""
     yield (
         f"{lowest_um:g} … {highest_um:g} µm; the drive's limits, {limits.lowest_v:g} V … {limits.drive_v:g} V, "
         f"allow only {low_um:.4g} … {high_um:.4g} µm{memory}"

@@ -80,7 +80,7 @@ class SharedLoop:
         The other axes' loops stay closed. Raises ValueError where the linear law or a model is unknown.
         """
         if self.linear is None or self.plant is None:
-            fault = f"it {NOT_LINEAR}" if self.linear is None else "an axis has no model"
+            fault = f"the law {NOT_LINEAR}" if self.linear is None else "an axis has no model"
             raise ValueError(
                 f"controller of axes {', '.join(self.axes)}: {fault}; the analysis of a loop needs a linear controller "
                 "and the models of all axes"
@@ -160,7 +160,7 @@ class AxisCheck:
         if self.together is not None:
             return self.together.broken_loop(dynamics, delay_ticks, self.reference)
         if self.linear is None:
-            fault = "missing" if self.law is None else f"it {NOT_LINEAR}"
+            fault = "missing" if self.law is None else f"the law {NOT_LINEAR}"
             raise ValueError(f"controller: {fault}; the analysis of a loop needs a linear controller")
         return discrete_loop(self.linear, dynamics, delay_ticks, self.reference)
 
@@ -339,7 +339,7 @@ def _coupled_plant(axes: Sequence[AxisOptions], delays: Sequence[int], findings:
                 allowed_names = ", ".join(name for name in names if name != axis.name)
                 findings.faults.append(
                     f"axis.{axis.name}.model.coupling.{other_name}: unknown; allowed: the controller's other axes"
-                    f" ({allowed_names or 'it has none'})"
+                    f" ({allowed_names or 'there are none'})"
                 )
     if len(models) < len(axes):
         return None

@@ -47,7 +47,8 @@ class ExtraOutputOptions(Options):
     def _check_level(self) -> Self:
         """Require `level_um` with mark = "position", and only there."""
         if (self.mark == "position") != (self.level_um is not None):
-            raise ValueError(f"level_um: {self.level_um}; allowed: a position with mark = 'position', and only there")
+            value = "missing" if self.level_um is None else f"{self.level_um:g} µm"
+            raise ValueError(f"level_um: {value}; allowed: a number with mark = 'position', and no level_um otherwise")
         return self
 
 

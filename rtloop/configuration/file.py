@@ -373,8 +373,8 @@ def shared_faults(axes: Sequence[AxisOptions]) -> list[str]:
         for other_axis in axes[number + 1 : number + len(controller_axes)]:
             if other_axis.controller:
                 faults.append(
-                    f"{key_text}; but axis {other_axis.name} has a controller of its own; remove it, or "
-                    f"{other_axis.name} from axes"
+                    f"{key_text}; but axis {other_axis.name} has a controller of its own; remove that "
+                    f"controller, or remove {other_axis.name} from axes"
                 )
     return faults
 
@@ -394,7 +394,11 @@ def _cross_faults(sections: FileOptions, channels: Mapping[str, ChannelOptions])
         for name in names
         if name not in channels
     ]
-    faults += [f"driver.channels.{name}: there is no axis of this name" for name in channels if name not in names]
+    faults += [
+        f"driver.channels.{name}: there is no axis of this name; the axes are {', '.join(names)}"
+        for name in channels
+        if name not in names
+    ]
     faults += setpoint_faults(sections.axis, sections.loop.mode, sections.schedule)
     faults += shared_faults(sections.axis)
     faults += extra_faults(sections.inputs, sections.outputs, sections.loop.hold_input, sections.axis)

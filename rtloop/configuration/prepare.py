@@ -164,13 +164,16 @@ def _lateness_faults(configuration: Configuration) -> list[str]:
     if not configuration.loop.simulated_lateness_us or configuration.driver_kind == SimDriver.kind:
         return []
     remedy = f"set driver.kind = {SimDriver.kind!r}, or remove the key"
-    return [f"{LATENESS_KEY}: set; allowed on the simulated rig alone, not {configuration.driver_kind!r}: {remedy}"]
+    return [
+        f"{LATENESS_KEY}: set with driver.kind = {configuration.driver_kind!r}; allowed with the simulated rig "
+        f"only; {remedy}"
+    ]
 
 
 def refuse_simulated_lateness(prepared: Prepared) -> None:
     """Raise ConfigError for a paced run with simulated lateness; its ticks are as late as the host makes them."""
     if prepared.plan.pacing.paced and prepared.plan.pacing.simulated_lateness_us:
-        fault = f"{LATENESS_KEY}: set; allowed in virtual time alone: add --unpaced, or remove the key"
+        fault = f"{LATENESS_KEY}: set; allowed in virtual time only; add --unpaced, or remove the key"
         raise ConfigError(prepared.configuration.source, [fault])
 
 

@@ -134,7 +134,10 @@ def read_samples(path: Path, folder: Path | None = None) -> npt.NDArray[np.float
     if samples.ndim == 1:
         samples = samples[:, np.newaxis]
     if samples.ndim != 2 or samples.shape[1] not in (1, 2) or samples.size == 0:
-        raise ValueError(f"file: {path} has shape {loaded.shape}; allowed: one or two columns of at least one number")
+        raise ValueError(
+            f"file: {path} holds an array of {' × '.join(map(str, loaded.shape)) or 'no'} numbers; allowed: one or "
+            "two columns of at least one number"
+        )
     if not np.all(np.abs(samples) < USABLE_MAGNITUDE):
         raise ValueError(f"file: {path} contains numbers that are not finite or beyond ±{USABLE_MAGNITUDE:g}")
     return samples

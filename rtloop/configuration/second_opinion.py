@@ -220,14 +220,15 @@ def disagreements(loop: Loop, opinion: Opinion) -> list[str]:
     ours, theirs = (poles[np.abs(poles) > LEAST_POLE] for poles in (loop.poles, opinion.poles))
     if ours.size != theirs.size:
         faults.append(
-            f"closed-loop poles: rtloop finds {ours.size} with |z| > {LEAST_POLE:g}, python-control {theirs.size}"
+            f"closed-loop poles with |z| > {LEAST_POLE:g}: rtloop finds {ours.size} poles, python-control "
+            f"{theirs.size} poles"
         )
     elif ours.size:
         distances = np.abs(ours[:, None] - theirs)
         furthest = max(distances.min(axis=0).max(), distances.min(axis=1).max())
         if not furthest <= POLE_TOLERANCE:
             faults.append(
-                f"closed-loop poles: one differs by {furthest:.3g} (in z) from python-control's; "
+                f"closed-loop poles: rtloop and python-control differ by up to {furthest:.3g} in z; "
                 f"allowed: {POLE_TOLERANCE:g}"
             )
     if not (loop.is_stable and opinion.position.size) or loop.period_s is None:

@@ -43,7 +43,7 @@ def read_text(path: Path, refused: type[RtloopError] = InputFileError) -> str:
     except OSError as error:
         fault = error.strerror
     except UnicodeDecodeError as error:
-        fault = f"not a text file in UTF-8 (byte {error.start})"
+        fault = f"not a text file in UTF-8 (fault at byte {error.start})"
     raise refused(f"{path}: {RECORDING if _is_mcap(path) else fault}")
 
 

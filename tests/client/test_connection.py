@@ -103,7 +103,7 @@ def test_a_controller_comes_from_a_configuration_file_that_has_one_for_the_axis(
     Connection(client).controller("x", config)  # type: ignore[arg-type]
     assert client.requests == [("/controller", {"axis": "x", "controller": section})]
     assert section["form"]
-    with pytest.raises(ConfigError, match=r"no controller for axis 'q'; its axes are x"):
+    with pytest.raises(ConfigError, match=r"no controller for axis 'q'; the axes of this file are x"):
         read_controller(config, "q")
 
 

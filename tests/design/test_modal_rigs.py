@@ -54,7 +54,7 @@ def test_the_stage_of_ones_own_keeps_its_specification(tmp_path, monkeypatch) ->
     result = CliRunner().invoke(main, ["design", "auto", *map(str, arguments)])
     assert result.exit_code == 0, result.output
     assert json.loads(result.stdout)["meets"]
-    assert "Its [axis.reference]: steps between 5 and 0 µm, 0.1 s each" in result.stderr
+    assert f"[axis.reference] of {out}: steps between 5 and 0 µm, 0.1 s each" in result.stderr
     assert "without any controller" not in out.read_text(encoding="utf-8")
     (axis,) = load(out).axes
     assert axis.model is not None

@@ -227,7 +227,7 @@ def test_other_drivers_than_the_simulated_rig_are_refused():
     with pytest.raises(ConfigError) as raised:
         prepare(parse(text_of_board, "late", Path(), "late.toml"))
     assert raised.value.faults == [
-        "loop.simulated_lateness_us: set; allowed on the simulated rig alone, not 'shm': "
+        "loop.simulated_lateness_us: set with driver.kind = 'shm'; allowed with the simulated rig only; "
         "set driver.kind = 'sim', or remove the key"
     ]
     plan: Plan = plan_of(late_text([1.0]))
@@ -249,7 +249,7 @@ def test_a_paced_run_is_refused(tmp_path):
     path = tmp_path / "late.toml"
     path.write_text(late_text([1.0]))
     done = command("run", path, "--duration", 0.1, "--out", tmp_path, code=78)
-    message = "loop.simulated_lateness_us: set; allowed in virtual time alone: add --unpaced, or remove the key"
+    message = "loop.simulated_lateness_us: set; allowed in virtual time only; add --unpaced, or remove the key"
     assert message in " ".join(done.stderr.split())
     assert not list(tmp_path.glob("*.mcap*"))
 

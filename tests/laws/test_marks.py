@@ -125,8 +125,8 @@ def test_a_gate_starts_and_holds_the_reference(tmp_path: Path, state: str):
 @pytest.mark.parametrize(
     ("before", "after", "message"),
     [
-        ("level_um = 6.0\n", "", "outputs.far.*level_um: None"),
-        ('mark = "moving"', 'mark = "moving"\nlevel_um = 1.0', "outputs.busy.*level_um: 1.0"),
+        ("level_um = 6.0\n", "", "outputs.far.*level_um: missing"),
+        ('mark = "moving"', 'mark = "moving"\nlevel_um = 1.0', "outputs.busy.*level_um: 1 µm"),
         ('mark = "moving"', 'mark = "falling"', "outputs.busy.mark"),
     ],
 )

@@ -19,7 +19,7 @@ CASES = [
     (
         ["y"],
         ["--name", "deploy/x.toml"],
-        "no service 'deploy/x.toml' has a control socket in {folder}; use the name 'x', not the file's; start a "
+        "no service 'deploy/x.toml' has a control socket in {folder}; use the name of the service, 'x'; start a "
         "service with `rtloop serve CONFIG`",
     ),
     (["x", "y"], [], "several services have a control socket in {folder}: x, y; use --name NAME"),

@@ -128,7 +128,7 @@ def _controller_fault(check: AxisCheck) -> str:
     """Return the reason why a controller cannot be linearised for one axis: shared, missing or not linear."""
     if check.together is not None:
         return f"shared by the axes {', '.join(check.together.axes)}"
-    return "missing" if check.law is None else f"it {NOT_LINEAR}"
+    return "missing" if check.law is None else f"the law {NOT_LINEAR}"
 
 
 def command_range_um(axis: AxisOptions) -> tuple[float, float]:

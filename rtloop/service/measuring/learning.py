@@ -191,7 +191,7 @@ def _learning_gains(live: LiveLaw, number: int, request: LearnRequest) -> Learni
         loop = promised_loop(options, rate_hz, delay_ticks(configuration, options), plant)
         loops += [] if loop is None else [(name, loop)]
     if not loops:
-        fault = "missing" if options.controller is None else f"it {NOT_LINEAR}"
+        fault = "missing" if options.controller is None else f"the law {NOT_LINEAR}"
         raise _invalid_request(f"axis.{options.name}.controller: {fault}; learning needs a linear controller")
     try:
         return learning_gains(loops, request.reference_um.size)

@@ -88,7 +88,7 @@ def test_a_panel_beside_a_dead_service_says_so_to_who_starts_it(tmp_path: Path, 
             said += line
         panel.terminate()
     assert ("the service has died" in said) == (not options)
-    assert ("; the panel waits for it" in said) == (not options)
+    assert ("; the panel waits for the service" in said) == (not options)
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
