@@ -63,11 +63,14 @@ def positions_between_ticks(
     modes, parts, points = factors.shape
     if axes != len(coefficients) or missed.shape != (ticks,) or not 0 <= axis < axes:
         raise ValueError(
-            f"motion: {axes} axes, {missed.size} counts of missed periods, axis {axis}; allowed: {len(coefficients)} "
-            f"axes, {ticks} counts, an axis below {len(coefficients)}"
+            f"motion: {axes} axes, {missed.size} counts of missed periods, axis number {axis}; allowed: "
+            f"{len(coefficients)} axes, {ticks} counts, axis numbers below {len(coefficients)}"
         )
     if (modes, parts) != (coefficients["mode_count"][axis], PARTS) or not factors.flags.c_contiguous:
-        raise ValueError(f"factors: {factors.shape}; allowed: ({coefficients['mode_count'][axis]}, {PARTS}, points)")
+        raise ValueError(
+            f"factors: an array of {modes} × {parts} × {points}; allowed: a contiguous array of "
+            f"{coefficients['mode_count'][axis]} × {PARTS} × any number"
+        )
     own_state, positions_um = state[axis : axis + 1].copy(), np.empty((ticks, points))
     _fill_positions(
         coefficients[axis : axis + 1].ctypes.data, own_state.ctypes.data, axis, factors.ctypes.data, points, modes,

@@ -65,7 +65,10 @@ def drain(ring: Ring, cursor: int, out: npt.NDArray[Any]) -> tuple[int, int, int
     """
     slots, first = ring.slots, np.array([cursor], np.uint64)
     if out.dtype != slots.dtype or out.shape[1:] != slots.shape[1:] or not out.flags.c_contiguous:
-        raise ValueError(f"out: {out.dtype} {out.shape}; allowed: contiguous slots of {slots.dtype} {slots.shape[1:]}")
+        raise ValueError(
+            f"out: slots of {' × '.join(map(str, out.shape[1:]))} {out.dtype} values; allowed: a contiguous array, "
+            f"slots of {' × '.join(map(str, slots.shape[1:]))} {slots.dtype} values"
+        )
     copied = _drain(
         ring.head.ctypes.data, ring.marks.ctypes.data, slots.ctypes.data, len(slots), slots.strides[0],
         out.ctypes.data, len(out), first.ctypes.data,

@@ -134,7 +134,8 @@ def _deadlines_ns(path: Path, name: str, times: Real, unit: str) -> tuple[Real, 
     if not is_growing.all():
         row = int(np.argmin(is_growing))
         raise UnreadableData(
-            f"{path}: time {name!r}: does not grow: {times[row + 1]:g} {unit} in row {row + 2} after {times[row]:g}; "
+            f"{path}: time {name!r} does not grow from row {row + 1} ({times[row]:g} {unit}) to row {row + 2} "
+            f"({times[row + 1]:g} {unit}); "
             "use --time COLUMN for another column, or --rate HZ"
         )
     if deadlines[-1] > LARGEST:
@@ -162,7 +163,7 @@ def _regularity(deadlines: Real) -> tuple[float, list[str]]:
         rms = float(np.sqrt(np.mean(deviation**2)))
         notes.append(
             f"sample times jitter by {rms / 1e3:.3g} µs rms, {deviation.max() / 1e3:.3g} µs at most, about a "
-            f"period of {period / 1e3:.6g} µs; the import keeps them as they are"
+            f"period of {period / 1e3:.6g} µs; the import keeps the times as recorded"
         )
     gap_indices = np.flatnonzero(intervals >= GAP_PERIODS * period)
     if gap_indices.size:

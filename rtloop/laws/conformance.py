@@ -58,7 +58,7 @@ class LawConformance:
         frequencies beyond 0 … half of the rate, and a response that does not settle.
         """
         if self.law.count == 0:
-            raise ValueError("a feedforward has no frequency response: it has no error")
+            raise ValueError("a feedforward has no error, and so no frequency response")
         return Bench(self.law, compiled=not UNCOMPILED).frequency_response(frequencies_hz, amplitude_um)
 
     @pytest.fixture
@@ -93,7 +93,7 @@ class LawConformance:
             zip(bench.run(TICKS), uncompiled.run(TICKS), strict=True)
         ):
             assert tick_compiled == tick_uncompiled, (
-                f"tick {number}: compiled {tick_compiled}, uncompiled {tick_uncompiled}"
+                f"tick {number}: the compiled law gives {tick_compiled}, the uncompiled law {tick_uncompiled}"
             )
 
     def test_its_state_is_in_its_record(self, bench: Bench) -> None:
@@ -114,14 +114,16 @@ class LawConformance:
     def test_it_stays_finite(self, bench: Bench) -> None:
         """Bounded errors with applied commands give commands below 1e9 µm (V for a feedforward)."""
         for number, (value, _) in enumerate(bench.run(20 * TICKS, wild=False)):
-            assert np.all(np.abs(value) < 1e9), f"tick {number}: {value}"
+            assert np.all(np.abs(value) < 1e9), f"tick {number}: the output is {value}; allowed: magnitudes below 1e9"
 
     def test_no_number_that_is_none_outlives_an_entry(self, bench: Bench) -> None:
         """A new entry makes all outputs finite again after NaN and infinite inputs."""
         bench.poison()
         bench.enter(*np.multiply.outer([3.0, 1.0, 5.0], np.ones(max(self.law.count, 1))))
         for number, (value, _) in enumerate(bench.run(TICKS, wild=False)):
-            assert np.all(np.isfinite(value)), f"tick {number} after the entry: {value}"
+            assert np.all(np.isfinite(value)), (
+                f"tick {number} after the entry: the output is {value}; allowed: finite numbers"
+            )
 
     def test_enter_continues_from_the_command(self, bench: Bench) -> None:
         """`enter` leaves a bump of at most BUMP; a law without `enter` is skipped, as the loop adds an offset for

@@ -227,7 +227,7 @@ def build_record(law: Law) -> Any:
             raise ValueError(f"{_build_location(law)} returns {name} = {value!r}; allowed: numbers")
         room = target.shape[1:]
         if numbers.ndim != len(room) or any(n > limit for n, limit in zip(numbers.shape, room, strict=True)):
-            needed = f"an array of up to {room}" if room else "one number"
+            needed = f"an array of up to {' × '.join(map(str, room))} numbers" if room else "one number"
             raise ValueError(
                 f"{_build_location(law)} returns {name} as an array of shape {numbers.shape}; allowed: {needed}"
             )

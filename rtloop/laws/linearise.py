@@ -54,7 +54,7 @@ def linearise_at_rest(law: Controller) -> SampledController | SampledCoupledSyst
             with np.errstate(divide="raise", invalid="raise"):  # names the line, if a division is the cause
                 _derivatives(tick, STEP)
                 _derivatives(tick, STEP / 2)
-            raise ValueError("results that are not finite")
+            raise ValueError("the results are not finite")
     except (ArithmeticError, IndexError, ValueError) as error:
         reason = f"{_place(error, type(law))}{type(error).__name__}: {error}"
         raise ValueError(f"the law fails at rest: {reason}") from error

@@ -225,7 +225,10 @@ def _system(a: npt.ArrayLike, b: npt.ArrayLike, c: npt.ArrayLike, d: npt.ArrayLi
         ("d", direct.shape, (1,)),
     ):
         if shape != allowed:
-            raise ValueError(f"{name}: shape {shape}; allowed: {allowed}, for one input and one output")
+            raise ValueError(
+                f"{name}: {' × '.join(map(str, shape))} numbers; allowed: {' × '.join(map(str, allowed))} numbers, "
+                "for one input and one output"
+            )
     return System(matrix, column, row, float(direct[0]))
 
 

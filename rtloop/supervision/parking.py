@@ -88,7 +88,7 @@ def _find_boards(config: Path, name: str, account: ParkingAccount) -> list[Hardw
             account.failures.append(error)
             return []
         account.remarks.append(
-            f"the board of the last run was taken, because the configuration cannot be used:\n{error}"
+            f"parking uses the board of the last run, because the configuration cannot be used:\n{error}"
         )
         return [note]
     return [configured] if note is None else [note] if configured.drives_same_outputs(note) else [note, configured]

@@ -56,7 +56,7 @@ def hardware_path(name: str) -> Path:
     return runtime_folder() / f"{name}.hardware"
 
 
-def create_file(path: Path, target: str = "the shared block") -> int:
+def create_file(path: Path, target: str = "the shared memory of the loop") -> int:
     """Create an empty file in place of an old one, and its folder, and return its descriptor, open to read and write.
 
     A process that has mapped the old file keeps it. `target` names the file in messages. Raises OutputError if the

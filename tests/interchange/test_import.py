@@ -168,7 +168,7 @@ def test_a_given_rate_replaces_an_unusable_time(folder: Path):
     savemat(folder / "scan.mat", {"time": np.round(TIME, 3), "u": VOLTS})
     result = run("import", "scan.mat", "--all")
     assert result.exit_code == 1
-    assert "time 'time': does not grow: 0 s in row 2 after 0" in result.stderr
+    assert "time 'time' does not grow from row 1 (0 s) to row 2 (0 s)" in result.stderr
     report = answer("import", "scan.mat", "--all", "--rate", 44_100)
     assert report["rate_hz"] == 44_100
     assert [one["name"] for one in report["signals"]] == ["u"]
@@ -231,8 +231,8 @@ def test_an_option_replaces_the_signal_of_a_mapping_file_under_its_short_name(sc
         (["--all", "--time", "t + 1 ms"], 1, "time from column 't': ms cannot be converted to 1; write the unit in"),
         (["--map", "tick=t"], 1, "tick is computed from the times and cannot be mapped"),
         (["--map", "mode=T"], 1, "mode: 21; allowed: a whole number from 0 to 3"),
-        (["--all", "--time", "T"], 1, "time 'T': does not grow"),
-        (["--all", "--time", "t [ns]"], 1, "time 't': does not grow: 0.0001 ns in row 2"),
+        (["--all", "--time", "T"], 1, "time 'T' does not grow"),
+        (["--all", "--time", "t [ns]"], 1, "time 't' does not grow from row 1 (0 ns) to row 2 (0.0001 ns)"),
         (["--all", "--time", "pos_nm"], 1, "time 'pos_nm': nm cannot be converted to s"),
         (["--all", "--group", "slow"], 1, "no group 'slow'; there are '3,000 rows'"),
         (["--all", "--mapping", "absent.toml"], 66, "absent.toml: No such file"),

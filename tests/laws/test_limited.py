@@ -30,7 +30,10 @@ BUILD = "    def build(self):\n"
 NASTY = "class Nasty(Exception):\n    def __str__(self):\n        raise OSError('no words')\nraise Nasty\n"
 THREAD = "import threading\nthreading.Thread(target=threading.Event().wait, daemon=True).start()\n"
 PROCESS_LEFT = "import os, time\nif not (pid := os.fork()):\n    time.sleep(1e6)\nopen('pid', 'w').write(str(pid))\n"
-ENDED, CORRECT = "the process that runs it ended", "correct its code: it exits, crashes or exhausts the memory"
+ENDED, CORRECT = (
+    "the process that runs this code ended",
+    "correct the code, which exits, crashes or exhausts the memory",
+)
 AT_IMPORT = {
     "never ends": ("while True:\n    pass\n", f"took longer than {LIMIT_S:g} s and was stopped"),
     "exits": ("import sys\nsys.exit(0)\n", "raised SystemExit: 0, in line 2"),

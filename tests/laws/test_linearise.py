@@ -40,7 +40,7 @@ def awkward(at_um: float, there_um: float) -> Awkward:
 
 @pytest.mark.parametrize("at_um", [STEP, STEP / 2])
 def test_a_law_that_is_not_finite_near_its_rest_fails(at_um: float) -> None:
-    with pytest.raises(ValueError, match="the law fails at rest: ValueError: results that are not finite"):
+    with pytest.raises(ValueError, match="the law fails at rest: ValueError: the results are not finite"):
         linearise_at_rest(awkward(at_um, math.inf))
 
 

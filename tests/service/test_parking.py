@@ -286,7 +286,7 @@ def test_parking_needs_no_file_that_can_be_read_but_for_the_first_time(parked, t
     write_note(hardware_path("lab"), Noted.from_configuration(load(tmp_path / "lab.toml")))
     (tmp_path / "lab.toml").write_text(text.replace("[driver]", "[drive"))
     assert "6.500 V" in park()
-    assert "the board of the last run was taken" in park()
+    assert "parking uses the board of the last run" in park()
     np.testing.assert_allclose(hardware.written[1:14], DRIVE_V - STEP_V * np.arange(1, 14), atol=1e-12)
     assert hardware.written[-1] == 0.0
     hardware_path("lab").unlink()
@@ -356,7 +356,7 @@ def test_a_configured_driver_without_its_library_does_not_keep_the_noted_board_f
         monkeypatch.setattr(f"rtloop.{user}.driver_class", lambda kind: ReadableCard if kind == "card" else Missing)
     config.write_text(config.read_text().replace('kind = "card"', 'kind = "another"'))
     text = park()
-    assert "the board of the last run was taken" in text
+    assert "parking uses the board of the last run" in text
     assert "libcard.so" in text
     assert hardware.written[-1] == 0.0
 
@@ -533,7 +533,7 @@ def test_a_service_that_died_is_parked_while_its_file_is_being_edited(tmp_path):
         assert bench.seen().last_v != 0.0
         assert bench.rtloop("park", bench.config).wait(120.0) == 0
         assert bench.seen().last_v == 0.0
-        assert "the board of the last run was taken" in bench.log()
+        assert "parking uses the board of the last run" in bench.log()
 
 
 def in_a_process(work: Callable[[], object]) -> int:

@@ -144,7 +144,7 @@ def test_taps_that_are_no_better_are_not_sent_whatever_the_consent(
     service = Service(tmp_path, HZ, LOW_GAIN, sent.tuned)
     assert retune_axis(service, REQUEST, yes=True, as_json=False) == 1  # type: ignore[arg-type]
     text = capsys.readouterr().out
-    assert "static gain of the plant 0.9500 ± 0.0010 between 0 and 2.5" in text
+    assert "static gain of the plant 0.9500 ± 0.0010 (standard deviation) between 0 and 2.5" in text
     assert "-5.00 % from the model's" in text
     assert "the new taps are no better; the taps in force stay" in text
     assert not service.tuned

@@ -100,9 +100,9 @@ def static_gain_text(gain: float, input_kind: str, spread: str = "") -> str:
     This depends on the input of the identification, `input_kind`: "hysteresis", "command" or "drive". `spread` follows
     the number, such as " ± 0.1 (1σ)".
     """
-    number = f"its static gain of {gain:.6g}{spread}"
+    number = f"the identified static gain of {gain:.6g}{spread}"
     if input_kind == "hysteresis":
-        return f"{number} is in the hysteresis"
+        return f"{number} is included in the weights of the hysteresis"
     if input_kind == "command":
         return f"{number} belongs to [axis.feedforward]: multiply weights_um_per_v by it"
     if gain <= 0:

@@ -105,7 +105,10 @@ def design_robust_loop(
     try:
         subject, taps = _find_taps(subject, "scenarios" in design.shape.model_fields_set, progress)
     except NoDesign as error:
-        comments += ["No taps were found for it, so that its steps are not shaped:", str(error)]
+        comments += [
+            "No taps were found for this controller, so that steps of the reference are not shaped:",
+            str(error),
+        ]
         raise NoTaps(str(error), stage_configuration(stage, parts, comments, axis, spec_name)) from None
     comments += taps_provenance(taps, subject, spec_name)
     text = stage_configuration(stage, {**parts, "prefilter": taps_values(taps.taps)}, comments, axis, spec_name)
@@ -178,14 +181,17 @@ def _find_controller(design: DesignOptions, progress: Progress) -> tuple[DesignO
         try:
             return narrowed, _find_damped_controller(narrowed, progress)
         except NoController as error:
-            progress(f"no controller for resonances within ±{narrowed.scenarios.resonance_percent:g} %: {error}")
+            progress(
+                f"no controller for resonances within ±{narrowed.scenarios.resonance_percent:g} % of the model's: "
+                f"{error}"
+            )
         except ValueError as error:  # a narrower range has the same plant and specification
             raise NoDesign(str(error)) from None
     try:
         return last, _find_damped_controller(last, progress)
     except (NoController, ValueError) as error:
         percent = last.scenarios.resonance_percent
-        prefix = f"no controller even for resonances within ±{percent:g} %: " if wider else ""
+        prefix = f"no controller even for resonances within ±{percent:g} % of the model's: " if wider else ""
         raise NoDesign(f"{prefix}{error}") from None
 
 
@@ -290,5 +296,6 @@ def _find_taps(subject: Subject, is_range_fixed: bool, progress: Progress) -> tu
         try:
             return narrowed, design_taps(narrowed, progress=progress)
         except NoDesign as error:
-            progress(f"no taps for resonances within ±{narrowed.options.scenarios.resonance_percent:g} %: {error}")
+            percent = narrowed.options.scenarios.resonance_percent
+            progress(f"no taps for resonances within ±{percent:g} % of the model's: {error}")
     return last, design_taps(last, progress=progress)

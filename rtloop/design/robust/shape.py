@@ -113,7 +113,8 @@ def design_taps(
         if fastest is None:
             raise NoDesign(_explain_no_taps(subject, programme))
         progress(
-            f"{len(scenarios)} scenarios: fastest {fastest * tick_ms:.4g} ms, overshoot {100 * subject.overshoot:g} %"
+            f"{len(scenarios)} scenarios: fastest settling {fastest * tick_ms:.4g} ms, overshoot ≤ "
+            f"{100 * subject.overshoot:g} %"
         )
         settling = fastest if options.settling_ms is None else options.settling_ms / tick_ms
         if may_be_late:
@@ -289,7 +290,7 @@ def _proof_failure(subject: Subject, settling_ms: float, proof: StepMeasures, pl
     excess = f"exceeds its limits by {100 * proof.excess:.2g} % of a step" if is_beyond else "stays within its limits"
     return (
         f"shape: the taps for {settling_ms:.4g} ms and overshoot ≤ {100 * subject.overshoot:g} % fail on {plants} "
-        f"plants between the scenarios: they settle in up to {proof.settling_ms:.4g} ms, overshoot by "
+        f"plants between the scenarios: steps settle in up to {proof.settling_ms:.4g} ms, overshoot by "
         f"{100 * proof.overshoot:.4g} %, and v {excess}. Use a longer shape.settling_ms or smaller [shape.scenarios]"
     )
 
@@ -322,7 +323,8 @@ def _describe_relaxations(subject: Subject) -> str:
         scenarios = list(dict.fromkeys([family.nominal, *family.sweep_scenarios(3)]))
         fastest[name] = fastest_settling(build_programme(subject_variant, scenarios), subject_variant.overshoot)
     listed = ", ".join(
-        f"{name} {'none' if value is None else f'{value * tick_ms:.4g} ms'}" for name, value in fastest.items()
+        f"{name} gives {'no settling' if value is None else f'{value * tick_ms:.4g} ms'}"
+        for name, value in fastest.items()
     )
     best_relaxation = min(fastest, key=lambda name: math.inf if (value := fastest[name]) is None else value)
     return f"Fastest settling with one limit relaxed: {listed}. Most helpful: {best_relaxation}"

@@ -27,7 +27,7 @@ def table(verification: Verification) -> list[tuple[str, ...]]:
     """
     continuous, running = verification.continuous, verification.running
     rows: list[tuple[str, ...]] = [
-        (LINEAR_HEADING, "required", CONTINUOUS_HEADING, RUNNING_HEADING, "", "its source says")
+        (LINEAR_HEADING, "required", CONTINUOUS_HEADING, RUNNING_HEADING, "", "claimed by the source")
     ]
     stable = ["yes" if loop is not None and loop.is_stable else "NO" for loop in (continuous, running)]
     rows.append(("stable", "yes", *stable, format_verdict(running.is_stable), ""))

@@ -61,7 +61,7 @@ def read_stabilizer(path: Path) -> Table:
     lost = int(np.sum(steps[1:] - batches)) // batches
     about = {
         "lost frames": str(lost),
-        "sample period": f"{SAMPLE_PERIOD_S * 1e6:g} µs assumed; another: --time 'sample * 2.56 µs'",
+        "sample period": f"{SAMPLE_PERIOD_S * 1e6:g} µs assumed; for another period: --time 'sample * 2.56 µs'",
     }
     return Table(columns.columns, columns.units, "time", about)
 

@@ -193,9 +193,9 @@ class LimitedProcess:
             if answers in readable:
                 part = os.read(answers, 1 << 20)
                 if not part:
-                    correction = "correct its code: it exits, crashes or exhausts the memory"
+                    correction = "correct the code, which exits, crashes or exhausts the memory"
                     remedy = "try again" if self._law is None else correction
-                    raise self._abandonment(f"the process that runs it ended ({self._exit_text()}); {remedy}")
+                    raise self._abandonment(f"the process that runs this code ended ({self._exit_text()}); {remedy}")
                 self._data += part
         end = self._end_of_message
         message = pickle.loads(self._data[LENGTH.size : end])

@@ -30,7 +30,10 @@ class Strided(NamedTuple):
     def of(cls, rows: Real) -> Strided:
         """Return the address and the steps of `rows`. Raises ValueError for items that are not doubles."""
         if rows.dtype != np.float64 or any(step % ITEM_BYTES or step < 0 for step in rows.strides):
-            raise ValueError(f"rows: {rows.dtype}, steps of {rows.strides} bytes; allowed: doubles, steps of 8 bytes")
+            raise ValueError(
+                f"rows: values of type {rows.dtype}, {' and '.join(map(str, rows.strides))} bytes apart; allowed: "
+                "float64, a multiple of 8 bytes apart"
+            )
         row_step, column_step = (step // ITEM_BYTES for step in rows.strides)
         return cls(rows.ctypes.data, row_step, column_step)
 
@@ -45,7 +48,8 @@ def first_unequal(recorded: Real, replayed: Real) -> tuple[int, int] | None:
     count, columns = recorded.shape
     if replayed.shape[0] < count or replayed.shape[1] != columns or columns <= FLAGS:
         raise ValueError(
-            f"replayed: an array of shape {replayed.shape}; allowed: at least {count} rows of {columns} values"
+            f"replayed values: an array of {' × '.join(map(str, replayed.shape))}; allowed: at least {count} rows "
+            f"of {columns} values"
         )
     place = _first_unequal(*Strided.of(recorded), *Strided.of(replayed), count, columns) if count else -1
     return None if place < 0 else divmod(place, columns)
@@ -63,7 +67,8 @@ def fill_tape(rows: Real, pairs: npt.NDArray[np.int64], tape: Real, refused: npt
     is_within = np.all(pairs >= 0) and np.all(pairs[:, 0] < tape.shape[1]) and np.all(pairs[:, 1] < columns)
     if not is_within or tape.shape[0] < count or refused.size < count or tape.shape[1] < 4 or columns <= FLAGS:
         raise ValueError(
-            f"tape: {tape.shape} for {rows.shape} recorded values; allowed: at least as many rows, known columns"
+            f"playback tape: {tape.shape[0]} rows of {tape.shape[1]} columns for {count} recorded ticks of "
+            f"{columns} columns; allowed: a row for each tick, at least 4 columns, pairs of existing columns"
         )
     if count:
         _fill_tape(

@@ -116,7 +116,9 @@ def _identify_from_rest(
     start = held_out_start(recording) if criterion == "held-out" else None
     models = fit_models(fitted_part(recording, start), orders)
     if not models:
-        raise UnsuitableData(f"{run.name}: no stable model of order {list(orders)} found; use another order")
+        raise UnsuitableData(
+            f"{run.name}: no stable model of order {', '.join(map(str, orders))} found; use another order"
+        )
     models = _require_settled(models, recording)
     candidates = [_score_model(model, recording, start, validation) for model in models]
     score: Callable[[Candidate], float] = lambda c: c.validation_rms_um if criterion == "validation" else c.rms_error_um

@@ -229,5 +229,6 @@ def _require_certain_mode(name: str, modes: tuple[Mode, ...]) -> None:
     if most_certain.frequency_std_hz > LARGEST_RELATIVE_STD * most_certain.frequency_hz:
         raise UnsuitableData(
             f"{name}: too little external excitation: the most certain mode is at {most_certain.frequency_hz:.4g} ± "
-            f"{most_certain.frequency_std_hz:.2g} Hz. Use a reference with a larger amplitude or more frequencies"
+            f"{most_certain.frequency_std_hz:.2g} Hz (standard deviation). Use a reference with a larger amplitude "
+            "or more frequencies"
         )

@@ -23,8 +23,8 @@ class RecordLayout:
         self.size = len(template)
         if self.size < WORD_BYTES or len(is_fixed) != self.size:
             raise ValueError(
-                f"template: {self.size} bytes, is_fixed: {len(is_fixed)} values; allowed: {WORD_BYTES} or more, "
-                "equally many"
+                f"template of {self.size} bytes with {len(is_fixed)} flags; allowed: {WORD_BYTES} bytes or more, "
+                "and a flag for each byte"
             )
         starts = np.minimum(np.arange(0, self.size, WORD_BYTES), self.size - WORD_BYTES)
         self._starts = starts.astype(np.int64)
@@ -42,7 +42,10 @@ class RecordLayout:
         """
         count, excess = divmod(len(content), self.size)
         if excess or not np.all((offsets >= 0) & (offsets <= self.size - WORD_BYTES)):
-            raise ValueError(f"{len(content)} bytes, offsets {offsets}; allowed: whole records of {self.size} bytes")
+            raise ValueError(
+                f"content: {len(content)} bytes, read at the offsets {offsets.tolist()}; allowed: whole records of "
+                f"{self.size} bytes, offsets up to {self.size - WORD_BYTES}"
+            )
         words = np.empty((len(offsets), count), np.uint64)
         places = np.ascontiguousarray(offsets, np.int64)
         is_equal = _take_out(
@@ -66,8 +69,9 @@ def first_fault(
     columns, count = numbers.shape
     if columns < 2 or bounds.shape != (columns, 2) or log_times_ns.shape != (2, count) or not count:
         raise ValueError(
-            f"numbers: {numbers.shape}, bounds: {bounds.shape}, times: {log_times_ns.shape}; "
-            "allowed: (columns, n), (columns, 2), (2, n) with 2 columns and 1 tick at least"
+            f"numbers of {columns} columns and {count} ticks, bounds {' × '.join(map(str, bounds.shape))}, times "
+            f"{' × '.join(map(str, log_times_ns.shape))}; allowed: at least 2 columns and 1 tick, 2 bounds for each "
+            "column, 2 times for each tick"
         )
     arrays = [np.ascontiguousarray(numbers, np.float64), np.ascontiguousarray(bounds, np.float64)]
     times = np.ascontiguousarray(log_times_ns, np.int64)
