@@ -107,7 +107,7 @@ class Board:
             )
         if self._library.comedi_lock(self._handle, subdevice) < 0:
             busy = self._library.comedi_errno() == errno.EBUSY
-            reason = "another program uses it; stop that program" if busy else self.error_text()
+            reason = "another program uses this subdevice; stop that program" if busy else self.error_text()
             raise DriverError(f"{self._device}: subdevice {subdevice}: {reason}")
         return subdevice
 

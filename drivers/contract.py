@@ -95,10 +95,18 @@ class DriverContract:
         before, facts = self.outputs(driver), driver.facts
         for channel in (*facts.inputs, *facts.outputs):
             ends = channel.minimum_v, channel.maximum_v
-            assert all(map(math.isfinite, ends)), f"{channel}: its range is not finite"
-            assert channel.minimum_v < channel.maximum_v, f"{channel}: its range is empty"
+            assert all(map(math.isfinite, ends)), (
+                f"channel {channel.name!r}: range {ends[0]} … {ends[1]} V; allowed: finite numbers"
+            )
+            assert channel.minimum_v < channel.maximum_v, (
+                f"channel {channel.name!r}: range {ends[0]} … {ends[1]} V; allowed: the lower end before the higher"
+            )
         for channel in facts.outputs:
-            assert channel.minimum_v <= channel.safe_v <= channel.maximum_v, f"{channel}: safe_v is outside its range"
+            assert channel.minimum_v <= channel.safe_v <= channel.maximum_v, (
+                f"channel {channel.name!r}: safe_v is {channel.safe_v} V; allowed: a value in the range of the "
+                "channel, "
+                f"{channel.minimum_v} … {channel.maximum_v} V"
+            )
         for names in ([c.name for c in facts.inputs], [c.name for c in facts.outputs], facts.observed):
             assert len(set(names)) == len(names), f"two channels have the same name: {names}"
         assert facts.max_rate_hz > 0, f"max_rate_hz is {facts.max_rate_hz}; allowed: above 0"
@@ -171,7 +179,11 @@ class DriverContract:
                 )
                 for channel, before, after in zip(channels, before_v, after_v, strict=True):
                     stayed = min(abs(after - before), abs(after - channel.safe_v)) <= self.tolerance_v
-                    assert stayed, f"{channel}: open moved the output from {before} V to {after} V, which is not safe_v"
+                    assert stayed, (
+                        f"channel {channel.name!r}: open moved the output from {before} V to {after} V; allowed: no "
+                        "motion, "
+                        f"or safe_v = {channel.safe_v} V"
+                    )
         finally:
             driver.close()
 
@@ -185,7 +197,10 @@ class DriverContract:
                 inputs = driver.facts.inputs
                 for channel, value in zip(inputs, values[: len(inputs)], strict=True):
                     inside = channel.minimum_v <= value <= channel.maximum_v
-                    assert inside, f"{channel}: read gave {value} V, outside its range"
+                    assert inside, (
+                        f"channel {channel.name!r}: read gave {value} V; allowed: the range of the channel, "
+                        f"{channel.minimum_v} … {channel.maximum_v} V"
+                    )
                 age_us, observed = values[len(inputs)], values[len(inputs) + 1 :]
                 assert 0 <= age_us < math.inf, f"the sample's age is {age_us} µs; allowed: 0 or more, finite"
                 assert all(map(math.isfinite, observed)), f"observed signals {observed} are not all finite"
@@ -209,7 +224,10 @@ class DriverContract:
                 calls.write([(c.maximum_v if excess > 0 else c.minimum_v) + excess for c in channels])
                 for channel, volts in zip(channels, self.outputs(driver) or (), strict=False):
                     inside = channel.minimum_v - self.tolerance_v <= volts <= channel.maximum_v + self.tolerance_v
-                    assert inside, f"{channel}: {volts} V, outside the range of the channel, reached the hardware"
+                    assert inside, (
+                        f"channel {channel.name!r}: {volts} V reached the hardware; allowed: the range of the channel, "
+                        f"{channel.minimum_v} … {channel.maximum_v} V"
+                    )
 
     def test_not_a_number_moves_no_output(self) -> None:
         """A write of NaN leaves every output where it was, whatever status it returns."""

@@ -113,7 +113,10 @@ RECOVER = "[service.recover]\n"
         (f"{SERVICE}tare_s = 1.0\n", []),
         (f"{SERVICE}arm = true\ntare_s = 1.0\n", ["service.depolarise, service.tare_s: no effect with service.arm"]),
         (f"{SERVICE}tare_s = 1.0\n{SCHEDULE.replace('-43', '-4')}", ["schedule: not allowed with service.tare_s or"]),
-        (f"{RECOVER}{SCHEDULE.replace('-43', '-4')}", ["schedule: not allowed with service.recover; its ticks"]),
+        (
+            f"{RECOVER}{SCHEDULE.replace('-43', '-4')}",
+            ["schedule: not allowed with service.recover, because the ticks"],
+        ),
     ],
 )
 def test_check_warns_of_what_serve_refuses_or_leaves_out(tmp_path: Path, text: str, warnings: list[str]) -> None:

@@ -25,7 +25,7 @@ from rtloop.drivers.node.options import NodeOptions, SerialOptions, UdpOptions
 RETRY_S, BUSY_S, CONFIRM_S = 0.05, 1.5, 0.02
 LONGEST_PARKING_S = 10.0
 OPENING_HOLD_US = 0xFFFFFFFF
-UNCONFIRMED = "the node does not confirm that its outputs are safe; only its watchdog can make them safe"
+UNCONFIRMED = "the node does not confirm that its outputs are safe; only the node's watchdog can make them safe"
 TOLERANCE = 1e-6
 BITS_PER_BYTE = 10
 MEASURING_WAIT_S, ANY_LEVEL = 0.1, 1 << 40

@@ -89,7 +89,8 @@ def learning_gains(loops: Sequence[tuple[str, Loop]], period_ticks: int) -> Lear
     if unstable:
         raise ValueError(
             f"the loop is unstable with {unstable[0]}; learning needs a loop that is stable for the "
-            "model and for every resonance within resonance_percent of it. Use a smaller resonance_percent, or another "
+            "model and for every resonance within resonance_percent of the model's. Use a smaller "
+            "resonance_percent, or another "
             "controller"
         )
     paths = np.array([np.column_stack(_position_responses(loop, hz)) for _, loop in loops])

@@ -54,7 +54,8 @@ class VerdictTable:
         except BlockingIOError:
             self.close()
             raise UnavailableError(
-                f"{folder}: another process stores verdicts here; wait for it, or choose another folder with --out"
+                f"{folder}: another process stores verdicts in this folder; wait for that process, or choose "
+                "another folder with --out"
             ) from None
         try:
             self._open(self.path)

@@ -177,7 +177,7 @@ def _campaign_section(folder: Path, summary: CampaignSummary, link: Link) -> dic
         "measure": ranked.measure,
         "runnable": len(runnable["rig"]),
         "sensitivity": draw_sensitivity(indices) if indices else None,
-        "crashed": [(rig, "its worker process died each time it ran the rig") for rig in summary.crashed],
+        "crashed": [(rig, "the worker process died each time that this rig ran") for rig in summary.crashed],
         "worst": [
             (rig, *_recordings_picture(folder, rig.rig, manifest["figures"], link))
             for rig in summary.worst_rigs

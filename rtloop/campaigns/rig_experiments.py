@@ -182,7 +182,9 @@ class WaveExperiment(ExperimentOptions):
         """
         error_um = motion.error_um[motion.tick(self.settle_periods / self.frequency_hz) :]
         if not error_um.size:
-            raise ValueError(f"settle_periods: {self.settle_periods:g}; no tick is left after them; raise periods")
+            raise ValueError(
+                f"settle_periods: {self.settle_periods:g}; no tick is left after these periods; raise periods"
+            )
         if not np.all(np.isfinite(error_um)):
             return (math.inf,) * len(self.figures)
         return float(np.sqrt(np.mean(error_um**2))), float(np.max(np.abs(error_um)))

@@ -258,7 +258,9 @@ def read_tables(folder: Path) -> Iterator[pa.Table]:
         try:
             yield _read_table(library, path)
         except (OSError, ValueError) as error:
-            raise InputFileError(f"{path}: damaged ({error}); run the campaign again, which repeats its rigs") from None
+            raise InputFileError(
+                f"{path}: damaged ({error}); run the campaign again, which repeats the rigs of this file"
+            ) from None
 
 
 def read_columns(folder: Path) -> dict[str, Any]:

@@ -268,7 +268,7 @@ def _print_summary(summary: CampaignSummary, folder: Path) -> None:
         if list((folder / "worst").glob("*.mcap")):
             out.print(f"recordings: {escape(folder / 'worst')}")
     for rig in summary.crashed:
-        out.print(f"[red]rig {rig}[/]: its worker died each time; counted as failed")
+        out.print(f"[red]rig {rig}[/]: the worker process died each time that this rig ran; counted as failed")
     for rig, text in summary.refused[:5]:
         out.print(f"[yellow]rig {rig}[/]: not possible, not counted: {escape(text)}")
     if len(summary.refused) > 5:

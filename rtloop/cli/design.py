@@ -24,7 +24,7 @@ def design() -> None:
 )  # fmt: skip
 @click.option("--out", type=OUTPUT, help="The configuration to write [the section alone, to stdout].")
 @click.option("--axis", default="x", show_default=True, help="Name of the axis in the configuration that is written.")
-@click.option("--cross-check", is_flag=True, help="Compute γ with SLICOT as well (needs the extra 'slycot').")
+@click.option("--cross-check", is_flag=True, help="Compute γ with SLICOT as well (needs rtloop[slycot]).")
 @JSON
 @report_errors
 def synthesise(spec: Path, model: Path | None, out: Path | None, axis: str, cross_check: bool, as_json: bool) -> None:

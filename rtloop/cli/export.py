@@ -21,7 +21,7 @@ FORMAT = click.Choice(["csv", "parquet", "npz", "mat", "hdf5"])
 
 @click.command()
 @FILES
-@click.option("--to", type=FORMAT, required=True, help="Format; parquet and hdf5 need the extra 'data'.")
+@click.option("--to", type=FORMAT, required=True, help="Format; parquet and hdf5 need rtloop[data].")
 @click.option("--out", type=OUTPUT, help="The file to write [FILE with another ending].")
 @click.option(
     "--from", "start_s", type=Seconds(allows_zero=True), default=0.0, help="Seconds since the start of the run [0]."

@@ -129,7 +129,7 @@ def import_file(
     except OutputError as error:
         if error.number != errno.EEXIST:
             raise
-        raise OutputError(f"{error}; --out FILE writes another one", error.number) from None
+        raise OutputError(f"{error}; use --out FILE to write another file", error.number) from None
     return report | {"mapping": None if mapping_path is None else str(mapping_path)}
 
 

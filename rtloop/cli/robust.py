@@ -75,7 +75,7 @@ def robust(spec: Path, config: Path | None, out: Path | None, axis: str, as_json
 @click.option("--spec", type=OUTPUT, help="The specification [the axis's key `specification`].")
 @click.option("--out", type=OUTPUT, help="The configuration to write: CONFIG with the taps [their section, to stdout].")
 @click.option("--axis", default="x", show_default=True, help="The axis whose taps are made.")
-@click.option("--plot", type=OUTPUT, help="A picture, .png: the trade-off and the step (needs the extra 'plot').")
+@click.option("--plot", type=OUTPUT, help="A picture, .png: the trade-off and the step (needs rtloop[plot]).")
 @JSON
 @report_errors
 def shape(config: Path, spec: Path | None, out: Path | None, axis: str, plot: Path | None, as_json: bool) -> None:

@@ -31,7 +31,7 @@ RED = {"MISSED", "NO"}
 @click.command()
 @CONFIG
 @click.option("--spec", type=OUTPUT, help="The specification [each axis's key `specification`].")
-@click.option("--out", type=OUTPUT, help="Folder for verify.html, verify.json and pictures (needs the extra 'plot').")
+@click.option("--out", type=OUTPUT, help="Folder for verify.html, verify.json and pictures (needs rtloop[plot]).")
 @JSON
 @report_errors
 def verify(config: Path, spec: Path | None, out: Path | None, as_json: bool) -> int:

@@ -80,7 +80,7 @@ def _service(configuration: Configuration) -> Iterator[str]:
     """Yield a warning for each option of [service] that a run ignores, and that `rtloop serve` refuses or ignores."""
     options = configuration.service
     if configuration.schedule:
-        yield from (f"{fault}: `rtloop serve` refuses it" for fault in options.faults_with_schedule())
+        yield from (f"{fault}; `rtloop serve` refuses this configuration" for fault in options.faults_with_schedule())
     elif options.arm and options.prepares:
         yield "service.depolarise, service.tare_s: no effect with service.arm = true"
 

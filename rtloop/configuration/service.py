@@ -76,7 +76,9 @@ class ServiceOptions(Options):
                 f"socket_mode: {self.socket_mode}; allowed: a mode without access for others, such as 0660"
             )
         if self.recover is not None and self.recover.depolarise and self.depolarise is None:
-            raise ValueError("recover.depolarise: true; add the table [service.depolarise], whose sine it plays")
+            raise ValueError(
+                "recover.depolarise: true; add the table [service.depolarise], whose sine the recovery plays"
+            )
         return self
 
     @property
@@ -90,5 +92,8 @@ class ServiceOptions(Options):
         if self.prepares:
             faults.append("schedule: not allowed with service.tare_s or service.depolarise, which use the first ticks")
         if self.recover is not None:
-            faults.append("schedule: not allowed with service.recover; its ticks do not come again after a trip")
+            faults.append(
+                "schedule: not allowed with service.recover, because the ticks of a schedule do not come again "
+                "after a trip"
+            )
         return faults

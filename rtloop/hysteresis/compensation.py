@@ -90,7 +90,7 @@ def residual_operator(actuator: PlayModel, inverse: PlayModel, command_um: float
     slopes = loading_slopes(inverse)
     if inverse.thresholds[0] != 0 or not np.all(slopes > 0):
         raise ValueError(
-            f"compensator: its loading curve has the slopes {np.array2string(slopes, precision=4)} from its first "
+            f"compensator: the loading curve has the slopes {np.array2string(slopes, precision=4)} from the first "
             f"threshold, {inverse.thresholds[0]:g} µm, on; allowed: slopes above 0, and a first threshold of 0"
         )
     if not (np.isfinite(command_um) and command_um > 0):

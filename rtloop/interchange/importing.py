@@ -238,7 +238,7 @@ def _import_ticks(table: Table, rows: int) -> tuple[Real, list[str]]:
     ):
         return ticks, []
     return new_ticks, [
-        f"the file's ticks, {ticks[0]:g} to {ticks[-1]:g}, do not count its samples; new ticks count from 0"
+        f"the file's ticks, {ticks[0]:g} to {ticks[-1]:g}, do not count the samples of the file; new ticks count from 0"
     ]
 
 

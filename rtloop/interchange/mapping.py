@@ -150,7 +150,9 @@ def find_column(table: Table, path: Path, name_or_path: str) -> str:
         or list(table.columns)[: 4 * MAX_SUGGESTIONS]
     )
     left_out = f" (left out: {table.about['left out']})" if "left out" in table.about else ""
-    raise UnreadableData(f"{path}: no column {name_or_path!r}; its columns include {_quoted_list(similar)}{left_out}")
+    raise UnreadableData(
+        f"{path}: no column {name_or_path!r}; the columns of the file include {_quoted_list(similar)}{left_out}"
+    )
 
 
 def column_unit(table: Table, name: str) -> str | None:

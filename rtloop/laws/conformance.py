@@ -109,7 +109,9 @@ class LawConformance:
         """No function writes to the coefficients: a recording describes the law by them."""
         before = bench.coefficients.tobytes()
         list(bench.run(TICKS))
-        assert bench.coefficients.tobytes() == before, "a function wrote to its coefficients"
+        assert bench.coefficients.tobytes() == before, (
+            "a function of the law wrote to the coefficients, which are read-only"
+        )
 
     def test_it_stays_finite(self, bench: Bench) -> None:
         """Bounded errors with applied commands give commands below 1e9 µm (V for a feedforward)."""

@@ -57,8 +57,8 @@ class StageFigures:
             _require("sensor-min-v", self.sensor_min_v, -10.0, 0.0, "V, as the stage rests at 0 V")
             if self.sensor_min_v > -10.0 and self.drive_min_v != 0.0:
                 raise ValueError(
-                    f"--sensor-min-v: value is {self.sensor_min_v:g}; allowed with --drive-min-v=0 alone, as a stage "
-                    "that goes below 0 µm needs a sensor that shows it"
+                    f"--sensor-min-v: value is {self.sensor_min_v:g}; allowed with --drive-min-v=0 only, as a stage "
+                    "that goes below 0 µm needs a sensor that shows positions below 0 µm"
                 )
         for name, value in (
             ("sensor-noise-um", self.sensor_noise_um),

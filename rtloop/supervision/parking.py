@@ -225,7 +225,7 @@ def park(driver: Driver, slew_v_per_s: float, noted_v: npt.NDArray[np.float64] |
     except Exception as error:
         raise DriverError(
             f"driver {driver.kind!r}: the outputs could not be set to their safe values "
-            f"({one_line_error(error)}); they may still carry voltage: check the amplifier"
+            f"({one_line_error(error)}); the outputs may still carry voltage; check the amplifier"
         ) from error
 
 

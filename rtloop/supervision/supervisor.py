@@ -51,9 +51,9 @@ START_TIME_FIELD = 19
 """Index of the start time in /proc/PID/stat, counted after the process's name."""
 OUTCOME_MESSAGES = {
     "heartbeat_lost": "the loop received no heartbeat from its supervisor and parked the outputs",
-    "law_failed": "law: its memory is invalid (a count or an index is beyond its array, or an axis has not exactly one "
-    "controller); this is a fault of rtloop, or another program changed the memory; the outputs were brought to their "
-    "safe values",
+    "law_failed": "the memory of the law is invalid (a count or an index is beyond its array, or an axis has not "
+    "exactly one controller); this is a fault of rtloop, or another program changed the memory; the outputs were "
+    "brought to their safe values",
 }
 """Messages for outcomes that the loop's process does not explain."""
 

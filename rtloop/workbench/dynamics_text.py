@@ -62,7 +62,11 @@ def print_dynamics(out: Console, report: dict[str, Any]) -> None:
         f"({tests['largest_cross_correlation']:.3f}, {tests['cross_ratio']:.2g} of its 99 % bound)"
     )
     if not tests["white"]:
-        out.print("± assumes noise with the correlation of these residuals; an error of the input is not included")
+        out.print(
+            "the standard deviations (±) assume noise with the correlation of these residuals; an error of the "
+            "input is "
+            "not included"
+        )
     if report["level_correction"]:
         unit = "V" if report["input"] == "drive" else "µm"
         out.print(

@@ -49,7 +49,7 @@ def validation_comments(rows: Sequence[dict[str, Any]], extra: dict[str, Any]) -
     lines = [
         f"held out: {worst_row['rms_error_um']:.3g} µm rms, at most {worst_row['max_error_percent']:.3g} % of "
         f"{worst_row['range_um']:.4g} µm, in {name}; memory at the start: {memory}, "
-        f"{worst_row['judged_percent']:.3g} % of it judged"
+        f"{worst_row['judged_percent']:.3g} % of this recording judged"
     ]
     play_errors_um = [row["as_written_rms_um"] for row in rows if math.isfinite(row["as_written_rms_um"])]
     if extra.get("terms") and play_errors_um:

@@ -33,7 +33,9 @@ def print_summary(out: Console, summary: Summary) -> None:
     rows.add_row("lost", str(summary.ticks_lost), "complete" if summary.complete else "[red]not complete[/]")
     if window := summary.around:
         total, stretches = summary.ticks_logged + summary.ticks_skipped, summary.stretches
-        extent = f"{count_text(stretches, 'stretch', 'stretches')}, {summary.ticks_logged:,} of {total:,} ticks kept"
+        extent = (
+            f"{count_text(stretches, 'stretch', 'stretches')}, {summary.ticks_logged:,} of {total:,} ticks recorded"
+        )
         span = f"{window['before_s']:g} s before and {window['after_s']:g} s after {escape(', '.join(window['on']))}"
         rows.add_row("around events", f"{stretches:,}", f"{extent}: {span}")
     rows.add_row("time", f"{summary.duration_s:.3f} s", f"at {summary.rate_hz:g} Hz")

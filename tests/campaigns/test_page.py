@@ -234,7 +234,7 @@ def test_crashed_and_refused_rigs_are_listed_with_their_reasons(coarse_pictures,
     require_whole(page)
     assert f"{FEW_RIGS - 1} <u>no rig</u>" in page.text
     assert "<u>" not in page.source
-    assert f"{FEW_RIGS} its worker process died" in page.text
+    assert f"{FEW_RIGS} the worker process died" in page.text
     assert "1 crashed, which counts as failed, and 1 could not run, which does not count." in page.text
     assert f"of {FEW_RIGS - 1} rigs pass" in page.text
 

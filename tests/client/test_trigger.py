@@ -207,7 +207,7 @@ def test_a_single_sweep_waits_to_be_armed():
         (lambda: Window("s", 1.0, 1.0), "trigger window: from 1 to 1"),
         (lambda: Stepped("s", -1.0), "trigger threshold: -1; allowed: 0 or more"),
         (lambda: Trigger(Settings(5), lambda: Edge("x", 0.0)).feed(Stretch(COLUMNS, 0, np.zeros((1, 4)))),
-         "signal 'x': not in the record; allowed: flags, mode"),
+         "signal 'x': not recorded; allowed: flags, mode"),
     ],
 )  # fmt: skip
 def test_bad_settings_are_refused(make: Callable[[], object], said: str):

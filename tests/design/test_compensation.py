@@ -104,7 +104,7 @@ def test_the_dead_band_alone_leaves_what_the_model_of_eq_4_says() -> None:
         (
             PlayModel(np.array([0.0, 1.0]), np.array([1.0, -1.5])),
             40.0,
-            "compensator: its loading curve has the slopes .* allowed: slopes above 0",
+            "compensator: the loading curve has the slopes .* allowed: slopes above 0",
         ),
         (INVERSE, -1, "command_um: -1"),
     ],

@@ -92,7 +92,7 @@ CASES = {
                               hardware=Path.unlink),
     "comedi: not a device": Case("comedi", "{device}: Inappropriate ioctl for device; not a comedi device",
                                  hardware=write_text),
-    "comedi: in use": Case("comedi", "{device}: subdevice 0: another program uses it; stop that program",
+    "comedi: in use": Case("comedi", "{device}: subdevice 0: another program uses this subdevice; stop that program",
                            hardware=open_comedi),
     "comedi: channel": Case("comedi", "{device}: ao9 is not a channel of this board; allowed: ao0 … ao3",
                             channels=("ai0", "ao9")),

@@ -122,7 +122,9 @@ def test_a_restarted_node_ends_the_exchange(node):
     wait_for(lambda: calls.write([3.0]) == 0 and calls.read()[0] < 0, "a driver that has failed")
     assert "restarted" in str(driver.error)
     assert abs(node.settled_output_v()) < 1e-5
-    ending = contextlib.nullcontext() if node.kind == "udp" else pytest.raises(DriverError, match="only its watchdog")
+    ending = (
+        contextlib.nullcontext() if node.kind == "udp" else pytest.raises(DriverError, match="only the node's watchdog")
+    )
     with ending:  # The terminal has gone with the first node.
         driver.close()
 

@@ -71,7 +71,7 @@ def test_characterise_takes_the_drive_from_end_to_end_and_names_the_volts(tmp_pa
     assert rows["h/H, drive -2 … 10 V"] == pytest.approx(100 * height_um / width_um, abs=0.3)
     assert rows["H, drive -2 … 10 V"] == pytest.approx(width_um, rel=0.005)
     assert rows["h, drive -2 … 10 V"] == pytest.approx(height_um, rel=0.03)
-    assert {"h/H, half of it, -1 … 5 V", "h/H, minor loop, 0 … 5 V"} <= rows.keys()
+    assert {"h/H, half of the drive, -1 … 5 V", "h/H, minor loop, 0 … 5 V"} <= rows.keys()
     assert not any("whole" in quantity for quantity in rows)
     assert not any("leaves out" in note for note in result.notes)
 

@@ -222,7 +222,7 @@ def test_an_option_replaces_the_signal_of_a_mapping_file_under_its_short_name(sc
     ("options", "code", "message"),
     [
         (["--map", "x_position_um=drive_mV"], 1, "x_position_um from column 'drive_mV': mV cannot be converted to µm"),
-        (["--map", "x_drive_v=voltage"], 1, "no column 'voltage'; its columns include "),
+        (["--map", "x_drive_v=voltage"], 1, "no column 'voltage'; the columns of the file include "),
         (
             ["--map", "drive_v=drive_mV", "--map", "x_drive_v=T [V]"],
             1,
@@ -253,7 +253,10 @@ def test_an_output_that_exists_stays_as_it_is(scan: Path, folder: Path):
     (folder / "scan.mcap").write_bytes(b"precious")
     result = run("import", scan, "--all")
     assert result.exit_code == 73
-    assert "scan.mcap exists already; a recording is never overwritten; --out FILE writes another one" in result.stderr
+    assert (
+        "scan.mcap exists already; a recording is never overwritten; use --out FILE to write another file"
+        in result.stderr
+    )
     assert (folder / "scan.mcap").read_bytes() == b"precious"
     assert {file.name for file in folder.iterdir()} == {"scan.mat", "scan.mcap"}
 

@@ -193,7 +193,7 @@ def service() -> str:
     policies = {pid: os.sched_getscheduler(pid) & ~os.SCHED_RESET_ON_FORK for pid in loop_pids()}
     require(list(policies.values()) == [os.SCHED_FIFO], f"policies of the loop's process: {policies}")
     refused = as_service(BIN / "rtloop", "drivers", "--selftest", CONFIGS / "comedi.toml", "--json", codes=(69,))
-    require("another program uses it" in refused, refused)
+    require("another program uses this subdevice" in refused, refused)
     run("systemctl", "stop", UNIT)
     result = run("systemctl", "show", "--value", "--property", "Result", UNIT).strip()
     require(result == "success", result)

@@ -71,6 +71,6 @@ def test_what_the_board_does_not_have(wiring, options, message):
 def test_a_board_in_use():
     first = comedi(TestOneAxis.wiring)
     first.open()
-    with pytest.raises(DriverError, match="/dev/comedi0: subdevice 0: another program uses it"):
+    with pytest.raises(DriverError, match="/dev/comedi0: subdevice 0: another program uses this subdevice"):
         comedi(TestOneAxis.wiring).open()
     first.close()

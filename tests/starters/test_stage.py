@@ -191,5 +191,5 @@ def test_the_interlock_of_the_sensor_lies_below_the_noise_at_rest(lowest_v, nois
 
 
 def test_a_sensor_from_0_v_on_needs_a_drive_from_0_v_on() -> None:
-    with pytest.raises(ValueError, match="--sensor-min-v: value is 0; allowed with --drive-min-v=0 alone"):
+    with pytest.raises(ValueError, match="--sensor-min-v: value is 0; allowed with --drive-min-v=0 only"):
         StageFigures(sensor_min_v=0.0)

@@ -71,7 +71,7 @@ def fit_light_mode(measured: MeasuredResponse, rate_hz: float, near_hz: float, b
     if (lines := int(in_band.sum())) < MIN_LINES:
         raise ValueError(
             f"only {lines} frequencies of the multisine lie within ±{100 * band:g} % of {near_hz:g} Hz; needs at least "
-            f"{MIN_LINES}. Use a multisine of longer period, or one that is denser there"
+            f"{MIN_LINES} frequencies. Use a multisine of longer period, or with more frequencies in this band"
         )
     hz, plant = measured.hz[in_band], measured.plant[in_band]
     fit = _ModeFit(hz, plant, np.abs(plant) * measured.spread[in_band], rate_hz)

@@ -52,8 +52,9 @@ class PeriodicPart(NamedTuple):
         silent = np.setdiff1d(np.arange(max(1, excited[0] - 1), excited[-1] + 2), excited)
         if not silent.size:
             raise ValueError(
-                "reference: the multisine excites every frequency of its band; leave some out, because only these show "
-                "noise and nonlinearity"
+                "reference: the multisine excites every frequency of the band; leave some frequencies out, because "
+                "noise "
+                "and nonlinearity show only at frequencies without excitation"
             )
         return LineGrid(self.samples, rate_hz, excited, silent)
 

@@ -80,4 +80,4 @@ def column_index(name: str, columns: Sequence[str]) -> int:
     try:
         return columns.index(name)
     except ValueError:
-        raise ValueError(f"signal {name!r}: not in the record; allowed: {', '.join(columns)}") from None
+        raise ValueError(f"signal {name!r}: not recorded; allowed: {', '.join(columns)}") from None

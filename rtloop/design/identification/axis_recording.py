@@ -208,7 +208,7 @@ def excitation_warnings(runs: Sequence[AxisRecording]) -> list[str]:
     for run in runs:
         if run.is_closed_loop:
             cause = "a controller made the drive (mode closed_loop)"
-            effect = "Its response to noise and dynamics of the position counts as hysteresis here"
+            effect = "The controller's response to noise and to the dynamics of the position counts as hysteresis here"
             sentences.append(f"{run.name}: {cause}. {effect}. {remedy}")
         elif jumps(run):
             cause = "the drive has steps, after which the stage rings"

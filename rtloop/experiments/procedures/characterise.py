@@ -92,7 +92,9 @@ def analyse(recordings: Sequence[RecordedRun], _: CharacteriseOptions) -> Analys
         run.row("hysteresis_percent", f"h/H, {drive_text}", "%", major.percent, model_major.percent, TOLERANCE_PERCENT),
         run.row("hysteresis_um", f"h, {drive_text}", "µm", major.height, model_major.height, near_um),
         run.row("range_um", f"H, {drive_text}", "µm", major.width, model_major.width, near_um),
-        run.row("", f"h/H, half of it, {ranges['half']}", "%", half[0].percent, half[1].percent, TOLERANCE_PERCENT),
+        run.row(
+            "", f"h/H, half of the drive, {ranges['half']}", "%", half[0].percent, half[1].percent, TOLERANCE_PERCENT
+        ),
         run.row("", f"h/H, minor loop, {ranges['minor']}", "%", minor[0].percent, minor[1].percent, TOLERANCE_PERCENT),
         run.row("hysteresis_fit", "largest difference to the model", "% of H", fit_percent, 0.0, FIT_TOLERANCE_PERCENT),
     ]

@@ -122,7 +122,7 @@ def _read_numbers(path: Path, dialect: CsvDialect) -> list[list[np.ndarray[Any, 
                 if rows > max_rows:
                     raise UnreadableData(
                         f"{path}: more than {max_rows} rows of {len(dialect.numbers)} numbers; split the file, or "
-                        "leave out columns when you write it"
+                        "leave out columns when you write the file"
                     )
     except (pandas.errors.ParserError, pandas.errors.EmptyDataError, UnicodeError) as fault:
         raise UnreadableData(f"{path}: {_parser_message(str(fault), dialect)}") from None

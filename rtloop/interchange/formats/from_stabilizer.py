@@ -50,7 +50,7 @@ def read_stabilizer(path: Path) -> Table:
     steps = np.diff(sequences, prepend=sequences[:1]).astype(np.int64)
     if np.any(steps[1:] == 0) or np.any(steps >= 1 << 31):
         raise UnreadableData(
-            f"{path}: frames of the stream are not in the order in which they were sent; record it again"
+            f"{path}: frames of the stream are not in the order in which they were sent; record the stream again"
         )
     first = np.cumsum(steps) * samples
     count = (first[:, None] + np.arange(batches * samples)).reshape(-1)
@@ -79,5 +79,5 @@ def _frames(path: Path, data: np.ndarray, samples: int) -> np.ndarray:
         if np.all(frames[:, :4] == data[:4]) and np.all(remainder == data[: len(remainder)]):
             return frames
     raise UnreadableData(
-        f"{path}: the frames of the stream have different lengths, or bytes are missing; record it again"
+        f"{path}: the frames of the stream have different lengths, or bytes are missing; record the stream again"
     )

@@ -122,7 +122,7 @@ class Guard:
                 return 403, "origin: missing; allowed: the origin of the panel's page"
         if is_public(path) or self._sessions.has_session(headers):
             return None
-        return 401, "no session: open the panel with the address that `rtloop panel` printed, with its token"
+        return 401, "no session: open the panel with the address that `rtloop panel` printed, token included"
 
 
 def is_public(path: str) -> bool:

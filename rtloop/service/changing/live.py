@@ -288,8 +288,8 @@ class LiveLaw:
         configuration = self.prepared.configuration
         if axis.feedforward != configuration.axes[number].feedforward:
             raise Refusal(
-                "feedforward: cannot change while the loop runs, because it holds the actuator's present hysteresis "
-                "state; restart the service"
+                "feedforward: cannot change while the loop runs, because the feedforward holds the actuator's present "
+                "hysteresis state; restart the service"
             )
         changed = _replace_axis(configuration, number, axis)
         if faults := shared_faults(changed.axes):

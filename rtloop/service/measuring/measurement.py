@@ -106,7 +106,8 @@ def measure_response(supervisor: Supervisor, live: LiveLaw, axis: str, request: 
     configuration = live.prepared.configuration
     if len(configuration.axes_sharing(number)) > 1:
         raise ConfigError(
-            "request", [f"axis {axis!r}: shares its controller; allowed: an axis with a controller of its own"]
+            "request",
+            [f"axis {axis!r}: shares a controller with other axes; allowed: an axis with a controller of its own"],
         )
     options, rate_hz = configuration.axes[number], configuration.loop.rate_hz
     model = promised_loop(options, rate_hz, delay_ticks(configuration, options))

@@ -117,7 +117,7 @@ class Player:
         if not np.array_equal(self.column(rows, signals.REFERENCE), samples):
             raise Refusal(
                 f"{self._activity}: the recorded reference differs from the one that was sent, because a hold input "
-                "held it or another client changed it; repeat without either"
+                "or another client changed the reference; try again while neither does"
             )
         return rows
 

@@ -119,10 +119,10 @@ def test_invalid_messages_are_refused(text: str):
 
 def test_signals_and_times_that_the_loop_lacks_are_refused():
     for change, said in (
-        ({"signals": ["x_posiotn_um"]}, "not in the record"),
+        ({"signals": ["x_posiotn_um"]}, "not recorded; allowed"),
         ({"seconds": 61.0}, "at most 60 s"),
         ({"trigger": {"kind": "edge"}}, "source: missing"),
-        ({"trigger": {"source": "y"}}, "not in the record"),
+        ({"trigger": {"source": "y"}}, "not recorded; allowed"),
         ({"trigger": {"kind": "window", "source": "tick", "low": 2, "high": 1}}, "lower end"),
     ):
         wish = {"signals": [], "seconds": 1.0, "pixels": 10} | change

@@ -28,7 +28,7 @@ COMMANDS = frozenset(kind.name.lower() for kind in Kind if kind < Kind.REFUSED)
 """Kinds of events that record a command."""
 OPERATOR = Origin.OPERATOR.name.lower()
 """Value of `who` for an operator without a name."""
-LOST_HEARTBEAT = "the heartbeat of `rtloop run` or of the service stopped: its process died or stood still"
+LOST_HEARTBEAT = "the heartbeat of `rtloop run` or of the service stopped: that process died or stood still"
 """Reason of a trip by the heartbeat, which concerns all axes."""
 RESERVED_NAMES = (*(origin.name.lower() for origin in Origin), RECORDER)
 MAX_NAME = 40

@@ -330,7 +330,7 @@ def parse_event(payload: bytes, axes: Sequence[str]) -> Event:
         names = ", ".join((*Kind.__members__, *Note.__members__)).lower()
         raise MalformedText(f"kind: {_shorten(kind)}; allowed: {names} or a number")
     if not is_member_name(Origin, event["who"]) and (fault := name_problem(event["who"])):
-        raise MalformedText(f"who: {fault}")
+        raise MalformedText(f"event {kind}: its field who: {fault}")
     _validate(_MessageDetails, details, "what.")
     _require_command(kind, event["axis"], [_command_value(value) for value in details["values"]])
     return event
