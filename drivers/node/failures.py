@@ -8,7 +8,7 @@ RESTARTED, NOT_READY, LINK, SILENT, NOT_A_NUMBER, LINE_GONE = 101, 102, 103, 104
 """Failures that the loop's side sees. The smaller numbers are reasons of the node's refusals."""
 
 TEXTS = {
-    VERSION_REFUSED: "the node speaks another version of the protocol",
+    VERSION_REFUSED: "the node speaks another version of the protocol; install the node's program of this rtloop",
     BUSY: "another controller drives this node; stop the other controller",
     UNKNOWN: "the node does not know this loop, so the outputs do not follow the loop; start the loop again",
     WATCHDOG: "no drive reached the node for longer than watchdog_ms, and the node's watchdog has parked the outputs",

@@ -171,6 +171,6 @@ def serve(
         while not is_stopped():
             step(node, port, start_s)
     return (
-        f"{node.samples} samples sent, {node.refused} frames refused, {node.old + node.invalid} ignored, "
+        f"{node.samples} samples sent, {node.refused} frames refused, {node.old + node.invalid} frames ignored, "
         f"outputs parked {node.watchdog_parkings} times by the watchdog"
     )

@@ -99,7 +99,9 @@ def _examine(
     `find_recordings`, `examine` and `DaskWorkers`.
     """
     if jobs and scheduler:
-        raise click.UsageError("--jobs: not allowed with --scheduler, whose workers are counted")
+        raise click.UsageError(
+            "--jobs: not allowed with --scheduler, which sets the number of workers; leave --jobs out"
+        )
     from rtloop.supervision.interruption import Interruption
 
     with Interruption() as interruption:

@@ -57,7 +57,9 @@ def choose_workers(jobs: int | None, scheduler: str | None) -> Iterator[Workers]
     The block receives the workers, which are closed at its end. Raises UsageError for both, and as `DaskWorkers`.
     """
     if jobs and scheduler:
-        raise click.UsageError("--jobs: not allowed with --scheduler, whose workers are counted")
+        raise click.UsageError(
+            "--jobs: not allowed with --scheduler, which sets the number of workers; leave --jobs out"
+        )
     from rtloop.campaigns.workers import DaskWorkers, ProcessWorkers
 
     workers = DaskWorkers(scheduler) if scheduler else ProcessWorkers(jobs)

@@ -56,10 +56,10 @@ def _print_comparison(comparison: Comparison) -> None:
     for name, estimate in zip((first, second), comparison.yields, strict=True):
         out.print(
             f"{name}: {estimate.passed:,} of {estimate.rigs:,} rigs pass, {100 * estimate.share:.2f} % "
-            f"({100 * estimate.low:.2f} … {100 * estimate.high:.2f} %)"
+            f"(95 % interval {100 * estimate.low:.2f} … {100 * estimate.high:.2f} %)"
         )
     out.print(
-        f"passed by {first} alone: {comparison.only_first:,}; by {second} alone: {comparison.only_second:,}; "
+        f"passed by {first} alone: {comparison.only_first:,} rigs; by {second} alone: {comparison.only_second:,} rigs; "
         f"p = {comparison.p_value:.3g} if both were equally good"
     )
     rows = [

@@ -78,7 +78,7 @@ def _print_held_out(out: Console, report: dict[str, Any]) -> None:
 def _rms_text(error: dict[str, Any]) -> str:
     """Return `rms_um`, and `std_um` unless it is None, as text without a unit: `0.12 ± 0.03`."""
     std_um = error["std_um"]
-    return f"{error['rms_um']:.3g}" + ("" if std_um is None else f" ± {std_um:.2g}")
+    return f"{error['rms_um']:.3g}" + ("" if std_um is None else f" ± {std_um:.2g} (1σ)")
 
 
 def print_files(out: Console, report: dict[str, Any]) -> None:

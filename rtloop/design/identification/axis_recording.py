@@ -97,7 +97,8 @@ def read_axis_recording(path: Path, axis: str | None = None) -> AxisRecording:
     intervals = np.diff(deadlines)
     if not np.all(intervals > 0):
         raise UnsuitableData(
-            f"{path}: the time of tick {int(np.argmax(intervals <= 0)) + 1} is not later than that of the tick before"
+            f"{path}: the time of tick {int(np.argmax(intervals <= 0)) + 1} is not later than the time of the tick "
+            "before"
         )
     period_ns = float(np.median(intervals))
     any_missed = "periods_missed" in recording and bool(np.any(recording["periods_missed"][1:]))

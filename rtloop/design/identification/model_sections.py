@@ -79,7 +79,7 @@ def dynamics_provenance(fit: DynamicsFit, run: AxisRecording, input_kind: str) -
     `input_kind` is the input of the identification: "hysteresis", "command" or "drive".
     """
     modes = (
-        f"{mode.frequency_hz:.2f} ± {mode.frequency_std_hz:.2g} Hz (ζ {mode.damping:.5f})"
+        f"{mode.frequency_hz:.2f} ± {mode.frequency_std_hz:.2g} Hz (1σ; ζ {mode.damping:.5f})"
         if math.isfinite(mode.frequency_std_hz)
         else "one that decays within a sample"
         for mode in fit.modes

@@ -29,7 +29,9 @@ def signal_figures(feed: Feed, run: int, first: int, end: int, signals: list[str
         past = feed.past
         if past is None or past.run != run or first < past.begin or end > past.end:
             raise RequestRefused(
-                410, f"ticks {first} to {end - 1}: not in memory; ticks of the running loop are kept for a limited time"
+                410,
+                f"ticks {first} to {end - 1}: not in memory, which holds the newest ticks only; select newer ticks, or "
+                "open the recording",
             )
         *values, ticks = past.values([*signals, "tick"], first, end)
     span = f"ticks {first} to {end - 1}"

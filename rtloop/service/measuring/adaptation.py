@@ -106,7 +106,7 @@ def _outcome_text(report: dict[str, Any]) -> str:
     if gain is not None:
         gain_percent = report["gain_percent_from_model"]
         gain_text = "too uncertain" if gain_percent is None else f"{gain_percent:+.2f} % from the model's"
-        measured += f"; gain {gain['value']:.4f} ± {gain['std']:.4f}, {gain_text}"
+        measured += f"; gain {gain['value']:.4f} ± {gain['std']:.4f} (standard deviation), {gain_text}"
     if report["tick"] is None:
         return f"keeps its taps: {measured}; new taps would be no better"
     return f"retuned: {measured}; at tick {report['tick']}"

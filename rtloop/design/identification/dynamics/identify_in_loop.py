@@ -174,7 +174,7 @@ def _require_samples(run: LoopExcitation) -> None:
     """Raise UnsuitableData for fewer than LEAST_SAMPLES ticks."""
     if run.input.size < LEAST_SAMPLES:
         raise UnsuitableData(
-            f"{run.name}: too short: {run.input.size} ticks in closed loop; needs at least {LEAST_SAMPLES}"
+            f"{run.name}: too short: {run.input.size} ticks in closed loop; needs at least {LEAST_SAMPLES} ticks"
         )
 
 

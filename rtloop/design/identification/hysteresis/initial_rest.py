@@ -32,7 +32,7 @@ def require_loop(run: AxisRecording) -> None:
     turns = turning_points(drive, 0.5 * float(np.ptp(drive)))
     if turns.size < 2:
         raise UnsuitableData(
-            f"{run.name}: too little excitation: the drive turns back {turns.size} times; needs at least 2 "
+            f"{run.name}: too little excitation: the drive turns back {turns.size} times; needs at least 2 turns "
             "(one and a half periods of a sine give the major loop)"
             + ("; a step is for `rtloop identify dynamics`" if jumps(run) else "")
         )

@@ -66,7 +66,9 @@ def synthesise_hinf(
             _central_controller(normal_form, _solve_riccati_pair(normal_form, target_gamma), target_gamma)
         )
     except NoController as fault:
-        raise NoController(f"gamma: {target_gamma:g} cannot be reached; {gamma_opt:.6g} can. {fault}") from None
+        raise NoController(
+            f"gamma: {target_gamma:g} cannot be reached; allowed: at least {gamma_opt:.6g}. {fault}"
+        ) from None
     loop = plant.close_loop(controller)
     achieved = hinf_norm(loop).norm
     if not achieved <= 1.01 * target_gamma:
