@@ -59,7 +59,7 @@ def build_rig(options: RigOptions, axes: Sequence[str], period_s: float) -> tupl
     that cannot be discretised at this period.
     """
     if not (math.isfinite(period_s) and period_s > 0):
-        raise ValueError(f"period_s: {period_s} s; allowed: finite, above 0")
+        raise ValueError(f"period_s: {period_s} s; allowed: a finite number above 0")
     if len(set(axes)) != len(axes):
         raise ValueError(f"axes: {list(axes)} names an axis twice")
     for name in options.plants:

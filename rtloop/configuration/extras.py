@@ -67,9 +67,9 @@ def extra_faults(
     names = [axis.name for axis in axes]
     for name, output in outputs.items():
         if output.axis not in names:
-            faults.append(f"outputs.{name}.axis: {output.axis!r} is not an axis; there are {', '.join(names)}")
+            faults.append(f"outputs.{name}.axis: {output.axis!r} is not an axis; the axes are {', '.join(names)}")
     if hold_input is not None and hold_input not in inputs:
-        available_text = f"there are {', '.join(inputs)}" if inputs else "there is none"
+        available_text = f"allowed: {', '.join(inputs)}" if inputs else "[inputs] has no entry"
         faults.append(f"loop.hold_input: {hold_input!r} is not among [inputs]; {available_text}")
     return faults
 
@@ -134,8 +134,8 @@ def connect(law: Law, owned: Sequence[str], inputs: Sequence[str], outputs: Mapp
     for kind, names, available in (("input", law.inputs, list(inputs)), ("output", law.outputs, axis_outputs)):
         for name in names:
             if name not in available:
-                available_text = f"there are {', '.join(available)}" if available else "there is none"
+                available_text = ", ".join(available) or "none"
                 raise ValueError(
-                    f"law {law.kind!r} needs the {kind} {name!r} in [{kind}s]; {available_text} for this law"
+                    f"law {law.kind!r} needs the {kind} {name!r} in [{kind}s]; available for this law: {available_text}"
                 )
     law.channels = {name: numbers[name] for name in (*law.inputs, *law.outputs)}

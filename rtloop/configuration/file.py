@@ -404,7 +404,7 @@ def _cross_faults(sections: FileOptions, channels: Mapping[str, ChannelOptions])
     faults += extra_faults(sections.inputs, sections.outputs, sections.loop.hold_input, sections.axis)
     for entry in sections.schedule:
         if entry.axis is not None and entry.axis not in names:
-            faults.append(f"schedule.axis: {entry.axis!r} is not an axis; there are {', '.join(names)}")
+            faults.append(f"schedule.axis: {entry.axis!r} is not an axis; the axes are {', '.join(names)}")
     for i, entry in enumerate(sections.schedule):
         if entry in sections.schedule[:i]:
             faults.append(f"schedule, at_tick {entry.at_tick}: two equal entries; remove one of them")

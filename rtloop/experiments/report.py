@@ -141,7 +141,7 @@ def _middle_notes(run: RecordedRun) -> list[str]:
         return []
     return [
         f"The drive has one sign: the experiment moves about {run.middle_um:g} µm, the middle of the positions that it "
-        "reaches in any order. Reference, command and position are relative to it."
+        "reaches in any order. Reference, command and position are relative to this middle."
     ]
 
 

@@ -294,7 +294,7 @@ class Supervisor:
                 before, compiled = compiled, stored_file_count()
                 if compiled == before:
                     raise UnavailableError(
-                        f"loop and recorder were not ready within {START_TIMEOUT_S:g} s; the host may be overloaded: "
+                        f"loop and recorder were not ready within {START_TIMEOUT_S:g} s; the host may be overloaded; "
                         "start again"
                     )
                 deadline = time.monotonic() + START_TIMEOUT_S

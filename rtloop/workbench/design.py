@@ -88,7 +88,8 @@ class DesignResult(Result):
     @property
     def headline(self) -> str:
         """Order and norms of the controller."""
-        return f"order {self.order} of {self.full_order}, γ_opt {self.gamma_opt:.6g}, ‖F_l(P, C)‖∞ {self.achieved:.6g}"
+        order = f"controller of order {self.order} (before reduction {self.full_order})"
+        return f"{order}, γ_opt {self.gamma_opt:.6g}, ‖F_l(P, C)‖∞ {self.achieved:.6g}"
 
     @property
     def summary_lines(self) -> list[str]:

@@ -31,7 +31,8 @@ def print_hysteresis(out: Console, report: dict[str, Any]) -> None:
             "of plays; the error may be larger for small steps and for loops of other sizes"
         )
     out.print(
-        f"height of the loop over its range: {format_number(report['measured_h_percent'], '.2f')} % measured, "
+        "height of the hysteresis loop in percent of the position's range: "
+        f"{format_number(report['measured_h_percent'], '.2f')} % measured, "
         f"{format_number(report['model_h_percent'], '.2f')} % by the model"
     )
     if not report["invertible"]:

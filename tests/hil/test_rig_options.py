@@ -133,7 +133,7 @@ def test_mistakes_are_named(text, place, message):
 @pytest.mark.parametrize(
     ("axes", "period_s", "message"),
     [
-        (["x"], 0.0, "period_s: 0.0 s; allowed: finite, above 0"),
+        (["x"], 0.0, "period_s: 0.0 s; allowed: a finite number above 0"),
         (["x"], float("nan"), "period_s: nan"),
         (["x", "x"], 1e-4, "names an axis twice"),
         (["z"], 1e-4, "plants.y: there is no such axis; allowed: z"),

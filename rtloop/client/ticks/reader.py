@@ -80,7 +80,8 @@ class Reader:
         capacity, width = ring.slots.shape
         if len(columns) != width:
             raise UnavailableError(
-                f"{self._path}: ticks have {width} signals, but the service names {len(columns)}; if the service was "
+                f"{self._path}: ticks have {width} signals, but the service names {len(columns)} signals; if the "
+                "service was "
                 "just started again, try again; else use the same version of rtloop as the service"
             )
         if self._mapping is None:

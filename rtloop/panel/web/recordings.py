@@ -148,7 +148,7 @@ class Recordings:
                 f"ticks {body.first} to {body.end - 1}: too many; allowed: at most {LONGEST_S:g} s at once"
             )
         if body.end > run.tick + AHEAD_S * rate_hz:
-            raise ValueError(f"end: {body.end}; allowed: at most {AHEAD_S:g} s after the newest tick, {run.tick}")
+            raise ValueError(f"end: tick {body.end}; allowed: at most {AHEAD_S:g} s after the newest tick, {run.tick}")
         return max(body.first, 0), body.end
 
     def _recording_folder(self) -> RecordingFolder:

@@ -217,10 +217,13 @@ class LiveReferences:
                 f"(`rtloop ctl mode closed_loop`), then a setpoint ({setpoint})"
             )
         if reference.in_volts:
-            raise Refusal(f"reference of axis {name}: in V, of mode raw; allowed: µm (`rtloop ctl mode closed_loop`)")
+            raise Refusal(
+                f"reference of axis {name}: in V (mode raw); allowed: a reference in µm; use `rtloop ctl mode "
+                "closed_loop`"
+            )
         if reference.kind is not Generator.HOLD:
             kind_name = reference.kind.name.lower()
-            raise Refusal(f"reference of axis {name}: kind is {kind_name}; allowed: hold ({setpoint})")
+            raise Refusal(f"reference of axis {name}: kind is {kind_name}; allowed: hold; use {setpoint}")
         return reference.value
 
     def generator(self, options: ReferenceOptions) -> tuple[list[Any], Samples]:

@@ -117,7 +117,7 @@ def _decompress(chunk: Chunk) -> Chunk:
             f"a chunk is compressed with {chunk.compression[:MAX_CHARACTERS]!r}; allowed: zstd, lz4, none"
         )
     if len(data) != size:
-        raise DamagedChunk(f"a chunk has {len(data)} bytes, but its header says {size}")
+        raise DamagedChunk(f"a chunk has {len(data)} bytes, but the header of the chunk says {size} bytes")
     return replace(chunk, compression="", data=data)
 
 
