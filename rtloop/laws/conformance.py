@@ -82,7 +82,8 @@ class LawConformance:
                 name for name in table.names if table[name].base.kind in "iu" and name not in ("unused", "reserved")
             }
             assert set(allowed) == integer_fields, (
-                f"allowed_{kind} has the keys {sorted(allowed)}; allowed: {sorted(integer_fields)}"
+                f"allowed_{kind} has the keys {', '.join(sorted(allowed)) or 'none'}; allowed: "
+                f"{', '.join(sorted(integer_fields)) or 'none'}"
             )
 
     def test_compiled_and_uncompiled_give_the_same_bits(self, bench: Bench) -> None:
@@ -138,7 +139,8 @@ class LawConformance:
             first_um = bench.enter(position_um, error_um, command_um)
             room = BUMP * (1 + np.abs(command_um) + np.abs(error_um))
             assert np.all(np.abs(first_um - command_um) <= room), (
-                f"entered at {command_um} µm, the law gave {first_um} µm"
+                f"after enter at a command of {command_um} µm the law gives {first_um} µm; allowed: about the same "
+                "command"
             )
 
     def test_a_limited_command_does_not_wind_it_up(self, bench: Bench) -> None:

@@ -143,13 +143,13 @@ def _remove_stale_socket(path: Path) -> None:
             probe.setblocking(False)
             probe.connect(str(path))
         raise UnavailableError(
-            f"{path}: another service uses this control socket; stop that service, or give this one another name with "
-            "--name NAME"
+            f"{path}: another service uses this control socket; stop that service, or give this service another name "
+            "with --name NAME"
         )
     except BlockingIOError:  # The queue of a living service is full.
         raise UnavailableError(
-            f"{path}: another service uses this control socket; stop that service, or give this one another name with "
-            "--name NAME"
+            f"{path}: another service uses this control socket; stop that service, or give this service another name "
+            "with --name NAME"
         ) from None
     except ConnectionRefusedError:
         path.unlink()

@@ -35,7 +35,7 @@ def print_plan(out: Console, prepared: Prepared) -> None:
     """Print the configuration's name, axes, rate, mode and driver, and the folder for its recordings."""
     plan, facts = prepared.plan, prepared.facts
     axes = count_text(len(plan.axes), "axis", "axes")
-    driver = f"driver {plan.driver_kind} ({len(facts.inputs)} in, {len(facts.outputs)} out)"
+    driver = f"driver {plan.driver_kind} ({len(facts.inputs)} inputs, {len(facts.outputs)} outputs)"
     rate = f"{plan.pacing.rate_hz:g} Hz"
     out.print(f"[bold]{escape(plan.name)}[/]: {axes} at {rate}, mode {plan.mode.name.lower()}, {driver}")
     out.print(f"records into {escape(str(recordings_folder(prepared.configuration)))}", soft_wrap=True)

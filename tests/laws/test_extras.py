@@ -210,7 +210,11 @@ class Mine(CoupledController):
         ("min_v = 0.0\n\n[[axis]]", "min_v = 1.0\n\n[[axis]]", "outputs.pulse: 1 … 10 V; .* safe voltage, 0 V"),
         ("max_v = 0.75", "max_v = 11.0", "outputs.count: -10 … 11 V"),
         ('channel = "dac1"\naxis = "x"', 'channel = "dac1"\naxis = "z"', "outputs.pulse.axis: 'z' is not an axis"),
-        ("[inputs.back]", "[inputs.black]", "law 'mine' needs the input 'back' in .inputs.; available for this law: spare, black"),
+        (
+            "[inputs.back]",
+            "[inputs.black]",
+            "law 'mine' needs the input 'back' in .inputs.; available for this law: spare, black",
+        ),
         ("[outputs.count]", "[outputs.spare]", "outputs.spare: an input has the same name"),
         ("[inputs.spare]", "[inputs.enable]", "inputs.enable: a recording already has a column enable_v"),
         ("[inputs.spare]", "[inputs.x_drive]", "inputs.x_drive: a recording already has a column x_drive_v"),

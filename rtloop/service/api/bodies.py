@@ -32,7 +32,7 @@ def _require_bounded(settings: dict[str, Any]) -> dict[str, Any]:
         if isinstance(value, str) and len(value) > MAX_CHARACTERS:
             raise ValueError(f"a text of {len(value)} characters; allowed: at most {MAX_CHARACTERS}")
         if isinstance(value, int) and abs(value) > LARGEST_INTEGER:
-            raise ValueError(f"an integer beyond ±{LARGEST_INTEGER}; allowed: smaller integers")
+            raise ValueError(f"an integer beyond ±{LARGEST_INTEGER}; allowed: integers within these limits")
     return settings
 
 
