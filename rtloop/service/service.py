@@ -291,8 +291,10 @@ class Service:
             except (RtloopError, DriverError) as error:
                 if self._end_requested.is_set():
                     return 0  # The end was requested before the loop began.
-                # A schedule would drive from the first tick, while the service is tripped.
-                outputs_off = outputs_off or bool(self.configuration.schedule)
+                # A schedule and a depolarisation would drive the outputs, while the service is tripped.
+                if not outputs_off and self.configuration.service.prepares:
+                    log.warning("the actuator is neither depolarised nor tared, because the service is tripped")
+                outputs_off = True
                 if _is_driver_error(error) and self.recovery.accept_failed_start(str(error)):
                     self._latch_and_wait(str(error))
                     continue

@@ -223,9 +223,15 @@ def test_the_loop_after_one_that_died_begins_with_its_outputs_off(monkeypatch):
     assert resting == [service.configuration.service.arm, True, True]
 
 
-def test_a_schedule_does_not_drive_the_outputs_after_a_start_that_failed(monkeypatch):
+@pytest.mark.parametrize("driving", ["a schedule", "a depolarisation", "nothing but the mode"])
+def test_nothing_drives_the_outputs_after_a_start_that_failed(monkeypatch, caplog, driving):
+    """The service is tripped, and says so; somebody may look after the wiring."""
     service, resting = dying_loops(monkeypatch, after_s=1.0, loops=2)
-    service.configuration = replace(service.configuration, schedule=[ScheduleOptions(at_tick=5, mode="off")])
+    if driving == "a schedule":
+        service.configuration = replace(service.configuration, schedule=[ScheduleOptions(at_tick=5, mode="off")])
+    if driving == "a depolarisation":
+        options = service.configuration.service.model_copy(update={"tare_s": 0.5})
+        service.configuration = replace(service.configuration, service=options)
     episode = service._run_loop
 
     def start(at_rest: bool) -> Any:
@@ -237,6 +243,7 @@ def test_a_schedule_does_not_drive_the_outputs_after_a_start_that_failed(monkeyp
     monkeypatch.setattr(service, "_run_loop", start)
     service.run()
     assert (resting, service.state) == ([False, True], State.TRIPPED)
+    assert ("neither depolarised nor tared" in caplog.text) == (driving == "a depolarisation")
 
 
 def test_a_status_without_a_tick_says_why_it_has_no_axes(monkeypatch):
