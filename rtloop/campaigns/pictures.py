@@ -215,7 +215,7 @@ def histogram_title(curves: FigureValues) -> str:
     if infinite:
         parts.append(f"{infinite:,} more {'has' if infinite == 1 else 'have'} an infinite value")
     if np.isposinf(curves.nominal):
-        parts.append("the value of the nominal rig is infinite")
+        parts.append("this figure is infinite for the nominal rig")
     return "; ".join(parts)
 
 

@@ -45,7 +45,9 @@ class PrefilterOptions(Options):
             )
         for section in self.sections:
             if len(section) != 5:
-                raise ValueError(f"section {list(section)}; allowed: the five numbers b0, b1, b2, a1, a2")
+                raise ValueError(
+                    f"a second-order section is {list(section)}; allowed: the five numbers b0, b1, b2, a1, a2"
+                )
             if not np.all(np.abs(np.roots([1.0, *section[3:]])) < 1):
                 raise ValueError(f"section {list(section)}: unstable; allowed: |roots| of 1 + a1/z + a2/z² below 1")
         return self

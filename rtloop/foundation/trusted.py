@@ -130,7 +130,7 @@ def open_device(path: Path | str) -> int:
     fd = os.open(path, os.O_RDWR | _NONBLOCK | getattr(os, "O_NOCTTY", 0) | _CLOEXEC)
     if not stat.S_ISCHR(os.fstat(fd).st_mode):
         close_descriptor(fd)
-        raise UntrustedPath(path, "not a terminal or another character device")
+        raise UntrustedPath(path, "neither a serial port nor another character device")
     return fd
 
 

@@ -54,7 +54,7 @@ def validation_comments(rows: Sequence[dict[str, Any]], extra: dict[str, Any]) -
     play_errors_um = [row["as_written_rms_um"] for row in rows if math.isfinite(row["as_written_rms_um"])]
     if extra.get("terms") and play_errors_um:
         lines.append(
-            f"the fit took out {' and '.join(extra['terms'])}; these plays alone leave an error of up to "
+            f"the fit also modelled {' and '.join(extra['terms'])}; these plays alone leave an error of up to "
             f"{max(play_errors_um):.3g} µm rms"
         )
     if extra.get("missing"):

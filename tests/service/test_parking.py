@@ -507,7 +507,7 @@ OTHER_WORDS = ('[8192, "<f8", [64]]', '[8192, "<u8", [8]]', '[8192, "<u8", [8, 8
 def test_a_block_that_is_not_understood_counts_as_none(parked, tmp_path, text):
     hardware, park = parked(ReadableCard)
     (tmp_path / "run" / "lab.block").write_bytes(text)
-    assert "the last drives in this file cannot be read and are ignored" in park()
+    assert "the drive voltages that the loop wrote last cannot be read from this file and are ignored" in park()
     assert hardware.written[-1] == 0.0
 
 

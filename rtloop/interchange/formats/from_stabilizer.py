@@ -36,7 +36,9 @@ def read_stabilizer(path: Path) -> Table:
         head = np.frombuffer(start if len(start) == HEADER.itemsize else b"", HEADER)
         size = os.fstat(file.fileno()).st_size
         if len(head) == 0 or head[0]["format"] != ADC_DAC_FORMAT or head[0]["samples"] == 0:
-            raise UnreadableData(f"{path}: a stream of Stabilizer, but not of its ADC and DAC codes (format 1)")
+            raise UnreadableData(
+                f"{path}: a stream of Stabilizer in another format; allowed: format 1, the codes of ADC and DAC"
+            )
         columns = FileColumns(path)
         columns.require_room("the stream", (size // 2,))
         file.seek(0)
