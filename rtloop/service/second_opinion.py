@@ -72,8 +72,8 @@ class SecondOpinion:
             )
         if self.faults:
             raise Refusal(
-                f"{activity}: refused, because rtloop and python-control compute different figures of this loop; report "
-                f"it as a fault of rtloop: {'; '.join(self.faults)}"
+                f"{activity}: refused, because rtloop and python-control compute different figures of this loop; "
+                f"report it as a fault of rtloop: {'; '.join(self.faults)}"
             )
 
 

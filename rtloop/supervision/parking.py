@@ -161,7 +161,8 @@ def _open_last_block(path: Path, account: ParkingAccount) -> Iterator[SharedBloc
                     f"process {pid} drives the outputs; stop that process, then use `rtloop park` again"
                 ) from None
             account.remarks.append(
-                f"{path}: the drive voltages that the loop wrote last cannot be read from this file and are ignored: {one_line_error(error)}"
+                f"{path}: the drive voltages that the loop wrote last cannot be read from this file and are ignored: "
+                f"{one_line_error(error)}"
             )
         yield block
     finally:

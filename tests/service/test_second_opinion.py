@@ -41,7 +41,7 @@ def test_a_controller_that_runs_with_a_wrong_gain_cannot_be_armed(prepared: Prep
     opinion = SecondOpinion()
     opinion.compute(with_louder_controller(prepared))
     with pytest.raises(
-        Refusal, match=r"arm: refused, because python-control disagrees .* axis\.x: closed-loop poles: "
+        Refusal, match=r"arm: refused, because rtloop and python-control .* axis\.x: closed-loop poles: "
     ):
         opinion.require("arm")
 
