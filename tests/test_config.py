@@ -156,7 +156,7 @@ def test_the_message_counts_and_lists():
 def test_axes_and_channels_must_match():
     assert faults(("[driver.channels.x]", "[driver.channels.z]")) == [
         "driver.channels.x: missing; the axis needs input, output, um_per_v",
-        "driver.channels.z: there is no axis of this name",
+        "driver.channels.z: there is no axis of this name; the axes are x",
     ]
     again = '[[axis]]\nname = "x"\nfeedforward = { thresholds_v = [0.0], weights_um_per_v = [1.0] }\n'
     assert faults(more=again) == ["axis.x: two axes have this name; rename one of them"]

@@ -226,8 +226,8 @@ def _system(a: npt.ArrayLike, b: npt.ArrayLike, c: npt.ArrayLike, d: npt.ArrayLi
     ):
         if shape != allowed:
             raise ValueError(
-                f"{name}: {' × '.join(map(str, shape))} numbers; allowed: {' × '.join(map(str, allowed))} numbers, "
-                "for one input and one output"
+                f"{name}: an array of {' × '.join(map(str, shape))}; allowed: {' × '.join(map(str, allowed))}, for "
+                "one input and one output"
             )
     return System(matrix, column, row, float(direct[0]))
 

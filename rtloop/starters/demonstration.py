@@ -89,11 +89,12 @@ def _board_process(config: Path) -> Iterator[None]:
     Raises UnavailableError if it does not start.
     """
     command = [sys.executable, "-m", "rtloop", "hil", "serve", str(config), "--until-stdin-ends"]
-    ready = config.with_name("board-ready")
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as notifications:
-        notifications.bind(str(ready))
+        notifications.bind(
+            ""
+        )  # Linux chooses a name outside the file system, whose paths may be too long for a socket.
         notifications.settimeout(POLL_S)
-        environment = os.environ | {"NOTIFY_SOCKET": str(ready)}
+        environment = os.environ | {"NOTIFY_SOCKET": f"@{notifications.getsockname()[1:].decode()}"}
         process = subprocess.Popen(command, stdin=subprocess.PIPE, process_group=0, env=environment)
         try:
             _wait_until_ready(notifications, process)

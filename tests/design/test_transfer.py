@@ -107,8 +107,11 @@ def test_factors_equal_zpk(poles: list[float], gain: float) -> None:
         (lambda: Transfer.from_transfer_function([1], [0]), "denominator: .* is zero"),
         (lambda: Transfer.from_factors(1, [[1, 1j]], [[1, 2, 3]]), "numerator: .*real"),
         (lambda: Transfer.from_factors(1, [[1, 1, 1]], [[1, 2]]), "improper"),
-        (lambda: Transfer.from_state_space([[1, 2]], [1], [1], 0), "a: shape"),
-        (lambda: Transfer.from_state_space([[1]], [1, 2], [1], 0), "b: shape"),
+        (
+            lambda: Transfer.from_state_space([[1, 2]], [1], [1], 0),
+            "a: an array of 1 × 2; allowed: 1 × 1, for one input",
+        ),
+        (lambda: Transfer.from_state_space([[1]], [1, 2], [1], 0), "b: an array of 2; allowed: 1, for one input"),
         (lambda: Transfer.from_state_space([[1]], [1], [1], [math.nan]), "d: .*finite"),
     ],
 )

@@ -154,7 +154,10 @@ def test_twice_the_same(options):
             {"kind": "table", "file": "wide.csv"},
             r"wide\.csv is not one or two columns of numbers \(line 1\)",
         ),
-        ({"kind": "table", "file": "wide.npy"}, r"wide\.npy has shape \(2, 3\); allowed: one or two columns"),
+        (
+            {"kind": "table", "file": "wide.npy"},
+            r"wide\.npy holds an array of 2 × 3 numbers; allowed: one or two columns",
+        ),
         ({"kind": "table", "file": "complex.npy"}, r"complex\.npy contains complex128; allowed: real numbers"),
         ({"kind": "table", "file": "nothing.npy"}, r"nothing\.npy is not one or two columns of numbers"),
         ({"kind": "table", "file": "empty.csv"}, r"empty\.csv .*at least one number"),

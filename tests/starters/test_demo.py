@@ -42,8 +42,9 @@ def test_the_configuration_is_the_board_that_ships_with_other_paths() -> None:
 
 
 def test_ctrl_c_ends_all_processes_and_leaves_no_file(tmp_path: Path) -> None:
-    runtime = tmp_path / "runtime"
-    environment = os.environ | {"PYTHONPATH": str(ROOT), "TMPDIR": str(tmp_path), "RUNTIME_DIRECTORY": str(runtime)}
+    runtime, folder = tmp_path / "runtime", tmp_path / ("longer than the path of a socket may be " * 3)
+    folder.mkdir()
+    environment = os.environ | {"PYTHONPATH": str(ROOT), "TMPDIR": str(folder), "RUNTIME_DIRECTORY": str(runtime)}
     command = [sys.executable, "-m", "rtloop", "demo", "--port", "0"]
     before = set(MEMORY.glob(f"{PREFIX}*")) if MEMORY.is_dir() else set()
     with subprocess.Popen(command, stderr=subprocess.PIPE, text=True, env=environment, cwd=tmp_path) as demo:
@@ -60,7 +61,7 @@ def test_ctrl_c_ends_all_processes_and_leaves_no_file(tmp_path: Path) -> None:
             assert address, "".join(lines)
             with urllib.request.urlopen(address[0], timeout=ANSWER_S) as response:
                 assert response.status == 200
-            boards = processes_with(f"{tmp_path}/{PREFIX}")
+            boards = processes_with(f"{folder}/{PREFIX}")
             assert any("hil serve" in line for line in boards)
             demo.send_signal(signal.SIGINT)
             rest = demo.stderr.read()
@@ -70,7 +71,7 @@ def test_ctrl_c_ends_all_processes_and_leaves_no_file(tmp_path: Path) -> None:
         finally:
             watchdog.cancel()
             demo.terminate()  # after a failure: it removes its files
-    assert processes_with(f"{tmp_path}/{PREFIX}") == processes_with(str(runtime)) == []
-    left = [path for path in tmp_path.rglob("*") if path != runtime]
+    assert processes_with(f"{folder}/{PREFIX}") == processes_with(str(runtime)) == []
+    left = [path for path in tmp_path.rglob("*") if path not in (runtime, folder)]
     assert left == []
     assert not (set(MEMORY.glob(f"{PREFIX}*")) if MEMORY.is_dir() else set()) - before
