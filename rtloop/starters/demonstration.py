@@ -90,9 +90,8 @@ def _board_process(config: Path) -> Iterator[None]:
     """
     command = [sys.executable, "-m", "rtloop", "hil", "serve", str(config), "--until-stdin-ends"]
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as notifications:
-        notifications.bind(
-            ""
-        )  # Linux chooses a name outside the file system, whose paths may be too long for a socket.
+        # Linux chooses a name outside the file system, whose paths may be too long for a socket.
+        notifications.bind("")
         notifications.settimeout(POLL_S)
         environment = os.environ | {"NOTIFY_SOCKET": f"@{notifications.getsockname()[1:].decode()}"}
         process = subprocess.Popen(command, stdin=subprocess.PIPE, process_group=0, env=environment)

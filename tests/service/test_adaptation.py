@@ -77,7 +77,8 @@ def test_the_journal_has_what_was_done_and_what_was_refused(caplog: pytest.LogCa
         ("INFO", f"axis x retuned: {resonance}; at tick 523005"),
         (
             "INFO",
-            f"axis x retuned: {resonance}; gain 1.0204 ± 0.0014 (standard deviation), +2.04 % from the model's; at tick 523005",
+            f"axis x retuned: {resonance}; gain 1.0204 ± 0.0014 (standard deviation), +2.04 % from the model's; "
+            "at tick 523005",
         ),
         ("INFO", f"axis x keeps its taps: {resonance}; new taps would be no better"),
         ("WARNING", f"axis x is not retuned: {refusal}"),
