@@ -26,16 +26,29 @@ QUANTILES = {"p50": 0.5, "p99": 0.99}
 
 def cyclictest(cpu: int, loops: int) -> dict[str, float]:
     """p50 and p99 of its latencies in µs. It holds /dev/cpu_dma_latency at 0 and locks its memory, as the loop does."""
+    return quantiles_us(*_latencies_ns(cpu, loops, 1_000_000 // RATE_HZ))
+
+
+def cycles_beyond(cpu: int, loops: int, limit_us: float) -> float:
+    """The share of cyclictest's cycles whose latency exceeds `limit_us`, which is also the interval."""
+    histogram_ns, cycles = _latencies_ns(cpu, loops, round(limit_us))
+    return 1.0 - sum(count for value, count in histogram_ns.items() if value <= 1000 * limit_us) / cycles
+
+
+def _latencies_ns(cpu: int, loops: int, interval_us: int) -> tuple[dict[int, int], int]:
+    """The number of cycles by latency in ns, up to HISTOGRAM_NS, and of all cycles. Raises NotMeasured."""
+    if shutil.which("cyclictest") is None:
+        raise NotMeasured("cyclictest is not installed; Debian has it in the package rt-tests")
     with tempfile.TemporaryDirectory() as folder:
         result = Path(folder) / "cyclictest.json"
-        command = ["cyclictest", f"--interval={1_000_000 // RATE_HZ}", f"--priority={PRIORITY}", f"--affinity={cpu}"]
+        command = ["cyclictest", f"--interval={interval_us}", f"--priority={PRIORITY}", f"--affinity={cpu}"]
         command += ["--threads=1", "--mlockall", "--quiet", "--nsecs", f"--histogram={HISTOGRAM_NS}"]
         command += [f"--loops={loops}", f"--json={result}"]
         done = subprocess.run(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
         if done.returncode != 0:
             raise NotMeasured(f"cyclictest ended with {done.returncode}: {done.stderr.strip()}")
         thread = json.loads(result.read_text())["thread"]["0"]
-    return quantiles_us({int(value): count for value, count in thread["histogram"].items()}, thread["cycles"])
+    return {int(value): count for value, count in thread["histogram"].items()}, thread["cycles"]
 
 
 def quantiles_us(histogram_ns: Mapping[int, int], cycles: int) -> dict[str, float]:
@@ -55,8 +68,6 @@ def lateness(effort: Effort) -> dict[str, Any]:
     spinning for the last 60 µs, and of cyclictest at the same interval, priority and processor. The table has p50
     and p99 of each run, and ratios to cyclictest, round by round.
     """
-    if shutil.which("cyclictest") is None:
-        raise NotMeasured("cyclictest is not installed; Debian has it in the package rt-tests")
     cpu, duration_s = last_cpu(), effort.seconds(RUN_S)
     runs = in_turn(
         {

@@ -20,7 +20,7 @@ from rtloop.signals import Flag
 from tests.benchmarks import native, plain_driver
 from tests.benchmarks.board import board, on_a_board
 from tests.benchmarks.configurations import RIG, SINE, STEPS, at_rate, changed, last_cpu, pinned, write
-from tests.benchmarks.lateness import PRIORITY
+from tests.benchmarks.lateness import PRIORITY, cycles_beyond
 from tests.benchmarks.measure import Effort, NotMeasured, say
 from tests.benchmarks.processes import Failed
 from tests.benchmarks.processes import rtloop as command
@@ -30,6 +30,8 @@ WINDOW_NS = 1e9
 WINDOWS = 7
 ALLOWED = 0.001
 SPIN_US = 60.0
+WHOLE = "sim", "spinning"
+"""The loop that is measured at every rate of the ladder, beside what the host leaves."""
 GENTLE = ("gain = 0.016", "gain = 0.004")
 """The paper's controller has hardly any margin: with another plant, or a board's delay, it would trip."""
 PLAIN = f"""[driver]
@@ -65,22 +67,23 @@ def late_shares(deadline_ns: Signal, flags: Signal, missed: Signal) -> Late:
     return Late(*(float(np.median(share)) for share in shares))
 
 
-def highest_rates(late_at: Callable[[float], Late]) -> dict[str, Any]:
+def highest_rates(late_at: Callable[[float], Late], *, whole: bool = False) -> dict[str, Any]:
     """Hz, for each share: the last rate of the ladder before the first one that is not kept; 0 where none is.
 
-    `late_at` returns the shares at a rate in Hz. They are returned too, in %, for each rate that was tried.
+    `late_at` returns the shares at a rate in Hz. `whole`: the ladder does not end there, and the share of overruns at
+    each rate is returned too, in %.
     """
     highest, kept = dict.fromkeys(Late._fields, 0.0), set(Late._fields)
     percent: dict[str, float] = {}
     for rate_hz in RATES_HZ:
         late = late_at(rate_hz)
         say(f"{rate_hz} Hz: overrun {late.overrun:.3%}, overrun or skipped {late.lost:.3%}")
-        percent |= {f"{rate_hz // 1000}_khz {name}_percent": 100 * share for name, share in late._asdict().items()}
+        percent[f"overrun_percent_at_{rate_hz // 1000}_khz"] = 100 * late.overrun
         kept &= {name for name, share in late._asdict().items() if share < ALLOWED}
         highest |= dict.fromkeys(kept, float(rate_hz))
-        if not kept:
+        if not kept and not whole:
             break
-    return {f"{name}_hz": rate_hz for name, rate_hz in highest.items()} | percent
+    return {f"{name}_hz": rate_hz for name, rate_hz in highest.items()} | (percent if whole else {})
 
 
 def _run(text: str, duration_s: float) -> Late:
@@ -149,18 +152,32 @@ def rates(effort: Effort) -> dict[str, Any]:
     `rtloop run` runs the paper's law (a quarter of its gain) with recording: on the simulated rig, on a driver in
     plain Python, and on a board in shared memory with a separate clock at 10 kHz. The loop sleeps, or spins for
     the last 60 µs. Above 16 kHz it spins all the time; the kernel then gives 5 % of this processor to other
-    waiting tasks. `host` is a loop in C that spins for its deadlines and does nothing else: what the machine
-    leaves. Where it is late too, no program on this machine is in time.
+    waiting tasks.
+
+    Beside it, at every rate: `host`, a loop in C that spins for its deadlines and does nothing else, and cyclictest.
+    They show what the machine leaves: where they are late too, no program on it is in time.
     """
     duration_s = max(round(effort.seconds(WINDOWS)), 2) + 0.5
-    found: dict[str, Any] = {"host": {"spinning": highest_rates(partial(_bare_spin, duration_s=duration_s))}}
+    found: dict[str, Any] = {
+        "host": {"spinning": highest_rates(partial(_bare_spin, duration_s=duration_s), whole=True)},
+        "cyclictest": {"sleeping": highest_rates(partial(_cyclictest, duration_s=duration_s), whole=True)},
+    }
     for name, kind in {"sim": _sim, "python": _plain, "shm": _shm}.items():
         with kind() as configure:
             found[name] = {
-                way: highest_rates(partial(_loop, configure, spin_us, duration_s))
+                way: highest_rates(partial(_loop, configure, spin_us, duration_s), whole=(name, way) == WHOLE)
                 for way, spin_us in {"sleeping": 0.0, "spinning": SPIN_US}.items()
             }
     return found
+
+
+def _cyclictest(rate_hz: float, duration_s: float) -> Late:
+    """The share of cyclictest's cycles that woke later than a period; it tells nothing of windows and skipped cycles.
+
+    Raises NotMeasured without cyclictest.
+    """
+    share = cycles_beyond(last_cpu(), round(rate_hz * duration_s), 1e6 / rate_hz)
+    return Late(share, share)
 
 
 def _loop(configure: Configure, spin_us: float, duration_s: float, rate_hz: float) -> Late:
