@@ -138,7 +138,7 @@ def take_apart(path: Path) -> Base:
     with Reader(path) as reader:
         entries = [(entry, entry.index) for entry in reader.entries[1:] if entry.index]
         assert len(entries) == len(reader.entries) - 1
-        chunks = [Chunk(reader._layout.content(entry), tuple(index.message_index_offsets)) for entry, index in entries]
+        chunks = [Chunk(reader._layout.content(entry), index.channels) for entry, index in entries]
         return Base(reader.header, chunks, format.tick_dtype(reader.columns))
 
 

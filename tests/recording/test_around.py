@@ -209,7 +209,7 @@ def test_a_recording_around_events_can_be_rewritten_by_another_tool(selected: Pa
 
 def test_a_damaged_overview_counts_as_a_loss(selected: Path, tmp_path: Path):
     with Reader(selected) as reader:
-        entry = next(entry for entry in reader.entries if entry.index and 5 in entry.index.message_index_offsets)
+        entry = next(entry for entry in reader.entries if entry.index and 5 in entry.index.channels)
     damaged = flip_byte(selected, entry.offset + entry.length - 20, tmp_path / "damaged.mcap")
     summary, report = summarise(damaged), replay(load(damaged))
     assert (summary.complete, len(summary.problems), summary.ticks_lost > 0) == (False, 1, True)

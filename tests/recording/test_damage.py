@@ -239,7 +239,7 @@ def test_a_recovered_file_without_a_chunk_of_events_and_snapshots_is_not_complet
     """All ticks are there; only the chunk shows the loss."""
     write_recording(path, ROWS)
     with Reader(path) as reader:
-        slow = [entry for entry in reader.entries if entry.index and format.LAW in entry.index.message_index_offsets]
+        slow = [entry for entry in reader.entries if entry.index and format.LAW in entry.index.channels]
     entry = slow[place]
     report = recover(flip_byte(path, entry.offset + entry.length - 1))
     assert (report["ticks"], report["gaps"], report["complete"]) == (COUNT, [], False)

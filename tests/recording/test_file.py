@@ -196,3 +196,17 @@ def test_a_growing_file_needs_little_memory_for_each_chunk(tmp_path: Path):
     tracemalloc.stop()
     writer.close()
     assert 50 < bytes_per_chunk < 400
+
+
+def test_the_index_is_read_as_the_stock_reader_reads_it(path: Path):
+    with path.open("rb") as file:
+        summary = make_reader(file).get_summary()
+    assert summary is not None
+    with Reader(path) as reader:
+        indexes = [entry.index for entry in reader.entries]
+    assert len(indexes) > 2
+    for index, stock in zip(indexes, summary.chunk_indexes, strict=True):
+        assert index == (
+            stock.chunk_start_offset, stock.chunk_length, stock.message_index_length, stock.message_start_time,
+            stock.message_end_time, stock.uncompressed_size, tuple(stock.message_index_offsets),
+        )  # fmt: skip

@@ -111,7 +111,7 @@ def sensitive_places(path: Path) -> np.ndarray[Any, Any]:
     with Reader(path) as reader:
         for entry in reader.tick_chunks:
             assert entry.index is not None
-            assert TICKS in entry.index.message_index_offsets or not entry.index.message_index_offsets
+            assert TICKS in entry.index.channels or not entry.index.channels
             free[entry.offset + CHUNK_HEAD_BYTES : entry.offset + entry.length] = False
     return np.flatnonzero(free)
 

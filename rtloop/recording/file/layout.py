@@ -43,8 +43,8 @@ class OwnLayout:
     @property
     def is_mixed(self) -> bool:
         """Whether the index has a chunk of ticks and other messages, which rtloop does not write."""
-        offsets = (entry.index.message_index_offsets for entry in self.entries if entry.index)
-        return any(len(channels) > 1 and format.TICKS in channels for channels in offsets)
+        indexes = (entry.index for entry in self.entries if entry.index)
+        return any(len(index.channels) > 1 and format.TICKS in index.channels for index in indexes)
 
     def _find_chunks(self) -> list[ChunkEntry]:
         """Return the chunks by the index of the file or, if that is missing or damaged, by a scan of the file.

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import NamedTuple
 
 from mcap.opcode import Opcode
-from mcap.records import ChunkIndex
 
 from rtloop.foundation.trusted import close_descriptor, open_user_file
 from rtloop.recording.errors import RecordingError
@@ -23,6 +22,7 @@ from rtloop.recording.file.mcap.container import (
     MAGIC,
     PREFIX,
     DamagedChunk,
+    IndexedChunk,
     parse_chunk_head,
     parse_summary,
 )
@@ -53,7 +53,7 @@ class ChunkEntry(NamedTuple):
 
     offset: int
     length: int
-    index: ChunkIndex | None  # pyright: ignore[reportIncompatibleMethodOverride]
+    index: IndexedChunk | None  # pyright: ignore[reportIncompatibleMethodOverride]
 
 
 class McapSource:
@@ -121,17 +121,17 @@ def read_chunk_index(source: McapSource) -> list[ChunkEntry]:
         raise DamagedChunk("the end of the file is damaged")
     indexes = parse_summary(source.read(start, source.size - len(MAGIC) - start))
     _require_contiguous(source, indexes, start - DATA_END_BYTES)
-    return [ChunkEntry(index.chunk_start_offset, index.chunk_length, index) for index in indexes]
+    return [ChunkEntry(index.offset, index.length, index) for index in indexes]
 
 
-def _require_contiguous(source: McapSource, indexes: list[ChunkIndex], end: int) -> None:
+def _require_contiguous(source: McapSource, indexes: list[IndexedChunk], end: int) -> None:
     """Raise DamagedChunk unless the indexed chunks, each with its message indexes, fill the data section to `end`."""
     _, position = _parse_record(source, len(MAGIC))
     position += len(MAGIC)
     for index in indexes:
-        if index.chunk_start_offset != position or index.chunk_length < CHUNK_HEAD.size:
+        if index.offset != position or index.length < CHUNK_HEAD.size:
             break
-        position += index.chunk_length + index.message_index_length
+        position += index.length + index.index_length
     if position != end:
         raise DamagedChunk("the chunk index contradicts the chunks")
 

@@ -44,9 +44,7 @@ def may_hold_slow(entry: ChunkEntry, channel: int) -> bool:
     """
     if entry.index is None or channel == format.OVERVIEW:
         return may_hold(entry, channel)
-    return any(
-        other_channel not in (format.TICKS, format.OVERVIEW) for other_channel in entry.index.message_index_offsets
-    )
+    return any(other_channel not in (format.TICKS, format.OVERVIEW) for other_channel in entry.index.channels)
 
 
 def may_hold(entry: ChunkEntry, channel: int) -> bool:
@@ -56,7 +54,7 @@ def may_hold(entry: ChunkEntry, channel: int) -> bool:
     """
     if entry.index is None:
         return True
-    return channel in (entry.index.message_index_offsets or {format.TICKS})
+    return channel in (entry.index.channels or (format.TICKS,))
 
 
 def overlaps(entry: ChunkEntry, start_ns: float, end_ns: float) -> bool:
@@ -65,9 +63,7 @@ def overlaps(entry: ChunkEntry, start_ns: float, end_ns: float) -> bool:
     A chunk up to 1 µs outside counts too, because a double of such a time is not more exact.
     """
     index, margin_ns = entry.index, 1e3
-    return index is None or not (
-        index.message_end_time < start_ns - margin_ns or index.message_start_time > end_ns + margin_ns
-    )
+    return index is None or not (index.end < start_ns - margin_ns or index.start > end_ns + margin_ns)
 
 
 def read_chunk(source: McapSource, entry: ChunkEntry) -> bytes:
@@ -79,8 +75,7 @@ def read_chunk(source: McapSource, entry: ChunkEntry) -> bytes:
     record = source.read(entry.offset, entry.length)
     if entry.index:
         head = parse_chunk_head(record)
-        indexed = entry.index.message_start_time, entry.index.message_end_time, entry.index.uncompressed_size
-        if (head.start, head.end, head.uncompressed) != indexed:
+        if (head.start, head.end, head.uncompressed) != (entry.index.start, entry.index.end, entry.index.uncompressed):
             raise DamagedChunk("the content contradicts the index")
     return record
 
