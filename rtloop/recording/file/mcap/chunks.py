@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -124,7 +124,7 @@ def read_chunk_index(source: McapSource) -> list[ChunkEntry]:
     return [ChunkEntry(index.offset, index.length, index) for index in indexes]
 
 
-def _require_contiguous(source: McapSource, indexes: list[IndexedChunk], end: int) -> None:
+def _require_contiguous(source: McapSource, indexes: Sequence[IndexedChunk], end: int) -> None:
     """Raise DamagedChunk unless the indexed chunks, each with its message indexes, fill the data section to `end`."""
     _, position = _parse_record(source, len(MAGIC))
     position += len(MAGIC)

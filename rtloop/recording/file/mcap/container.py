@@ -9,6 +9,7 @@ from __future__ import annotations
 import struct
 import threading
 from collections.abc import Iterable, Iterator, Sequence
+from functools import lru_cache
 from typing import NamedTuple
 
 import zstandard
@@ -188,21 +189,23 @@ def index_record_span(record: bytes) -> tuple[int, int, int]:
     return start, end, offset
 
 
-def parse_summary(data: bytes) -> list[IndexedChunk]:
+@lru_cache(maxsize=1)
+def parse_summary(data: bytes) -> tuple[IndexedChunk, ...]:
     """Parse the chunk indexes in `data`: the summary section and the footer without magic.
 
-    Raises DamagedChunk if the checksum differs or an index record cannot be read.
+    The newest result is kept: a replay opens its file several times, and its processes share the index. Raises
+    DamagedChunk if the checksum differs or an index record cannot be read.
     """
     (crc,) = struct.unpack_from("<I", data, len(data) - 4)
     if crc32(data[:-4]) != crc:
         raise DamagedChunk("the checksum of the summary differs")
     known_channels: dict[tuple[int, ...], tuple[int, ...]] = {}
     try:
-        return [
+        return tuple(
             _parse_chunk_index(content, known_channels)
             for opcode, content in split_records(data[:-FOOTER_BYTES])
             if opcode == Opcode.CHUNK_INDEX
-        ]
+        )
     except struct.error as error:
         raise DamagedChunk(f"the chunk index cannot be read ({error})") from None
 
