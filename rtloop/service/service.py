@@ -29,6 +29,7 @@ from rtloop.drivers.errors import DriverError
 from rtloop.engine.memory import Word
 from rtloop.engine.messages import MESSAGE, Kind
 from rtloop.errors import ConfigError, LoopFault, RtloopError, UnavailableError
+from rtloop.foundation.arrays import Real
 from rtloop.foundation.trusted import open_own
 from rtloop.recording.file.recover import find_leftovers, recover
 from rtloop.service.changing.building import prepare_builder, prepare_limited
@@ -132,7 +133,7 @@ class Service:
 
         Before a loop's first tick it is TRIPPED if there are faults, else STARTING.
         """
-        row = None if self.supervisor is None else self.supervisor.latest()
+        row = self._latest_row()
         if row is None:
             return State.TRIPPED if self.faults else State.STARTING
         if self.faults or self._has_died or int(row[signals.FLAGS]) & signals.TRIP_MASK:
@@ -146,7 +147,13 @@ class Service:
     @property
     def _has_died(self) -> bool:
         """Whether the present loop's process has died; parking its outputs was tried, its files may be unfinished."""
-        return self.supervisor is not None and self.supervisor.error is not None
+        supervisor = self.supervisor  # the loop may end in another thread meanwhile
+        return supervisor is not None and supervisor.error is not None
+
+    def _latest_row(self) -> Real | None:
+        """Return the newest record of the present loop (columns,); None without a loop, and before its first tick."""
+        supervisor = self.supervisor  # the loop may end in another thread meanwhile
+        return None if supervisor is None else supervisor.latest()
 
     @property
     def is_moved(self) -> bool:
@@ -162,9 +169,10 @@ class Service:
     @property
     def desk(self) -> Desk:
         """The desk of the running loop. Raises Refusal without a loop, or before its first tick."""
-        if self._desk is None or self.supervisor is None or self.supervisor.latest() is None:
+        desk = self._desk
+        if desk is None or self._latest_row() is None:
             raise Refusal(f"no loop is running: the state of the service is {self.state}")
-        return self._desk
+        return desk
 
     def require_live(self) -> LiveLaw:
         """Return the law of the loop, for its live changes. Raises Refusal without a loop."""
@@ -226,7 +234,7 @@ class Service:
         except RefusedByLoop as refusal:
             if mode is not Mode.OFF:
                 raise
-            row = None if self.supervisor is None else self.supervisor.latest()
+            row = self._latest_row()
             if row is not None and int(row[signals.FLAGS]) & Flag.WRITE_FAILED:
                 reason = "the driver refuses every write: the outputs do not move; use the emergency stop"
                 raise Refusal(f"mode off: {reason}") from None
