@@ -183,15 +183,17 @@ class LiveLaw:
         offset stays. Raises UnconfirmedCommand: the loop may still load the new one, which counts as loaded.
         """
         with self._staging.lock:
-            axis, earlier_v = self.prepared.configuration.axes[number], dict(self.offsets_v)
+            axis, earlier_v = self.prepared.configuration.axes[number], self.offsets_v.get(number)
             self.offsets_v[number] = offset_v
             try:
                 return self._stage(
                     number, self.prepared, axis, f"position 0 µm is now at a reading of {offset_v:.4g} V"
                 )
             except Refusal:
-                self.offsets_v.clear()
-                self.offsets_v.update(earlier_v)
+                if earlier_v is None:
+                    del self.offsets_v[number]
+                else:
+                    self.offsets_v[number] = earlier_v
                 raise
 
     def replace_all(self, prepared: Prepared) -> list[str]:
