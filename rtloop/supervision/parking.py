@@ -151,7 +151,7 @@ def _open_last_block(path: Path, account: ParkingAccount) -> Iterator[SharedBloc
         try:
             with _block_errors(path):
                 found = SharedBlock.attach(fd, lambda: True)
-            _require_drives(found)
+            _require_known_arrays(found)
             block = found
         except EOFError:  # The service died before it had written the block.
             pass
@@ -169,8 +169,11 @@ def _open_last_block(path: Path, account: ParkingAccount) -> Iterator[SharedBloc
         close_descriptor(fd)
 
 
-def _require_drives(block: SharedBlock) -> None:
-    """Raise one of UNREADABLE unless the block has control words and the last drives as this version writes them."""
+def _require_known_arrays(block: SharedBlock) -> None:
+    """Raise ValueError or KeyError unless the block has its control words and last drive voltages as this version does.
+
+    The types and the dimensions of both arrays are checked.
+    """
     words, drives_v = block["words"], block["last_drive_v"]
     if words.dtype != np.uint64 or words.ndim != 1 or words.size < len(Word):
         raise ValueError(f"words: {words.dtype} {words.shape}; allowed: uint64, at least {len(Word)}")

@@ -152,8 +152,8 @@ def recover(
 def remove_leftover(output: Path, suffix: str) -> None:
     """Remove the unfinished file, `output` plus `suffix`, of an earlier attempt to write `output`, if there is one.
 
-    Raises OutputError if another process is writing it or it cannot be removed, RecordingError if its lock cannot be
-    tested.
+    A process that writes such a file holds a lock on the file. Raises OutputError if another process does, or if the
+    file cannot be removed, RecordingError if the lock cannot be tested.
     """
     leftover = output.with_name(output.name + suffix)
     if is_being_written(leftover):

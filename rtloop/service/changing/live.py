@@ -179,8 +179,9 @@ class LiveLaw:
     def tare(self, number: int, offset_v: float) -> int:
         """Make `offset_v` the reading at position 0 of axis `number`, now and after later changes.
 
-        Returns the tick at which it took effect. Raises Refusal, also while an earlier change is unsettled: the earlier
-        offset stays. Raises UnconfirmedCommand: the loop may still load the new one, which counts as loaded.
+        Returns the tick at which the offset took effect. Raises Refusal if the loop refuses, and while an earlier change
+        is unconfirmed; the earlier offset then stays. Raises UnconfirmedCommand if the loop does not answer; it may
+        still load the new offset, so that later changes carry the new offset.
         """
         with self._staging.lock:
             axis, earlier_v = self.prepared.configuration.axes[number], self.offsets_v.get(number)

@@ -191,10 +191,10 @@ def index_record_span(record: bytes) -> tuple[int, int, int]:
 
 @lru_cache(maxsize=1)
 def parse_summary(data: bytes) -> tuple[IndexedChunk, ...]:
-    """Parse the chunk indexes in `data`: the summary section and the footer without magic.
+    """Parse the chunk indexes in `data`: the summary section and the footer, without the magic bytes behind it.
 
-    The newest result is kept: a replay opens its file several times, and its processes share the index. Raises
-    DamagedChunk if the checksum differs or an index record cannot be read.
+    The result of the newest `data` is cached: a replay opens its file several times, and forked processes inherit the
+    cache. Raises DamagedChunk if the checksum differs or an index record cannot be read.
     """
     (crc,) = struct.unpack_from("<I", data, len(data) - 4)
     if crc32(data[:-4]) != crc:
@@ -211,9 +211,10 @@ def parse_summary(data: bytes) -> tuple[IndexedChunk, ...]:
 
 
 def _parse_chunk_index(content: bytes, known_channels: dict[tuple[int, ...], tuple[int, ...]]) -> IndexedChunk:
-    """Parse the content of a chunk index record. Raises struct.error if it is cut off.
+    """Parse the content of a chunk index record. Raises struct.error if the content is cut off.
 
-    `known_channels` has one tuple for all chunks with the same channels; a new one is added.
+    `known_channels` maps each tuple of channels to itself, so that chunks with the same channels share one tuple, which
+    saves memory. A new tuple is added.
     """
     start, end, offset, length, places_bytes = INDEX_BEGIN.unpack_from(content)
     position = INDEX_BEGIN.size + places_bytes
