@@ -155,7 +155,7 @@ def choose_exchange(frames: dict[str, Frame], channels: int, options: BusOptions
 
 
 def require_signals(frame: Frame, names: Sequence[str], options: BusOptions) -> None:
-    """Raise ValueError, naming the DBC file of `options`, unless the frame has exactly these signals, in bit order."""
+    """Raise ValueError, with the DBC file of `options`, unless the frame has exactly these signals, in bit order."""
     if [*frame.signals] != [*names]:
         raise ValueError(
             f"dbc: {options.dbc}: {frame.name} has the signals {', '.join(frame.signals)}; "
