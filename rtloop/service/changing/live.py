@@ -179,8 +179,8 @@ class LiveLaw:
     def tare(self, number: int, offset_v: float) -> int:
         """Make `offset_v` the reading at position 0 of axis `number`, now and after later changes.
 
-        Returns the tick at which the offset took effect. Raises Refusal if the loop refuses, and while an earlier change
-        is unconfirmed; the earlier offset then stays. Raises UnconfirmedCommand if the loop does not answer; it may
+        Returns the tick at which the offset took effect. Raises Refusal if the loop refuses, or an earlier change is
+        unconfirmed; the earlier offset then stays. Raises UnconfirmedCommand if the loop does not answer; it may
         still load the new offset, so that later changes carry the new offset.
         """
         with self._staging.lock:
