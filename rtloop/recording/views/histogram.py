@@ -56,11 +56,12 @@ class TimeHistogram:
 
         A quantile is the smallest value that at least this fraction of the values does not exceed.
         """
-        large = sorted(self._large.items())
-        values = np.concatenate([np.arange(self.LINEAR_NS), np.array([value for value, _ in large], np.int64)])
-        cumulative = np.cumsum(np.concatenate([self._counts, np.array([count for _, count in large], np.int64)]))
-        if cumulative[-1] == 0:
+        small, large = np.flatnonzero(self._counts), sorted(self._large.items())
+        values = np.concatenate([small, np.array([value for value, _ in large], np.int64)])
+        counts = np.concatenate([self._counts[small], np.array([count for _, count in large], np.int64)])
+        if not len(values):
             return [None] * len(quantiles)
+        cumulative = np.cumsum(counts)
         ranks = [max(math.ceil(quantile * cumulative[-1]), 1) for quantile in quantiles]
         return [float(values[np.searchsorted(cumulative, rank)]) / NS_PER_US for rank in ranks]
 

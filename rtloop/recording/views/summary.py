@@ -25,8 +25,8 @@ from rtloop.signals import DEADLINE, Flag, Mode
 MEASURED_TIMES = ("lateness_us", "exec_us", "read_us", "law_us", "write_us")
 COMMON = ("tick", "deadline_ns", "periods_missed", "flags", "mode", *MEASURED_TIMES)
 LIMIT_FLAGS = {"command": Flag.COMMAND_LIMITED, "drive": Flag.DRIVE_LIMITED, "slew": Flag.SLEW_LIMITED}
-BATCH_ROWS = 1 << 18
-"""Rows per batch; larger than any chunk."""
+PROGRESS_TICKS = 1 << 18
+"""Number of ticks after which the progress is reported."""
 
 
 @dataclass(frozen=True)
@@ -349,21 +349,15 @@ def _bands_um(header: dict[str, Any]) -> dict[str, float | None]:
 
 
 def _sum_ticks(readers: Sequence[Reader], progress: ReportTicks | None) -> RecordingTotals:
-    """Sum up all ticks of all files, in batches; `progress` receives the number of ticks so far."""
+    """Sum up all ticks of all files, chunk by chunk; `progress` receives the number of ticks so far."""
     header, axes = readers[0].header, readers[0].header["axes"]
     totals = RecordingTotals(_bands_um(header), header["imported"]["units"] if "imported" in header else {})
     names = [*COMMON, *(f"{axis}_{signal}" for axis in axes for signal in ("error_um", "drive_v", "position_um"))]
     if "imported" in header:
         names = [*readers[0].columns]
-    batch, fill = np.empty((len(names), BATCH_ROWS)), 0
     for rows in (rows for reader in readers for rows in reader.blocks(names)):
-        if fill + len(rows) > BATCH_ROWS:
-            totals.add(dict(zip(names, batch[:, :fill], strict=True)))
-            fill = 0
-            if progress:
-                progress(totals.ticks)
-        batch[:, fill : fill + len(rows)] = rows.T
-        fill += len(rows)
-    if fill:
-        totals.add(dict(zip(names, batch[:, :fill], strict=True)))
+        ticks_before = totals.ticks
+        totals.add(dict(zip(names, rows.T, strict=True)))
+        if progress and ticks_before // PROGRESS_TICKS < totals.ticks // PROGRESS_TICKS:
+            progress(totals.ticks)
     return totals
