@@ -39,7 +39,8 @@ from rtloop.recording.file.topics.events import (
 )
 from rtloop.recording.file.topics.overview import Intervals
 
-FLUSH_S = 0.5
+FLUSH_S = 0.4
+"""Two polls of the recorder: at most half a second of ticks is not in the file."""
 RESUME_FREE_BYTES = 1 << 20
 """Space that must be free, besides 5/4 of `min_free_bytes`, before a file is begun after a failure."""
 
