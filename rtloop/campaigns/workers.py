@@ -182,17 +182,18 @@ class DaskWorkers:
         return self._executor.submit(function, *arguments)
 
     def explain(self, error: BaseException) -> BaseException:
-        """Return WorkerDied where a function killed its workers, else UnavailableError for CancelledError and OSError.
+        """Return WorkerDied where a function killed its workers, UnavailableError where the scheduler is gone.
 
-        These two are taken as the sign that the scheduler is gone. Returns any other error itself.
+        Signs of the latter are a cancelled function and a closed connection. Returns any other error itself.
         """
         from concurrent.futures import CancelledError
 
         from distributed import KilledWorker
+        from distributed.comm.core import CommClosedError
 
         if isinstance(error, KilledWorker):
             return WorkerDied()
-        if isinstance(error, CancelledError | OSError):
+        if isinstance(error, CancelledError | CommClosedError | ConnectionError):
             return UnavailableError(f"{self.name}: the scheduler is gone; run the same command again to continue")
         return error
 

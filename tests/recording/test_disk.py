@@ -18,12 +18,14 @@ from rtloop.recording.capture.session import Options, Session
 from rtloop.recording.file.reader import Reader
 from rtloop.recording.file.recover import recover
 from rtloop.recording.file.topics.format import chunk_rows
+from rtloop.recording.file.writer import Writer
 from rtloop.recording.load import load
 from rtloop.recording.replay.replay import replay
 from rtloop.recording.views.summary import summarise
+from rtloop.signals import Mode
 from rtloop.supervision.recording_state import recording_state
 from tests.recording.disk import PLENTY_BYTES, Disk, missing
-from tests.recording.hand_made_loop import HandMadeLoop, RecorderProcess, make_header, make_rows
+from tests.recording.hand_made_loop import START_UNIX_NS, HandMadeLoop, RecorderProcess, make_header, make_rows
 from tests.recording.real_loop import RecordedRun, rows_of
 
 SECOND = 10_000
@@ -160,6 +162,30 @@ def test_a_file_without_ticks_is_removed(disk: Disk, run: RecordedRun, tmp_path:
     check(totals, 65_000)
     assert sorted(os.listdir(tmp_path)) == ["run-0002.mcap", "run.mcap"]
     assert scheduled_ticks(load(totals["paths"]).events) == COMMANDS
+
+
+def test_events_that_are_in_a_file_stay_where_no_tick_could_follow_them(disk: Disk, loop: HandMadeLoop, tmp_path: Path):
+    session = Session(loop.block, tmp_path / "run.mcap", make_header(), Options(min_free_bytes=0))
+    loop.command(0, Mode.FEEDFORWARD)
+    session.drain()
+    session._write_all()
+    disk.longest_write_bytes = 40_000
+    loop.run(make_rows(4_000))
+    session.drain()
+    session._write_all()
+    disk.longest_write_bytes = PLENTY_BYTES
+    totals = session.finish("finished")
+    assert [event["kind"] for event in load(totals["paths"]).events][:1] == ["set_mode"]
+    assert (totals["events_lost"], totals["ticks_lost"], totals["complete"]) == (0, 4_000, False)
+
+
+def test_the_file_of_another_process_is_not_removed_with_an_own_one(tmp_path: Path):
+    path = tmp_path / "run.mcap"
+    writer = Writer(path, make_header(), START_UNIX_NS)
+    writer.part.unlink()
+    writer.part.write_text("another recording")
+    writer.discard()
+    assert writer.part.read_text() == "another recording"
 
 
 def test_recording_resumes_after_a_rotation_without_a_free_inode(disk: Disk, tmp_path: Path):

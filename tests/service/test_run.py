@@ -239,6 +239,13 @@ def test_an_output_folder_that_cannot_be_made_ends_with_73(tmp_path: Path) -> No
     assert summary["exit_code"] == 73
 
 
+def test_a_recordings_name_is_no_folder(tmp_path: Path) -> None:
+    process = start("run", PAPER, "--duration", "0.1", "--unpaced", "--out", tmp_path / "a.mcap")
+    _, err = process.communicate(timeout=TIMEOUT_S)
+    assert (process.returncode, "a.mcap is a recording's name; allowed: a folder" in err) == (2, True), err
+    assert os.listdir(tmp_path) == []
+
+
 @pytest.mark.skipif(os.geteuid() != 0, reason="mounting a small file system needs root")
 def test_a_full_disk_costs_records_and_nothing_else(tmp_path: Path) -> None:
     small = tmp_path / "small"

@@ -171,14 +171,14 @@ class RunFiles:
 
     def discard_unusable(self) -> None:
         """Give up a present file that was removed, whose ticks are then lost; remove a present file
-        with neither ticks nor overviews.
+        with nothing but its header.
 
         Ticks before `repeats_before` that are not written yet are left out: the dead recorder's file holds them. They
         count in `ticks_logged`, and `end_place` moves behind them.
         """
         if self.writer and not self.writer.file.is_in_place():
             self._abandon(self.writer)
-        elif self.writer and not (self.writer.ticks or self.writer.ticks_skipped):
+        elif self.writer and len(self.writer.file) <= 1:
             self.writer.discard()
             self.writer = None
             self._opened_paths.pop()

@@ -223,9 +223,10 @@ class ChunkFile:
             self._fd = -1
 
     def discard(self) -> None:
-        """Close the file and remove it; a file that cannot be removed stays, without an error."""
+        """Close the file and remove it, unless another file has taken its name; one that cannot be removed stays."""
         with contextlib.suppress(OSError):
-            os.unlink(self._name)
+            if self.is_in_place():
+                os.unlink(self._name)
         self.close()
 
     def _open(self) -> int:
