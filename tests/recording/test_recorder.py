@@ -165,7 +165,7 @@ def test_a_recorder_without_an_order_is_not_complete(recorder):
 
 def test_a_killed_recorder_loses_less_than_a_chunk(loop, recorder, path):
     rows, part = make_rows(30_000), path.with_name("run.mcap.part")
-    recorder.start(path)
+    recorder.start(path, make_header(paced=False))
     loop.run(rows, slack=SLACK)
     recorder.wait_for_ticks(len(rows))
     recorder.process.kill()

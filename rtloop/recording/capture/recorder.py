@@ -110,17 +110,6 @@ def _is_supervisor_gone() -> bool:
     return bool(poll.poll(0))
 
 
-def _session_class(header: dict[str, Any]) -> type[Session]:
-    """Return the class of the session that records a run with `header`."""
-    if header.get("around"):
-        return SelectiveSession
-    if header["paced"]:
-        return Session
-    from rtloop.recording.capture.unpaced import UnpacedSession  # Loads threads, which a paced run does not need.
-
-    return UnpacedSession
-
-
 def record_run(fd: int, names: RequesterNames | None = None) -> int:
     """Record one run from the shared block at descriptor `fd`, as a line on stdin orders; print the totals as JSON.
 
@@ -140,9 +129,8 @@ def record_run(fd: int, names: RequesterNames | None = None) -> int:
         if (command := orders.next(None)) is None:
             raise RecordingError("the recorder received no order; it needs one JSON line with path and header on stdin")
         header = command["header"]
-        session = _session_class(header)(
-            block, Path(command["path"]), header, Options(**command.get("options", {})), names
-        )
+        session_class = SelectiveSession if header.get("around") else Session
+        session = session_class(block, Path(command["path"]), header, Options(**command.get("options", {})), names)
         block.store(Word.RECORDER_STATE, ProcessState.RUNNING)
         result = recorder.record(session, orders, POLL_S if header["paced"] else UNPACED_POLL_S)
         totals = session.finish(result)

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 from rtloop.errors import OutputError
 from rtloop.foundation.arrays import Real
 from rtloop.recording.capture.buffer import TickTime
-from rtloop.recording.file.mcap.chunkfile import NotOnDisk, PackedChunk
+from rtloop.recording.file.mcap.chunkfile import NotOnDisk
 from rtloop.recording.file.topics.contents import Message
 from rtloop.recording.file.topics.overview import Intervals
 from rtloop.recording.file.writer import Writer
@@ -116,16 +116,11 @@ class RunFiles:
         self.writer, self.file_begin = writer, self.end_place
 
     def write(
-        self,
-        messages: Sequence[Message],
-        ticks: Real | PackedChunk,
-        intervals: Intervals | None,
-        start_unix_ns: int,
-        end: TickTime,
+        self, messages: Sequence[Message], rows: Real, intervals: Intervals | None, start_unix_ns: int, end: TickTime
     ) -> None:
-        """Write messages and ticks, rows (n, columns) or a packed chunk: both, or neither.
+        """Write messages and rows (n, columns): both, or neither.
 
-        Then set `end_place` to `end`. Intervals (n, columns, 3: minimum, maximum, mean) are written instead of ticks if
+        Then set `end_place` to `end`. Intervals (n, columns, 3: minimum, maximum, mean) are written instead of rows if
         they are not None. Raises OutputError if no file is open or the write fails.
         """
         if self.writer is None:
@@ -135,7 +130,7 @@ class RunFiles:
             )
         self.writer.start_unix_ns = start_unix_ns
         if intervals is None:
-            self.writer.write(messages, ticks)
+            self.writer.write(messages, rows)
         else:
             self.writer.write_overview(messages, intervals)
         self.end_place = end

@@ -23,7 +23,6 @@ from rtloop.recording.capture.requester_names import RequesterNames
 from rtloop.recording.capture.rings import RingReader
 from rtloop.recording.capture.run_files import Options, RunFiles, predecessor_file
 from rtloop.recording.capture.successor import snapshot_before
-from rtloop.recording.file.mcap.chunkfile import PackedChunk
 from rtloop.recording.file.topics import format
 from rtloop.recording.file.topics.contents import Message
 from rtloop.recording.file.topics.events import (
@@ -314,34 +313,20 @@ class Session:
         While no file can be written, rows and snapshots are lost and events wait.
         """
         self._last_write_s = time.monotonic()
-        rows = self._buffer.first_rows(count)
-        self._write_or_lose(rows, entries)
-        self._buffer.drop(count)
-
-    def _write_or_lose(self, rows: Real, entries: list[PendingEntry], packed: PackedChunk | None = None) -> None:
-        """Write `entries`, then `rows`, which may be packed already. A failed write sets `failure`.
-
-        While no file can be written, rows and snapshots are lost and events wait.
-        """
         if self.failure is None:
             try:
-                self._write_to_file(rows, entries, packed=packed)
+                self._write_to_file(self._buffer.first_rows(count), entries)
             except OutputError as error:
                 self._fail(error)
         if self.failure:
             self._pending.requeue_events(entries)
+        self._buffer.drop(count)
 
-    def _write_to_file(
-        self,
-        rows: Real,
-        entries: list[PendingEntry],
-        intervals: Intervals | None = None,
-        packed: PackedChunk | None = None,
-    ) -> None:
+    def _write_to_file(self, rows: Real, entries: list[PendingEntry], intervals: Intervals | None = None) -> None:
         """Write entries and gap events, then rows or, if not None, intervals of omitted ticks.
 
-        `packed`, if not None, is the rows as a chunk. The write is announced in the block for a replacement recorder,
-        and RECORDER_FAILURE set to 0 after it. Raises OutputError if it fails.
+        The write is announced in the block for a replacement recorder, and RECORDER_FAILURE set to 0 after it. Raises
+        OutputError if it fails.
         """
         end, messages = self._files.end_place, [entry.message for entry in entries]
         spans, rate_hz = TickSpans(rows, intervals), self._header["rate_hz"]
@@ -359,7 +344,7 @@ class Session:
             end.tick - self._files.ticks_logged - self._files.ticks_skipped - spans.tick_count,
         )
         with self._progress.announced_write(self._files.size_bytes, position.furthest(self._predecessor_end)):
-            self._files.write(messages, rows if packed is None else packed, intervals, self._start_unix_ns(), end)
+            self._files.write(messages, rows, intervals, self._start_unix_ns(), end)
         self._block.store(Word.RECORDER_FAILURE, 0)
 
     def _count_pending(self, channel: int) -> int:

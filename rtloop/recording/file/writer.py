@@ -17,40 +17,13 @@ from mcap.records import Header, McapRecord
 
 from rtloop.errors import LOW_SPACE, OutputError, output_errors
 from rtloop.foundation.arrays import Real
-from rtloop.recording.file.mcap.chunkfile import ChunkContent, ChunkFile, ChunkPacker, PackedChunk
+from rtloop.recording.file.mcap.chunkfile import ChunkContent, ChunkFile
 from rtloop.recording.file.mcap.container import PREFIX, pack_message, pack_records
 from rtloop.recording.file.topics import format
 from rtloop.recording.file.topics.contents import Message
 from rtloop.recording.file.topics.overview import Intervals, OverviewLayout, overview_records, tick_ranges
 
 DISK_FULL_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
-
-
-class TickPacker:
-    """Packer of ticks into chunks, one at a time."""
-
-    def __init__(self, columns: Sequence[str], message_index: bool) -> None:
-        """Pack ticks of `columns`; `message_index` adds 16 bytes of index to every tick."""
-        self._columns, self._message_index = list(columns), message_index
-        self._template = format.blank_ticks(columns, format.chunk_rows(columns))
-        self._packer = ChunkPacker()
-
-    @property
-    def max_rows(self) -> int:
-        """Largest number of ticks in a chunk."""
-        return len(self._template)
-
-    def pack(self, rows: Real, start_unix_ns: int) -> PackedChunk:
-        """Pack rows (n, columns) float64 of ticks, 1 ≤ n ≤ `max_rows`; log time = `start_unix_ns` + deadline, in ns."""
-        count = len(rows)
-        records = self._template[:count]
-        format.fill_ticks(records, self._columns, rows, start_unix_ns)
-        times, index = records["_log_time"], {}
-        if self._message_index:
-            offsets = np.arange(count) * records.dtype.itemsize
-            index = {format.TICKS: _index_record(format.TICKS, times, offsets)}
-        data = records.view(np.uint8).data
-        return self._packer.pack(ChunkContent(data, int(times[0]), int(times[-1]), {format.TICKS: count}, index))
 
 
 class Writer:
@@ -81,7 +54,8 @@ class Writer:
         """Number of ticks written, and of ticks that overviews replace."""
         self._skipped_counts: list[int] = []
         self._columns: list[str] = header["columns"]
-        self._packer, self._min_free_bytes = TickPacker(self._columns, message_index), min_free_bytes
+        self._message_index, self._min_free_bytes = message_index, min_free_bytes
+        self._template = format.blank_ticks(self._columns, format.chunk_rows(self._columns))
         self._check_space(room_bytes)
         repeated = [*format.schemas(self._columns), *format.channels()]
         if header.get("around"):
@@ -98,18 +72,15 @@ class Writer:
         """The file's name from its first chunk, the header, until it is finished."""
         return self.file.part
 
-    def write(self, messages: Sequence[Message], ticks: Real | PackedChunk) -> None:
+    def write(self, messages: Sequence[Message], rows: Real) -> None:
         """Write messages of topics other than /ticks, and rows (n, columns) of at most one chunk of ticks.
 
-        `ticks` may be packed already. Both are written, or neither. Raises OutputError if either fails; messages whose
-        ticks could not be written are removed from the file, unless that fails too.
+        Both are written, or neither. Raises OutputError if either fails; messages whose ticks could not be written are
+        removed from the file, unless that fails too.
         """
         self.write_messages(messages)
         try:
-            if isinstance(ticks, PackedChunk):
-                self._write_packed(ticks)
-            else:
-                self.write_ticks(ticks)
+            self.write_ticks(rows)
         except OutputError:
             if messages:
                 with contextlib.suppress(OutputError):
@@ -121,17 +92,25 @@ class Writer:
 
         Raises OutputError; the chunks before the failed one stay in the file.
         """
-        for start in range(0, len(rows), self._packer.max_rows):
-            self._write_packed(self._packer.pack(rows[start : start + self._packer.max_rows], self.start_unix_ns))
+        for start in range(0, len(rows), len(self._template)):
+            self._write_chunk(rows[start : start + len(self._template)])
 
-    def _write_packed(self, chunk: PackedChunk) -> None:
-        """Write a chunk of ticks, and add their number to `ticks`.
+    def _write_chunk(self, rows: Real) -> None:
+        """Write rows (n, columns) of ticks, n ≤ `format.chunk_rows`, as one chunk, and add n to `ticks`.
 
         Raises OutputError if the file was removed, the free space is too small, or the write fails.
         """
         self._check_writable()
-        self.file.append_packed(chunk)
-        self.ticks += chunk.counts[format.TICKS]
+        count = len(rows)
+        records = self._template[:count]
+        format.fill_ticks(records, self._columns, rows, self.start_unix_ns)
+        times, index = records["_log_time"], {}
+        if self._message_index:
+            offsets = np.arange(count) * records.dtype.itemsize
+            index = {format.TICKS: _index_record(format.TICKS, times, offsets)}
+        data = records.view(np.uint8).data
+        self.file.append_chunk(ChunkContent(data, int(times[0]), int(times[-1]), {format.TICKS: count}, index))
+        self.ticks += count
 
     def write_messages(self, messages: Sequence[Message]) -> None:
         """Write messages of topics other than /ticks as one chunk, indexed by topic; nothing for an empty sequence.

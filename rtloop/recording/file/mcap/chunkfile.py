@@ -55,32 +55,6 @@ class ChunkContent(NamedTuple):
     indexes: dict[int, bytes]
 
 
-class PackedChunk(NamedTuple):
-    """A chunk as it is written, `record` and its index records, and what the file's own index says of it.
-
-    `start` and `end` are the first and last log time in ns, `counts` the number of messages by channel.
-    """
-
-    record: bytes
-    indexes: dict[int, bytes]
-    start: int
-    end: int
-    counts: dict[int, int]
-    content_bytes: int
-
-
-class ChunkPacker:
-    """Packer of chunks, one at a time."""
-
-    def __init__(self) -> None:
-        self._compressor = zstandard.ZstdCompressor(compression_params=COMPRESSION)
-
-    def pack(self, content: ChunkContent) -> PackedChunk:
-        """Compress a chunk; equal contents give equal bytes."""
-        record = pack_chunk(content.records, content.start, content.end, self._compressor)
-        return PackedChunk(record, content.indexes, content.start, content.end, content.counts, len(content.records))
-
-
 class _WrittenChunk(NamedTuple):
     """Data stored in memory for every written chunk: its packed index record, and the data needed to drop it."""
 
@@ -102,7 +76,7 @@ class ChunkFile:
         self._name = path.with_name(f"{self.part.name}.new")
         self.size = 0
         self._repeated = repeated
-        self._packer = ChunkPacker()
+        self._compressor = zstandard.ZstdCompressor(compression_params=COMPRESSION)
         self._chunks: list[_WrittenChunk] = []
         self._distinct_counts: dict[tuple[tuple[int, int], ...], dict[int, int]] = {}
         self._crc = 0
@@ -135,34 +109,31 @@ class ChunkFile:
             return True  # Unknown; the next write fails if the file is gone.
 
     def append_chunk(self, content: ChunkContent) -> None:
-        """Compress and write one chunk as `append_packed` does. Raises OutputError as `append_packed` does."""
-        self.append_packed(self._packer.pack(content))
-
-    def append_packed(self, chunk: PackedChunk) -> None:
-        """Write one chunk and its index records, if it has any, as a whole or not at all.
+        """Compress and write one chunk and its index records, if it has any, as a whole or not at all.
 
         The first chunk gives the file the name PATH.part. Raises OutputError, with nothing written, if the write fails,
         and with the chunk written if the file cannot get that name.
         """
-        index_begin = self.size + len(chunk.record)
+        chunk = pack_chunk(content.records, content.start, content.end, self._compressor)
+        index_begin = self.size + len(chunk)
         position, index_offsets = index_begin, {}
-        for channel, record in chunk.indexes.items():
+        for channel, record in content.indexes.items():
             index_offsets[channel] = position
             position += len(record)
         entry = ChunkIndex(
-            chunk_length=len(chunk.record),
+            chunk_length=len(chunk),
             chunk_start_offset=self.size,
             compression="zstd",
-            compressed_size=len(chunk.record) - CHUNK_HEAD.size,
-            message_end_time=chunk.end,
+            compressed_size=len(chunk) - CHUNK_HEAD.size,
+            message_end_time=content.end,
             message_index_length=position - index_begin,
             message_index_offsets=index_offsets,
-            message_start_time=chunk.start,
-            uncompressed_size=chunk.content_bytes,
+            message_start_time=content.start,
+            uncompressed_size=len(content.records),
         )
-        counts = self._distinct_counts.setdefault(tuple(chunk.counts.items()), chunk.counts)
+        counts = self._distinct_counts.setdefault(tuple(content.counts.items()), content.counts)
         written_chunk = _WrittenChunk(pack_records([entry]), counts, self._crc)
-        self._append(chunk.record + b"".join(chunk.indexes.values()))
+        self._append(chunk + b"".join(content.indexes.values()))
         self._chunks.append(written_chunk)
         if self._name != self.part:
             self._rename_to_part()
