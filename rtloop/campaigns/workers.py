@@ -15,6 +15,7 @@ from concurrent.futures.process import BrokenProcessPool
 from typing import Any, Literal, Protocol
 
 from rtloop.errors import MissingExtra, UnavailableError
+from rtloop.foundation.heap import keep_freed_memory
 from rtloop.version import __version__
 
 StartMethod = Literal["forkserver", "spawn"]
@@ -101,8 +102,12 @@ class ProcessWorkers:
 
 
 def _follow_coordinator() -> None:
-    """Leave Ctrl-C to the coordinator, which ends the workers after their functions, and end when it is killed."""
+    """Leave Ctrl-C to the coordinator, which ends the workers after their functions, and end when it is killed.
+
+    Also keep the memory of one rig for the next one.
+    """
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    keep_freed_memory()
     threading.Thread(target=_end_after_coordinator, daemon=True).start()
 
 

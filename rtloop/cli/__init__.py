@@ -46,6 +46,7 @@ from rtloop.cli import (
     service,
     verify,
 )
+from rtloop.foundation.heap import keep_freed_memory
 from rtloop.version import __version__
 
 GARBAGE_AFTER = 100_000
@@ -74,6 +75,7 @@ def main() -> None:
     available; 73 cannot write; 77 refused by the host; 78 configuration.
     """
     gc.set_threshold(GARBAGE_AFTER)
+    keep_freed_memory()
 
 
 for _group, _commands in (

@@ -27,6 +27,7 @@ from typing import Any
 
 from rtloop.engine.memory import ProcessState, SharedBlock, Word
 from rtloop.errors import RtloopError
+from rtloop.foundation.heap import keep_freed_memory
 from rtloop.recording.capture.requester_names import RequesterNames
 from rtloop.recording.capture.rings import RingReader
 from rtloop.recording.capture.selective import SelectiveSession
@@ -150,6 +151,7 @@ def main() -> int:
     parser.add_argument("--fd", type=int, required=True, help="file descriptor of the shared block")
     parser.add_argument("--names", type=int, help="file descriptor of the requesters' names")
     arguments = parser.parse_args()
+    keep_freed_memory()
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
     return record_run(arguments.fd, None if arguments.names is None else RequesterNames(arguments.names))
