@@ -124,3 +124,12 @@ def test_a_reader_of_some_seconds_leaves_the_other_chunks_alone(tmp_path: Path):
         ticks = np.concatenate([rows[:, 0] for rows in reader.blocks(["tick"], some)])
         assert (ticks[0] <= 20_000, ticks[-1] >= 24_999) == (True, True)
         assert reader.chunks_between(0.0, np.inf) is None
+
+
+def test_a_file_that_is_closed_twice_closes_no_other_one(tmp_path: Path):
+    reader = Reader(write_recording(tmp_path / "run.mcap", make_rows(100)))
+    reader.close()
+    other = os.open(tmp_path / "other", os.O_CREAT | os.O_RDWR)  # The system gives it the number that is free now.
+    reader.close()
+    os.fstat(other)
+    os.close(other)

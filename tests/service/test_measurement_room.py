@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from typing import Any, cast
+
+import numpy as np
 import pytest
 
+from rtloop.analysis.measured.multisine import excitation_sequence, make_grid
 from rtloop.configuration.file import load
 from rtloop.errors import ConfigError
-from rtloop.service.measuring.measurement import require_room
+from rtloop.service.measuring.measurement import TRIAL_PERIODS, _ExcitationRun, require_room
 from tests.paper_configuration import PAPER
 
 
@@ -18,3 +22,13 @@ def test_the_nearer_end_of_the_sensors_range_limits_a_motion(hold_um: float, all
     require_room(axis, (2.0, 40.0), hold_um, allowed_um)
     with pytest.raises(ConfigError, match=f"allowed: up to {allowed_um:g} µm, by axis.x.interlocks.*{limit}"):
         require_room(axis, (2.0, 40.0), hold_um, allowed_um + 0.01)
+
+
+def test_a_fade_as_long_as_a_period_is_no_period_of_a_trial() -> None:
+    lines = make_grid(10_000.0, 0.05, 40.0, 1_000.0, None)
+    period = np.sin(2 * np.pi * np.arange(lines.samples) / lines.samples)
+    played = excitation_sequence(period, TRIAL_PERIODS, 0.0, lines.samples)
+    signals = dict.fromkeys(("error_um", "command_um", "position_um"), played)
+    periods = _ExcitationRun(cast(Any, None), "sim")._whole_periods(lines, signals)
+    for part in (periods.error, periods.command, periods.position):
+        assert part.tobytes() == np.stack([period] * TRIAL_PERIODS).tobytes()

@@ -95,6 +95,9 @@ def _read_or_make_token(file: Path) -> str:
         try:
             os.fchmod(fd, TOKEN_MODE)
             os.write(fd, (secrets.token_urlsafe(TOKEN_BYTES) + "\n").encode())
+        except OSError:  # An empty file would be refused from now on.
+            file.unlink(missing_ok=True)
+            raise
         finally:
             os.close(fd)
     except FileExistsError:

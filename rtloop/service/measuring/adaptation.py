@@ -94,7 +94,10 @@ class RetuneSchedule:
             log.warning("axis %s is not retuned: %s", axis, error)
             return
         if "better" in report:
-            log.info("axis %s %s", axis, _outcome_text(report))
+            try:
+                log.info("axis %s %s", axis, _outcome_text(report))
+            except (LookupError, TypeError) as error:  # Another version of rtloop may have been installed meanwhile.
+                log.warning("axis %s: the answer of `rtloop ctl retune` is not as in this version: %r", axis, error)
         else:
             log.warning("axis %s is not retuned: %s", axis, process.stderr.strip().removeprefix("rtloop: "))
 

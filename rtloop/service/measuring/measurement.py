@@ -236,13 +236,12 @@ class _ExcitationRun:
         )
 
     def _whole_periods(self, lines: LineGrid, loop_signals: dict[str, Real]) -> PeriodSignals:
-        """Return error, command and position, µm, (periods, samples) each, of the complete periods after the first one,
-        which is for settling.
+        """Return error, command and position, µm, (TRIAL_PERIODS, samples) each, of the periods of a trial that `play`
+        has played: those between the settling period and the fade, which may be longer than a period.
         """
-        series = (loop_signals[name][lines.samples :] for name in ("error_um", "command_um", "position_um"))
-        return PeriodSignals(
-            *(part[: part.size // lines.samples * lines.samples].reshape(-1, lines.samples) for part in series)
-        )
+        first, end = lines.samples, (1 + TRIAL_PERIODS) * lines.samples
+        series = (loop_signals[name][first:end] for name in ("error_um", "command_um", "position_um"))
+        return PeriodSignals(*(part.reshape(TRIAL_PERIODS, lines.samples) for part in series))
 
     def _require_within_limits(self, position_um: Real) -> None:
         """Raise _ExcessiveMotion if a position (n,), µm, leaves the range that `limit_motion` has set."""

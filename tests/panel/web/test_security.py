@@ -5,6 +5,7 @@ The panel here has no service: what is handed on is answered by 503, what is not
 
 from __future__ import annotations
 
+import errno
 import http.client
 import json
 import os
@@ -327,6 +328,17 @@ def test_the_token_file_is_made_once_and_private(tmp_path: Path):
 
 
 @ROOT_ONLY
+def test_a_disk_that_was_full_leaves_no_token_file_behind(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    def refuse(_fd: int, _data: bytes) -> int:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "write", refuse)
+        with pytest.raises(OutputError, match="No space left"):
+            read_or_make_token(tmp_path / "token")
+    assert len(read_or_make_token(tmp_path / "token")) >= 32
+
+
 def test_a_token_file_of_another_user_is_refused():
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)

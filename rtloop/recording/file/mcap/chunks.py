@@ -97,6 +97,7 @@ class McapSource:
         """Close the descriptor of the file, if it is open."""
         if self._fd >= 0:
             close_descriptor(self._fd)
+            self._fd = -1
 
 
 def _file_name_hint(path: Path) -> str:
