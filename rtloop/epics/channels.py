@@ -15,7 +15,9 @@ from caproto import (
     ChannelData,
     ChannelDouble,
     ChannelEnum,
+    ChannelType,
     Forbidden,
+    native_type,
 )
 
 from rtloop.epics.variables import Variable, unit_in_mode
@@ -104,6 +106,12 @@ class Channel(ChannelData):
 
 class NumberChannel(Channel, ChannelDouble):
     """A channel whose value is a number of double precision."""
+
+    async def write_from_dbr(self, data: Any, data_type: Any, metadata: Any, *, flags: int = 0) -> None:
+        """Convert a client's value and write it. Raises CaprotoValueError for an empty text, which caproto makes 0."""
+        if native_type(data_type) is ChannelType.STRING and not all(text.strip() for text in data):
+            raise CaprotoValueError(data)
+        await super().write_from_dbr(data, data_type, metadata, flags=flags)
 
     def from_client(self, value: Any) -> float:
         """Return the client's value as a float."""

@@ -42,6 +42,15 @@ class RecordedRun:
                 f"{recording.paths[0]}: not a recording of an experiment; `rtloop info` shows its content"
             )
         self.recording = recording
+        try:
+            self._read(metadata)
+        except (LookupError, TypeError, ValueError) as error:
+            raise RecordingError(
+                f"{recording.paths[0]}: the description of its experiment is damaged or of another version: {error!r}"
+            ) from None
+
+    def _read(self, metadata: dict[str, Any]) -> None:
+        """Set the attributes from the run's description. Raises LookupError, TypeError or ValueError for another one."""
         self.experiment: str = metadata["name"]
         self.label: str = metadata["run"]
         self.run_count: int = metadata["runs"]

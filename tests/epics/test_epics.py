@@ -129,6 +129,8 @@ def test_a_refused_setpoint_is_an_error_with_the_text_of_ctl(bench: Bench, runni
     ("suffix", "value", "options"),
     [
         ("x:SETPOINT", "fast", {"data_type": caproto.ChannelType.STRING}),
+        ("x:SETPOINT", "", {"data_type": caproto.ChannelType.STRING}),
+        ("x:SETPOINT", " ", {"data_type": caproto.ChannelType.STRING}),
         ("x:SETPOINT", float("nan"), {}),
         ("x:SETPOINT", float("inf"), {}),
         ("x:SETPOINT", [10.0, 12.0], {}),

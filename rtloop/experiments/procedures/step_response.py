@@ -82,17 +82,17 @@ def analyse(recordings: Sequence[RecordedRun], options: StepResponseOptions) -> 
     time_s = np.arange(height.size) / run.rate_hz
     window = ringing_window(run.model)
     ringing = fit_ringing(height, run.rate_hz, window)
-    overshoot = 100 * (float(height.max() / final) - 1)
+    overshoot = 100 * (float((height / final).max()) - 1)
     modelled = ModelResponse(None, None, None, None, None)
     if run.model is not None:
         model_response = run.model.open_response(np.ones(height.size)) * final / run.static_gain
         model_ringing = fit_ringing(model_response, run.rate_hz, window) if run.model.resonance_hz else None
         modelled = ModelResponse(
             model_response,
-            100 * (float(model_response.max() / final) - 1),
+            100 * (float((model_response / final).max()) - 1),
             model_ringing and model_ringing.frequency_hz,
             model_ringing and model_ringing.damping,
-            100 * float(np.abs(height - model_response).max()) / final,
+            100 * float(np.abs(height - model_response).max()) / abs(final),
         )
     largest_v = options.part_of_drive * run.axis_options.limits.drive_v
     final_model = float(loading_curve(run.actuator_model, largest_v)) * run.static_gain if run.model else None
@@ -102,7 +102,7 @@ def analyse(recordings: Sequence[RecordedRun], options: StepResponseOptions) -> 
                   TOLERANCE_RATIO * (modelled.frequency_hz or 0.0)),
         run.row("", "damping ratio of the ringing", "1", ringing.damping, modelled.damping,
                   DAMPING_TOLERANCE * (modelled.damping or 0.0)),
-        run.row("", "final position", "µm", final, final_model, FINAL_TOLERANCE * (final_model or 0.0)),
+        run.row("", "final position", "µm", final, final_model, FINAL_TOLERANCE * abs(final_model or 0.0)),
     ]  # fmt: skip
     if modelled.difference_percent is not None:
         difference = modelled.difference_percent
