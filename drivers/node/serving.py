@@ -49,7 +49,11 @@ class UdpPort(Port):
         try:
             family, _, _, _, address = socket.getaddrinfo(options.host, options.port, type=socket.SOCK_DGRAM)[0]
             self._socket = socket.socket(family, socket.SOCK_DGRAM)
-            self._socket.bind(address)
+            try:
+                self._socket.bind(address)
+            except OSError:
+                self._socket.close()
+                raise
         except OSError as error:
             raise DriverError(
                 f"{options.label}: {error.strerror or error}; allowed: an address of this computer and a free port"

@@ -77,7 +77,8 @@ def hil_serve(config: Path, on_can: bool, on_udp: bool, on_serial: bool, tied: b
     from rtloop.configuration.file import load
 
     configuration = load(config)
-    axes = [axis for axis, _ in sorted(configuration.wiring.items(), key=lambda item: item[1].output)]
+    outputs = {axis: channels.output for axis, channels in configuration.wiring.items()}
+    axes = sorted(outputs, key=lambda axis: (len(outputs[axis]), outputs[axis]))  # dac10 comes after dac9.
     options = {"can": on_can, "udp": on_udp, "serial": on_serial}
     if sum(options.values()) > 1:
         raise click.UsageError("--can, --udp and --serial: more than one is given; allowed: one of them")

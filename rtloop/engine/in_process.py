@@ -55,7 +55,10 @@ class LoopsInProcess:
         ring_length = len(ring.slots)
         for first in range(0, ticks, ring_length):
             assembly.run(min(first + ring_length, ticks))
-            consume(first, ring.slots[: int(assembly.loop.tick) - first])
+            count = int(assembly.loop.tick) - first
+            consume(first, ring.slots[:count])
+            if count < ring_length:  # The last ticks, or the loop has ended earlier.
+                break
         driver.close()
         return int(assembly.loop.tick)
 

@@ -196,6 +196,7 @@ class SharedBlock:
         """Store the message of the driver's error, cut to FAULT_BYTES bytes."""
         data = text.encode(errors="replace")[:FAULT_BYTES]
         self["fault"][: len(data)] = np.frombuffer(data, np.uint8)
+        self["fault"][len(data) :] = 0
 
     def claim(self) -> None:
         """Mark the calling process as the driving process for as long as it lives, and store its number in LOOP_PID.

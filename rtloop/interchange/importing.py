@@ -170,9 +170,9 @@ def _select_signals(table: Table, path: Path, selection: ColumnSelection, time_b
 def _select_columns(table: Table, path: Path, selection: ColumnSelection) -> dict[str, MappedColumn]:
     """Return the selected columns by signal name.
 
-    A column kept under its own name gets a number behind it if a signal has this name already. Raises UnreadableData
-    for a missing or ambiguous column, a unit that does not fit, a reserved name, two mappings of one signal, and where
-    no column besides the time is left.
+    A column kept under its own name gets a number behind it if a signal, the tick or the deadline has this name.
+    Raises UnreadableData for a missing or ambiguous column, a unit that does not fit, a reserved name, two mappings of
+    one signal, and where no column besides the time is left.
     """
     signals: dict[str, MappedColumn] = {}
     for given_name, source in selection.signals.items():
@@ -195,8 +195,8 @@ def _select_columns(table: Table, path: Path, selection: ColumnSelection) -> dic
         name = column if is_from_recording(table) and NAME.fullmatch(column) else default_signal_name(column)
         free_name = next(
             candidate
-            for candidate in (name, *(f"{name}_{k}" for k in range(2, len(signals) + 3)))
-            if candidate not in signals
+            for candidate in (name, *(f"{name}_{k}" for k in range(2, len(signals) + 4)))
+            if candidate not in signals and candidate not in RECORDING_TIME_COLUMNS
         )
         unit = signal_unit(column) if is_from_recording(table) and not table.units else column_unit(table, column) or ""
         signals[free_name] = MappedColumn(

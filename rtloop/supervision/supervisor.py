@@ -201,16 +201,22 @@ class Supervisor:
 
         Sets `realtime`, and `startup_s`, the age of this process then. Raises RtloopError with the failure that the
         loop's process reports, LoopFault if a process ends without report, UnavailableError after START_TIMEOUT_S in
-        which nothing was compiled, OutputError if the recording cannot be opened: the loop has executed no tick then.
+        which nothing was compiled or the recording is not open, OutputError if it cannot be opened: the loop has
+        executed no tick then.
         """
         self.newest(0)  # Compile or load the function before it is needed in time.
         self._loop.send(pickle.dumps(self.prepared.plan))
         self._await_ready()
         self.recorder.start(recording_header(self.prepared, self.realtime))
+        deadline = time.monotonic() + START_TIMEOUT_S
         while not self.recorder.recording:
             self._watched_s = time.monotonic()
             if self.recorder.failure is not None:
                 raise self.recorder.failure
+            if self._watched_s > deadline:
+                raise UnavailableError(
+                    f"the recording was not open within {START_TIMEOUT_S:g} s; its file system may not answer"
+                )
             time.sleep(START_POLL_S)
         self.block.store(Word.GO, 1)
         with contextlib.suppress(OSError):  # The figure is for information only.

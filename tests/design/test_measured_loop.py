@@ -15,6 +15,7 @@ from rtloop.analysis.measured.mode import fit_light_mode
 from rtloop.analysis.measured.multisine import LineGrid, excitation_sequence, low_crest_amplitudes, make_grid
 from rtloop.analysis.measured.recorded import find_periodic_part
 from rtloop.analysis.measured.response import MeasuredResponse, PeriodSignals, measure_response
+from rtloop.design.identification.plot_response import _format_margin
 from rtloop.linear.discretise import discretise_controller
 from rtloop.linear.transfer import Transfer
 from tests.design.measured_loops import RATE_HZ, TrueLoop
@@ -262,3 +263,9 @@ def test_what_reaches_the_command_past_the_controller_is_not_the_controllers() -
     true = loop.open(lines.hz)
     assert np.median(np.abs(with_it.response.plant * with_it.response.controller / true - 1)) < 1e-3
     assert np.median(np.abs(without.response.plant * without.response.controller / true - 1)) > 0.1
+
+
+def test_a_margin_without_a_standard_deviation_is_shown():
+    assert _format_margin({"value": 2.5, "std": None}) == "2.5 ± –"
+    assert _format_margin({"value": 2.5, "std": 0.125}) == "2.5 ± 0.12"
+    assert _format_margin({"value": None, "std": None}) == "–"

@@ -3,6 +3,7 @@
 import json
 import re
 import tomllib
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -283,3 +284,11 @@ def test_taps_that_their_proof_does_not_bear_out_are_refused(monkeypatch, missed
     monkeypatch.setattr(shape_module, "measure_step", lambda *of: real(*of)._replace(**missed))
     with pytest.raises(NoDesign, match=said):
         design_taps(SUBJECT)
+
+
+def test_restricted_scenarios_keep_the_delay() -> None:
+    options = ShapeOptions(scenarios=ScenarioOptions(delay_ticks=(0, 2)))
+    subject = Subject(cast(Any, None), cast(Any, None), 1, cast(Any, None), 0.1, options)
+    restricted = subject.restrict_resonance(3.0).options.scenarios
+    assert (restricted.resonance_percent, restricted.damping, restricted.gain_percent) == (3.0, (1.0,), 0.0)
+    assert restricted.delay_ticks == (0, 2)

@@ -24,6 +24,7 @@ from rtloop.configuration.prepare import prepare
 from rtloop.design.paper import PAPER_C, PAPER_D
 from rtloop.design.synthesis.specification import DesignOptions, SensorOptions, SpecificationOptions
 from rtloop.design.synthesis.synthesise import synthesise_design
+from rtloop.design.verification import axes as axes_module
 from rtloop.design.verification import text
 from rtloop.design.verification.axes import add_simulation, verify_axis
 from rtloop.design.verification.json_values import as_dict
@@ -413,3 +414,13 @@ def test_the_sensors_lag_is_in_the_loop_that_runs() -> None:
     assert abs(seen.response([2000j * math.pi])[0] / PAPER_D.response([2000j * math.pi])[0]) == pytest.approx(
         math.sqrt(0.5)
     )
+
+
+def test_a_simulation_that_cannot_be_evaluated_is_a_warning(tmp_path, monkeypatch) -> None:
+    def refuse(*_: object) -> None:
+        raise ValueError("the recorded reference has no step")
+
+    monkeypatch.setattr(axes_module, "simulate", refuse)
+    verification = judged(tmp_path, MODEST, simulated=True)
+    assert verification.simulated is None
+    assert verification.warnings[-1] == "steps are not simulated: the recorded reference has no step"

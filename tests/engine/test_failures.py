@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from rtloop.drivers.playback import Playback
-from rtloop.engine import process
+from rtloop.engine import in_process, process
 from rtloop.engine.loop import Outcome
 from rtloop.engine.memory import Word
 from rtloop.engine.messages import Kind, Origin
@@ -22,7 +22,7 @@ from rtloop.errors import ConfigError
 from rtloop.signals import Flag, Mode
 from tests.drivers.bench_driver import LoopBack
 from tests.engine.failing_driver import ScriptedDriver
-from tests.engine.harness import AXIS, FOR_EVER, IDEAL, LoopBench, ScriptedClock, text
+from tests.engine.harness import AXIS, CONTROLLER, FOR_EVER, IDEAL, LoopBench, ScriptedClock, plan_of, text
 
 RAW = text(IDEAL, AXIS, '[axis.reference]\nkind = "hold"\nvalue = 3.0\n', mode="raw")
 RAMP = 3.0 - 0.1 * np.arange(1, 31)
@@ -222,3 +222,17 @@ def test_a_fault_of_the_plan_begins_with_its_own_key(driver: Callable[[], LoopBa
     with pytest.raises(ConfigError) as caught:
         process._make_driver(plan)
     assert caught.value.faults == [fault]
+
+
+def test_a_loop_in_process_that_ends_early_gives_its_ticks_once(monkeypatch: pytest.MonkeyPatch):
+    """4096 ticks fill its ring; this one ends after 5000 of 20,000."""
+    plan = plan_of(text(AXIS, CONTROLLER, IDEAL))
+    blocks: list[tuple[int, int]] = []
+
+    class Ending(in_process.Assembly):
+        def run(self, tick: int) -> None:
+            super().run(min(tick, 5_000))
+
+    monkeypatch.setattr(in_process, "Assembly", Ending)
+    ticks = in_process.LoopsInProcess().run(plan, plan.driver(), 20_000, lambda n, rows: blocks.append((n, len(rows))))
+    assert (ticks, blocks) == (5_000, [(0, 4_096), (4_096, 904)])

@@ -60,3 +60,10 @@ def test_a_plan_survives_pickling():
     first, second = LoopBench(plan).run(500), LoopBench(again).run(500)
     assert first.tobytes() == second.tobytes()
     assert np.array_equal(again.coefficients, plan.coefficients)
+
+
+def test_a_shorter_fault_leaves_nothing_of_the_one_before():
+    block = SharedBlock.create_private(Sizes(4, 1, 1000.0, 8, 1))
+    for message in ("the driver lost its device", "µ", ""):
+        block.fault = message
+        assert block.fault == (message or None)

@@ -7,14 +7,18 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
 
 import numpy as np
 import pytest
 from click.testing import CliRunner, Result
 
 from rtloop.cli import main
+from rtloop.experiments.recorded_run import RecordedRun
 from rtloop.experiments.report import load_runs, make_report
+from rtloop.recording.errors import RecordingError
+from rtloop.recording.load import load
 from tests.service.test_run import ENVIRONMENT, PAPER
 from tests.soak.aborts import TIMEOUT_S, abort, check
 
@@ -157,3 +161,11 @@ def test_a_compared_configuration_must_have_the_axis() -> None:
     refused = command("run", "steps", two, "--axis", "y", "--beside", PAPER)
     assert refused.exit_code != 0
     assert "--axis y: there is no such axis; there are x" in refused.output
+
+
+def test_a_description_without_a_key_is_named(campaign: tuple[Path, dict[str, Any]], tmp_path: Path) -> None:
+    folder, _ = campaign
+    text = load(next(iter(sorted(folder.glob("*.mcap"))))).configuration
+    for damaged in (text.replace('"segments"', '"parts"', 1), text.replace('"asked"', '"asked": 5, "old"', 1)):
+        with pytest.raises(RecordingError, match="its experiment is damaged or of another version"):
+            RecordedRun(cast(Any, SimpleNamespace(configuration=damaged, paths=[tmp_path / "run.mcap"])))

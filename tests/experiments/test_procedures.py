@@ -6,6 +6,7 @@ import re
 import shutil
 import tomllib
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -27,10 +28,12 @@ from rtloop.experiments.planning import load_stage, plan_runs
 from rtloop.experiments.procedures.harmonic import bandwidth_hz
 from rtloop.experiments.procedures.response import ResponseOptions, analyse
 from rtloop.experiments.procedures.robustness import Outcome, next_shift_distance, range_about_zero, settling_range
-from rtloop.experiments.procedures.step_response import fit_ringing
+from rtloop.experiments.procedures.step_response import StepResponseOptions, fit_ringing
+from rtloop.experiments.procedures.step_response import analyse as analyse_step
 from rtloop.experiments.registry import EXPERIMENTS, parse_parameters, select_experiments
 from rtloop.experiments.report import load_runs, make_report
 from rtloop.experiments.setting import Setting
+from rtloop.experiments.timeline import Segment
 from rtloop.experiments.verdict import Row
 from rtloop.foundation.options import Options
 from rtloop.recording.load import load as load_recording
@@ -458,3 +461,33 @@ def test_a_position_that_moves_further_than_stated_is_refused(linear_response: t
             continue
         with pytest.raises(UnsuitableData, match=f"moved by {moved_um:.3g} µm; .* use a smaller amplitude_um"):
             analyse([run], stated)
+
+
+class FallingStage:
+    """A run of the step experiment on a stage whose position is `sign` times that of a ringing one."""
+
+    rate_hz, model = 10_000.0, None
+    axis_options = SimpleNamespace(limits=SimpleNamespace(drive_v=10.0))
+
+    def __init__(self, sign: float) -> None:
+        time_s = np.arange(20_000) / self.rate_hz
+        step = 1.0 - np.exp(-40.0 * time_s) * np.cos(2 * np.pi * 500.0 * time_s)
+        self.position = sign * np.concatenate([np.zeros(10_000), 10.0 * step])
+
+    def signal(self, _: str) -> np.ndarray:
+        return self.position
+
+    def segments_labelled(self, label: str) -> list[Segment]:
+        return [Segment(label, "raw", 0, 10_000, {}) if label == "rest" else Segment(label, "raw", 10_000, 20_000, {})]
+
+    def row(self, _name: str, quantity: str, unit: str, run: float, *_: object) -> tuple[str, str, float]:
+        return quantity, unit, run
+
+
+def test_a_stage_that_falls_as_its_drive_rises_has_the_overshoot_of_its_mirror_image():
+    rising, falling = (
+        {quantity: run for quantity, _, run in analyse_step([FallingStage(sign)], StepResponseOptions()).rows}
+        for sign in (1.0, -1.0)
+    )
+    assert rising["overshoot"] == pytest.approx(95.9, abs=1.0)
+    assert falling == pytest.approx(rising | {"final position": -rising["final position"]})

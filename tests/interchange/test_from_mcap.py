@@ -15,11 +15,13 @@ from google.protobuf.descriptor_pb2 import FieldDescriptorProto as Field
 from google.protobuf.descriptor_pool import DescriptorPool
 from google.protobuf.message_factory import GetMessageClass
 from google.protobuf.timestamp_pb2 import DESCRIPTOR as TIMESTAMP
+from mcap.records import Schema
 from mcap.writer import CompressionType, Writer
 from mcap_protobuf.writer import Writer as ProtobufWriter
 from mcap_ros2.writer import Writer as Ros2Writer
 
 from rtloop.interchange.formats.from_mcap import read_mcap
+from rtloop.interchange.formats.mcap_fields import DecodingError, _require_sizes
 from rtloop.interchange.formats.table import UnreadableData
 
 START_NS, STEP_NS, ROWS = 1_700_000_000_000_000_123, 99_999, 400
@@ -216,3 +218,12 @@ def test_a_truncated_file_gives_its_complete_part(tmp_path: Path):
     assert 20 < rows < ROWS
     assert table.columns["accel.x"].tobytes() == TRUTH[:rows, 0].tobytes()
     assert "the messages after the damage are left out" in table.about["problems"]
+
+
+def test_bounded_fields_of_ros_2_are_fields():
+    """A constant has "=", a bound "<=": a message of bounded fields is not empty."""
+    bounded = Schema(data=b"float64[<=3] data\nstring<=10 name\n", encoding="ros2msg", id=1, name="lab/Bounded")
+    _require_sizes(bounded)
+    empty = b"lab/Empty[] parts\n" + b"=" * 80 + b"\nMSG: lab/Empty\nint32 SIZE=3\nstring TEXT=<=\n"
+    with pytest.raises(DecodingError, match="without fields"):
+        _require_sizes(Schema(data=empty, encoding="ros2msg", id=1, name="lab/List"))

@@ -147,3 +147,12 @@ def test_frames(recording: Recording, tmp_path: Path):
     assert data["x_position_um"].attrs == {"units": "µm", "long_name": "x: measured position x"}
     assert json.loads(data.attrs["events"]) == recording.events
     assert data.sel(time_s=slice(0.1, 0.2)).sizes["time_s"] == 1001
+
+
+def test_a_kept_column_of_ticks_replaces_neither_ticks_nor_deadlines(recording: Recording, tmp_path: Path):
+    path = exported(recording, "npz", tmp_path)
+    selection = ColumnSelection(keep=("tick", "deadline_ns", "x_drive_v"), rate_hz=1_000.0)
+    back = load(import_data(path, selection, tmp_path / "kept.mcap", table=read_in_process(path))["output"])
+    assert np.array_equal(back["deadline_ns"], 1e6 * np.arange(COUNT))
+    assert back["tick_2"].tobytes() == recording["tick"].tobytes()
+    assert back["deadline_ns_2"].tobytes() == recording["deadline_ns"].tobytes()

@@ -68,5 +68,8 @@ def _complex(pairs: Any) -> Complex:
 
 
 def _format_margin(margin: Mapping[str, float | None]) -> str:
-    """Return a margin, its "value" ± its "std", as text; "–" if the value is None."""
-    return "–" if margin["value"] is None else f"{margin['value']:.4g} ± {margin['std']:.2g}"
+    """Return a margin, its "value" ± its "std", as text; "–" for each that is None."""
+    value, std = ("–" if number is None else f"{number:{form}}" for number, form in (
+        (margin["value"], ".4g"), (margin["std"], ".2g"),
+    ))  # fmt: skip
+    return "–" if margin["value"] is None else f"{value} ± {std}"

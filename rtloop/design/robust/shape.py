@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rtloop.design.robust.options import ScenarioOptions, ShapeOptions
+from rtloop.design.robust.options import ShapeOptions
 from rtloop.design.robust.programme import BAND, USED_SHARE, Bounds, Programme, Taps
 from rtloop.design.robust.responses import Responses, horizon_ticks, step_responses
 from rtloop.design.robust.scenarios import Family, Scenario
@@ -45,10 +45,11 @@ class Subject:
     options: ShapeOptions
 
     def restrict_resonance(self, percent: float) -> Subject:
-        """Return a copy whose scenarios vary the resonance by ±`percent` of the model's, and neither damping nor
-        gain.
+        """Return a copy whose scenarios vary the resonance by ±`percent` of the model's, neither damping nor gain, and
+        the delay as before.
         """
-        scenarios = ScenarioOptions(resonance_percent=percent, damping=(1.0,), gain_percent=0.0)
+        varied = {"resonance_percent": percent, "damping": (1.0,), "gain_percent": 0.0}
+        scenarios = self.options.scenarios.model_copy(update=varied)
         return replace(self, options=self.options.model_copy(update={"scenarios": scenarios}))
 
     def family(self) -> Family:

@@ -78,8 +78,9 @@ def synthesise(
         return Synthesis(controller, full, achieved, weights, hinf, hankel_singular_values(full))
     if order is not None:
         raise ValueError(
-            f"synthesis.order: {order} gives an unstable loop with reduction {reduction!r}; use a higher order, or "
-            "remove synthesis.order, so that the lowest suitable one is found"
+            f"synthesis.order: {order} gives, with reduction {reduction!r}, an unstable loop or one with max |S| above "
+            f"{LARGEST_SENSITIVITY:g}; use a higher order, or remove synthesis.order, so that the lowest suitable one "
+            "is found"
         )
     raise NotRunnable(
         f"specification: γ = {hinf.gamma:.4g} can be reached in continuous time, but no controller of order {lowest} "

@@ -127,24 +127,37 @@ Verifications = dict[str, tuple[Verification, DesignOptions]]
 def add_simulation(configuration: Configuration, verifications: Verifications) -> Verifications:
     """Return the verifications with simulated steps of every stable axis; an unstable one stays unchanged.
 
-    If no rig can represent the hardware, or the configuration cannot run on it, every axis gets a warning instead.
+    If no rig can represent the hardware, or the configuration cannot run on it, every axis gets a warning instead, and
+    so does an axis whose simulation fails.
     """
     axes = {axis.name: axis for axis in configuration.axes}
     hardware_models = {name: _hardware_model(axes[name], design) for name, (_, design) in verifications.items()}
     try:
         bench = Bench(configuration, hardware_models)
     except (ValueError, RtloopError) as error:
-        note = f"steps are not simulated: {error}"
         return {
-            name: (replace(verification, warnings=(*verification.warnings, note)), options)
+            name: (_warn_unsimulated(verification, error), options)
             for name, (verification, options) in verifications.items()
         }
     return {
-        name: (replace(verification, simulated=simulate(bench, axes[name], verification.slowest_s, options)), options)
+        name: (_simulate_axis(bench, axes[name], verification, options), options)
         if verification.running.is_stable
         else (verification, options)
         for name, (verification, options) in verifications.items()
     }
+
+
+def _simulate_axis(bench: Bench, axis: AxisOptions, verification: Verification, design: DesignOptions) -> Verification:
+    """Return the verification with the axis's simulated steps, or with a warning if they cannot be evaluated."""
+    try:
+        return replace(verification, simulated=simulate(bench, axis, verification.slowest_s, design))
+    except ValueError as error:
+        return _warn_unsimulated(verification, error)
+
+
+def _warn_unsimulated(verification: Verification, error: Exception) -> Verification:
+    """Return the verification with a warning that its steps are not simulated."""
+    return replace(verification, warnings=(*verification.warnings, f"steps are not simulated: {error}"))
 
 
 def _hardware_model(axis: AxisOptions, design: DesignOptions) -> HardwareModel:

@@ -204,7 +204,11 @@ def _require_sizes(schema: Schema) -> None:
     text = schema.data.decode(errors="replace")
     for definition in re.split(r"^=+\s*$", text, flags=re.MULTILINE):
         lines = [line.partition("#")[0].strip() for line in definition.splitlines()]
-        if not any(line and not line.startswith("MSG:") and "=" not in line for line in lines) and "[" in text:
+        # A constant has "="; "<=" is the bound of a field.
+        if (
+            not any(line and not line.startswith("MSG:") and "=" not in line.replace("<=", "") for line in lines)
+            and "[" in text
+        ):
             raise DecodingError(
                 f"schema {schema.name[:SHOWN]!r}: a schema with both lists and a message type without fields cannot be "
                 "read; write the file without the empty message type"

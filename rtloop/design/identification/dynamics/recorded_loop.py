@@ -13,7 +13,7 @@ from rtloop.design.identification.axis_recording import UnsuitableData, select_a
 from rtloop.design.identification.dynamics.excitation import LoopExcitation
 from rtloop.design.identification.dynamics.prediction_error import Excitation
 from rtloop.foundation.arrays import Real
-from rtloop.recording.load import Recording, load
+from rtloop.recording.load import load
 from rtloop.signals import Flag, Mode
 
 State = Literal["auto", "open", "closed"]
@@ -82,16 +82,15 @@ def find_closed_loop(
     skipped = shifted_rows(recording)
     external, closed = np.array(recording.read(*present))[:, skipped:], closed[skipped:]
     start, end = _longest_closed(closed) if np.any(closed) else (0, external.shape[1])
-    return RecordedLoop(start, end, present, external, _first_limited_tick(recording, start, end))
+    flags = recording["flags"][skipped:] if "flags" in recording else np.zeros(external.shape[1])
+    return RecordedLoop(start, end, present, external, _first_limited_tick(flags, start, end))
 
 
-def _first_limited_tick(recording: Recording, start: int, end: int) -> int | None:
-    """Return the first tick from `start` on, before `end`, with an active limit or a ramp; None if there is none, or no
-    flags were recorded.
+def _first_limited_tick(flags: Real, start: int, end: int) -> int | None:
+    """Return the first tick from `start` on, before `end`, with an active limit or a ramp by its `flags` (ticks,); None
+    if there is none.
     """
-    if "flags" not in recording:
-        return None
-    limited = np.flatnonzero(recording["flags"][start:end].astype(np.int64) & int(LIMITING_FLAGS))
+    limited = np.flatnonzero(flags[start:end].astype(np.int64) & int(LIMITING_FLAGS))
     return start + int(limited[0]) if limited.size else None
 
 
