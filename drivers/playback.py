@@ -71,7 +71,8 @@ class Playback:
         """Play `rows` (n, TIMING_COLUMNS + 1 + inputs + 1 + observed) from the first, in place of those loaded before.
 
         Columns: deadline and wake in ns, number of missed periods, now in ns; status of the read; inputs in V, age in
-        µs, observed signals. `refused_writes` (n,) is True where the recorded write failed; None if none did.
+        µs, observed signals. `refused_writes` (n,) is True where the recorded write failed; None if none did. Both may
+        be used without a copy: do not change them while they are played.
         """
         self._rows = np.ascontiguousarray(rows, dtype=np.float64)
         self._refused_writes = None if refused_writes is None else np.ascontiguousarray(refused_writes)

@@ -170,7 +170,10 @@ class ShmDriver(Driver):
         return Pointers(context.ctypes.data, shm_read.address, shm_write.address)
 
     def outputs_v(self) -> list[float]:
-        """Return the volts at the converters of the wired outputs. Raises DriverError if the driver is not open."""
+        """Return the volts at the converters of the wired outputs, in the order of the facts.
+
+        Raises DriverError if the driver is not open.
+        """
         if self._memory is None:
             raise DriverError(f"{self._file}: the driver is not open; call open() first")
         return (self._memory.dac_codes[: len(self.wiring)] * LSB_V).tolist()

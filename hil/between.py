@@ -35,8 +35,9 @@ class RecordedMotion(NamedTuple):
 def fractions_of_period(coefficients: np.record, period_s: float, points: int) -> npt.NDArray[np.float64]:
     """Return the factors that move each mode of an axis from a tick to `points` instants of the next period.
 
-    Instant i lies i/points of `period_s` after the tick. The array (modes, PARTS, points) has the real and imaginary
-    part of λᶠ, the factor of the mode's state, then those of (λᶠ − 1)/(λ − 1), the factor of its constant input.
+    Instant i, from 0 on, lies i/points of `period_s` after the tick. The array (modes, PARTS, points) has the real and
+    imaginary part of λᶠ, the factor of the mode's state, then those of (λᶠ − 1)/(λ − 1), the factor of its constant
+    input.
     """
     count = coefficients.mode_count
     exponents = (coefficients.pole_real[:count] + 1j * coefficients.pole_imag[:count])[:, None] * period_s

@@ -93,7 +93,10 @@ class BoardMemory:
 
     @property
     def dac_codes(self) -> np.ndarray[Any, Any]:
-        """Codes at the converters (MAX_CHANNELS,), copied from the newest write; zeros before the first write."""
+        """Codes of the newest write (MAX_CHANNELS,), a copy; zeros before the first write.
+
+        The converters have these codes unless the fault STUCK_OUTPUT holds them.
+        """
         written = int(self.words[WRITTEN])
         return self.fifo[(written - 1) % FIFO]["codes"].copy() if written else np.zeros(MAX_CHANNELS, np.int64)
 

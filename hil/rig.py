@@ -110,7 +110,7 @@ def _fill_coupling(options: RigOptions, axes: Sequence[str], coefficients: np.re
 
 
 def _settle_history(history_v: Sequence[float], coefficients: np.record, state: np.record) -> None:
-    """Set `state` to that of an actuator after the drives `history_v` and a rest at 0 V until its creep has ended."""
+    """Set `state` to that of an actuator after slow moves to each of `history_v` and to 0 V, with its creep ended."""
     displacement_um = 0.0
     for drive_v in (*history_v, 0.0):
         displacement_um = _displacement_um(coefficients, state, drive_v)

@@ -39,7 +39,8 @@ def judge_write(evidence, levels, volts, written_ns, follows):
     """Add one write to the evidence of an output; return 1 if it cannot be compared with its whole window, else 0.
 
     `levels` (MAX_LEVELS,) stores the output's voltages, number i at index i modulo MAX_LEVELS. A write of the same
-    voltage changes nothing. Without `follows`, the output is stuck and keeps its voltage.
+    voltage changes nothing. Without `follows`, the write is judged all the same, but the output is stuck and keeps its
+    voltage.
     """
     if volts == evidence.written_v:
         return 0

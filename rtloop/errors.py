@@ -35,7 +35,10 @@ def fault_list(source: str, faults: Sequence[str]) -> str:
 
 
 def one_line_error(error: BaseException) -> str:
-    """Return type and message of an exception on one line; unprintable characters become "?"."""
+    """Return "Type: message" of an exception on one line.
+
+    White space, line breaks included, becomes one space, an unprintable character "?".
+    """
     words = " ".join(str(error).split())
     return f"{type(error).__name__}: {''.join(letter if letter.isprintable() else '?' for letter in words)}"
 

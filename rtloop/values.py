@@ -18,8 +18,8 @@ def to_jsonable(value: Any) -> Any:
     """Return a value as JSON has it: numbers, text, lists, and dictionaries whose keys are text, nested ones too.
 
     Complex numbers become [real, imaginary], real numbers that are not finite None, dataclasses and named tuples
-    dictionaries, paths text, arrays lists. An object with a method `for_json` is replaced by the result of that method;
-    any other value stays.
+    dictionaries, paths text, arrays lists. An object with a method `for_json` is replaced by the result of that method,
+    converted as well; any other value stays.
     """
     if hasattr(value, "for_json"):
         return to_jsonable(value.for_json())

@@ -124,12 +124,13 @@ class CanDriver(PythonDriver):
     def write(self, volts: Sequence[float]) -> None:
         """Send `volts`, one per output channel, with the next sequence number; do not wait for the answer.
 
-        Raises DriverError if the driver is not open; python-can's errors pass through.
+        Volts are clipped to the range of the DBC's integers. Raises DriverError if the driver is not open, ValueError
+        for NaN, OverflowError for infinity; python-can's errors pass through.
         """
         self._send(self._stream.next_sequence(), volts)
 
     def stop(self) -> None:
-        """Wait until the node answers the last drive frame, which has the safe values, then close the bus.
+        """Wait until the node answers the last drive frame, in which `close` sent the safe values; then close the bus.
 
         Without an answer within CONFIRM_S, the safe values are sent again, CONFIRMATIONS times at most. Raises
         DriverError, with the bus closed, if no answer comes or the bus fails. Without an open bus it does nothing.
@@ -222,8 +223,9 @@ class CanDriver(PythonDriver):
     def _process_frame(self, message: can.Message) -> bool:
         """Store a new sample, or count a lost, late, repeated or invalid frame; return whether it was a new sample.
 
-        A sample is new if it is newer than all earlier ones; the answer to an opening frame is new until the first
-        `write`. Raises DriverError for a drive frame that this driver did not send: another controller drives the node.
+        Frames of other identifiers are ignored. A sample is new if it is newer than all earlier ones; the answer to an
+        opening frame is new until the first `write`. Raises DriverError for a drive frame that this driver did not
+        send: another controller drives the node.
         """
         drive, sample = self._exchange.drive, self._exchange.sample
         if message.arbitration_id == drive.identifier and drive.fits(message):

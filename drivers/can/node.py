@@ -154,9 +154,9 @@ def serve(
 ) -> str:
     """Run a node on the bus of the options until `is_stopped()`; return a sentence with its counts.
 
-    `on_ready` is called when no other node has answered. Raises ValueError for an unknown interface and if rig, axes
-    and DBC do not fit together, KeyError for a DBC without the frame Node; DriverError if the bus cannot be opened or
-    fails, and for another node on it.
+    `on_ready` is called when no other node has answered. Raises ValueError for an unknown interface, if rig, axes and
+    DBC do not fit together, and for a DBC without the frame Node; DriverError if the bus cannot be opened or fails, and
+    for another node on it.
     """
     require_interface(options)
     with open_bus(options) as bus:

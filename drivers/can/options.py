@@ -30,7 +30,7 @@ class BusOptions(Options):
 
     @model_validator(mode="after")
     def _check_rates(self) -> Self:
-        """Require `data_bitrate` with `fd` only, and then at least `bitrate`."""
+        """Raise ValueError for a `data_bitrate` without `fd`, and for one below `bitrate`."""
         if self.data_bitrate is not None and not self.fd:
             raise ValueError(f"data_bitrate: {self.data_bitrate} bit/s; allowed with fd = true only")
         if self.data_bitrate is not None and self.data_bitrate < self.bitrate:

@@ -103,7 +103,7 @@ def make_card(
 
 
 def _scale_array(scales: tuple[Scale, ...]) -> np.ndarray[Any, Any]:
-    """Return the scales as records SCALE (channels,), without safe value and change per ms."""
+    """Return the scales as records SCALE (channels,), which have no safe value and no change per ms."""
     rows = [(s.lowest, s.highest, s.volts_per_code, s.offset_v) for s in scales]
     return np.array(rows, SCALE)
 

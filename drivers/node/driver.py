@@ -100,7 +100,7 @@ class NodeDriver(Driver):
     def _open_node(self, link: Link) -> Pointers:
         """Compare the node on an open line with the options, begin a session, and make the memory of the exchange.
 
-        Returns the pointers of `open`. Raises DriverError as `open`, and OSError if the line fails.
+        Returns the pointers of `open`. Raises DriverError as `open`, and OSError if the line fails; closes no line.
         """
         options = self._options
         self._session = secrets.randbelow(frames.MAX_SESSION) + 1
@@ -195,7 +195,7 @@ class NodeDriver(Driver):
     def _await_welcome(self, link: Link, timeout_s: float) -> Welcome | None:
         """Return the node's description if it comes within `timeout_s`, else None.
 
-        Raises DriverError for a node of another version.
+        Raises DriverError for a node of another version, OSError if the line fails.
         """
         for header, data in _receive_for(link, timeout_s):
             if header.session != self._session:

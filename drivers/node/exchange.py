@@ -51,8 +51,9 @@ OBSERVED_COUNT = len(COUNTS)
 def node_read(context, values):
     """Fill `values` with the newest sample's volts, its age in µs, and the counts of OBSERVED.
 
-    Returns GOOD; HELD while the last request is not answered: the values are the previous sample's, and after more than
-    `hold_ticks` such ticks the age is infinite; FAILED, with the reason in `failure`, once the exchange has ended.
+    With `waits`, first asks for a sample and waits for it, at most `deadline_ns`. Returns GOOD; HELD while the last
+    request is not answered: the values are the previous sample's, and after more than `hold_ticks` such ticks the age
+    is infinite; FAILED, with the reason in `failure`, once the exchange has ended.
     """
     card = carray(context, 1, CARD)[0]
     if card.running == 0:

@@ -236,7 +236,7 @@ def read_refusal(data: bytes) -> Refusal | None:
 
 
 def _pack_codes(codes: Sequence[int]) -> bytes:
-    """Return the codes as signed integers of 32 bits."""
+    """Return the bytes of the codes, signed integers of 32 bits, little-endian."""
     return struct.pack(f"<{len(codes)}i", *codes)
 
 
@@ -248,10 +248,10 @@ def _unpack_codes(data: bytes, start: int, count: int) -> tuple[int, ...] | None
 
 
 def drive_bytes(outputs: int) -> int:
-    """Return the length in bytes of a DRIVE for `outputs` outputs."""
+    """Return the length in bytes of a DRIVE for `outputs` outputs, before COBS."""
     return DRIVE_HEAD + 4 * outputs + CRC_BYTES
 
 
 def sample_bytes(inputs: int) -> int:
-    """Return the length in bytes of a SAMPLE of `inputs` inputs."""
+    """Return the length in bytes of a SAMPLE of `inputs` inputs, before COBS."""
     return SAMPLE_HEAD + 4 * inputs + CRC_BYTES

@@ -63,7 +63,7 @@ class NodeOptions(RigOptions):
 
     @property
     def waits(self) -> bool:
-        """Whether a tick asks for its own sample and waits for it."""
+        """Whether a tick asks for its own sample and waits for it; else it uses the answer to the last tick's drive."""
         return self.answer == "same tick"
 
     @property

@@ -53,12 +53,12 @@ class SimulatedNode:
 
     @property
     def outputs_v(self) -> list[float]:
-        """Voltages at the outputs, in V."""
+        """Voltages at the analogue outputs, in V."""
         return [scale.volts(code) for scale, code in zip(self._outputs, self.codes, strict=True)]
 
     @property
     def _is_safe(self) -> bool:
-        """Whether all outputs have their safe codes."""
+        """Whether all analogue outputs have their safe codes; digital outputs do not count."""
         return all(code == scale.safe for scale, code in zip(self._outputs, self.codes, strict=True))
 
     def poll(self, now_us: float) -> None:

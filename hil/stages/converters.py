@@ -29,7 +29,7 @@ STATE = [("dac_v", "f8"), ("queue_v", "f8", (MAX_LATENCY,)), ("queue_head", "i8"
 
 
 def lsb_and_range(range_v: float, bits: int) -> tuple[float, float, float]:
-    """Return the LSB (0 for an ideal converter), the lowest and the highest value [V] of a converter."""
+    """Return the LSB (0 for an ideal converter, `bits` 0), the lowest and the highest value [V] of a converter."""
     if bits == 0:
         return 0.0, -range_v, range_v
     lsb_v = 2.0 * range_v / 2**bits

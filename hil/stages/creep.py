@@ -40,7 +40,9 @@ def discretise(gains: Sequence[float], time_constants_s: Sequence[float], period
 
 @jit
 def step(coefficients, state, displacement_um):
-    """Return the displacement with creep [µm] for the period that begins, and let the lags follow `displacement_um`."""
+    """Return the displacement with creep [µm] for the period that begins, from the lags before it; then let the lags
+    follow `displacement_um`.
+    """
     crept_um = displacement_um
     for i in range(coefficients.lag_count):
         lag_um = state.lags_um[i]

@@ -107,7 +107,7 @@ def change_resonance(
 def _damped(pole: complex, factor: float) -> complex:
     """Return a pole of the same magnitude as `pole` with `factor` times its damping ratio.
 
-    Raises ValueError for a damping ratio of 1 or more.
+    Raises ValueError if the new damping ratio is 1 or more.
     """
     if factor == 1:
         return pole

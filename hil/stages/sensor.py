@@ -23,7 +23,9 @@ STATE: list[tuple[str, str]] = []
 
 @jit
 def read(coefficients, state, position_um):
-    """Return the sensor's output [V] for `position_um`; draw from the axis's noise if the sensor has any."""
+    """Return the sensor's output [V] for `position_um`: (position + offset + noise) / um_per_v, in steps of the
+    resolution; draw from the axis's noise if the sensor has any.
+    """
     reading_um = position_um + coefficients.sensor_offset_um
     if coefficients.sensor_noise_um > 0.0:
         value, state.noise_word = noise.draw_normal(state.noise_word)

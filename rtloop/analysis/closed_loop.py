@@ -56,7 +56,9 @@ class Loop:
     reference: ReferencePath = UNFILTERED
 
     def open(self, hz: npt.ArrayLike) -> Complex:
-        """Return the open loop L = C·D at frequencies (k,) in Hz, complex (k,)."""
+        """Return the open loop L = C·D at frequencies (k,) in Hz, complex (k,). In discrete time, D includes hold and
+        delay.
+        """
         points = self._points(hz)
         return self.controller.response(points) * self.plant.response(points)
 
@@ -79,6 +81,8 @@ class Loop:
     def response_from_command(self, hz: npt.ArrayLike) -> Complex:
         """Return the complex response (k,) from a signal added to the command to the position, at frequencies (k,) in
         Hz.
+
+        In discrete time, the signal passes hold and delay.
         """
         a, _, c, _ = self.matrices
         return System(a, self.injection.b, c[0], 0.0).response(self._points(hz))
@@ -97,7 +101,8 @@ class Loop:
 
     @cached_property
     def positions(self) -> IntersampleOutput:
-        """Positions within a period, from the closed loop's states and the error's reference.
+        """Positions at the POINTS instants of a period, the sample first, from the closed loop's states and the error's
+        reference.
 
         Of a loop whose `between` is None, the position at the sample alone: (1, n) and (1,).
         """
@@ -147,7 +152,7 @@ class Loop:
 
     @cached_property
     def poles(self) -> Complex:
-        """Closed-loop poles (n,), in s (rad/s) or in z."""
+        """Closed-loop poles (n,), in s (rad/s) or in z, unsorted; those of the pre-filter are not included."""
         return np.linalg.eigvals(self.matrices[0]).astype(complex)
 
     @property
@@ -165,8 +170,8 @@ class Loop:
 
     @cached_property
     def frequencies(self) -> Real:
-        """A rising grid in Hz, even on a logarithmic scale, and dense near lightly damped roots of C, D and the closed
-        loop.
+        """A rising grid in Hz, above 0, even on a logarithmic scale, and dense near lightly damped roots of C, D and
+        the closed loop.
 
         It ends at half the sampling rate, in continuous time at ten times the largest root.
         """
@@ -184,7 +189,10 @@ class Loop:
 
 
 def continuous_loop(controller: Transfer, plant: Transfer) -> Loop:
-    """Return the loop of C(s) and D(s) in continuous time. Raises ValueError for a plant with direct feedthrough."""
+    """Return the loop of C(s) and D(s) in continuous time, without delay and pre-filter.
+
+    Raises ValueError for a plant with direct feedthrough.
+    """
     _require_strictly_proper(plant)
     roots = np.concatenate([controller.zeros, controller.poles, plant.zeros, plant.poles])
     return Loop(realise_transfer(controller), realise_transfer(plant), (controller * plant).dc_gain, roots)

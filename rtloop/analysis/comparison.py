@@ -54,8 +54,8 @@ class ControllerComparison:
     warnings: list[str]
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the fields by name as values for JSON, null for NaN; `shifts` is a list of {kind, frequency_hz,
-        discrete_hz, damping}.
+        """Return the fields by name as values for JSON, null for numbers that are not finite; `shifts` is a list of
+        {kind, frequency_hz, discrete_hz, damping}.
         """
         return to_jsonable(self)
 
@@ -67,7 +67,7 @@ def compare_controllers(
     largest_shift: float = 0.002,
     largest_part_of_half_width: float = 0.5,
 ) -> ControllerComparison:
-    """Return the deviation of C(z) from C(s) and the shifts of notches and resonances, with warnings.
+    """Return the largest |C(z) − C(s)|/|C(s)| and the shifts of notches and resonances, with warnings.
 
     The deviation is over frequencies below `up_to_hz`, at most (and by default) half the sampling rate.
 
@@ -100,7 +100,8 @@ def _frequencies(transfer: Transfer, limit_hz: float) -> Real:
 
 
 def _light_pairs(roots: Complex) -> list[complex]:
-    """Return the root with positive imaginary part of each pair with a |damping ratio| below LIGHT_DAMPING, in order.
+    """Return the root with positive imaginary part of each pair with a |damping ratio| below LIGHT_DAMPING, in the
+    order of `roots`.
 
     A pair to the right of the imaginary axis counts like its mirror image to the left.
     """

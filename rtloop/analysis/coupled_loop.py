@@ -71,8 +71,8 @@ class CoupledPlant:
 def coupling_matrix(names: Sequence[str], coupling: Sequence[Mapping[str, float]]) -> Real:
     """Return K (axes, axes), the µm that the row's axis moves, before its dynamics, per µm of the column's command.
 
-    `coupling` has a dict for each of `names`, with the factors by the names of other axes. K is 1 on the diagonal, and
-    0 for axes that the dict does not name.
+    `coupling` has, for each of `names` in order, the factors of its row by the names of the other axes. K is 1 on the
+    diagonal, and 0 for axes that the dict does not name; other names in the dict are ignored.
     """
     pairs = zip(names, coupling, strict=True)
     return np.array([[1.0 if a == b else factors.get(b, 0.0) for b in names] for a, factors in pairs])
@@ -94,12 +94,16 @@ class BrokenLoop(Loop):
         return self.command_injection
 
     def command_sensitivity(self, hz: npt.ArrayLike) -> Real:
-        """Return |C·S| (k,) from the axis's reference to its command, at frequencies (k,) in Hz."""
+        """Return |C·S| (k,) from the reference of the axis's error (without pre-filter) to its command, at frequencies
+        (k,) in Hz.
+        """
         return np.abs(self.command.response(self._points(hz))) * self.sensitivity(hz)
 
     @cached_property
     def matrices(self) -> tuple[Real, Real, Real, Real]:
-        """A (n, n), b (n,), C (2, n), d (2,) from the axis's reference to its position and command."""
+        """A (n, n), b (n,), C (2, n), d (2,) from the reference of the axis's error (without pre-filter) to position,
+        command.
+        """
         a, b, c, _ = self.plant
         command_row, direct = self.command.c, self.command.d
         return a - np.outer(b, c), b, np.vstack([c, command_row - direct * c]), np.array([0.0, direct])
@@ -121,7 +125,7 @@ class SimultaneousMargins(NamedTuple):
     command_disk_margin_hz: float
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the margins by name as values for JSON, null for NaN."""
+        """Return the margins by name as values for JSON, null for margins that are not finite."""
         return to_jsonable(self)
 
 
@@ -183,7 +187,7 @@ class CoupledLoop:
 
     @cached_property
     def poles(self) -> Complex:
-        """Poles in z (n,) of the closed loop of all axes."""
+        """Poles in z (n,) of the closed loop of all axes, unsorted."""
         return self.axis_loop(0).poles
 
     @property
@@ -192,12 +196,14 @@ class CoupledLoop:
         return bool(np.all(np.abs(self.poles) < 1))
 
     def sensitivity(self, hz: npt.ArrayLike) -> Complex:
-        """Return S = (I + G C)⁻¹ at frequencies (k,) in Hz, complex (k, axes, axes): from references to errors."""
+        """Return S = (I + G C)⁻¹ at frequencies (k,) in Hz, complex (k, axes, axes): from the column's reference
+        (without pre-filter) to the row's error.
+        """
         return self._inverse_return_difference(hz, self._plant, self._controller)
 
     def command_sensitivity(self, hz: npt.ArrayLike) -> Complex:
-        """Return (I + C G)⁻¹ at frequencies (k,) in Hz, complex (k, axes, axes): from signals added to the commands, to
-        the commands.
+        """Return (I + C G)⁻¹ at frequencies (k,) in Hz, complex (k, axes, axes): from a signal added to the column's
+        command, to the row's command.
         """
         return self._inverse_return_difference(hz, self._controller, self._plant)
 

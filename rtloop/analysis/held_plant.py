@@ -37,7 +37,7 @@ class HeldPlant(NamedTuple):
 
 
 def hold_plant(plant: Transfer, period_s: float, delay_ticks: int = 0) -> HeldPlant:
-    """Return D(s) behind a zero-order hold and `delay_ticks` samples of delay, one state more per sample.
+    """Return D(s) behind a zero-order hold and `delay_ticks` samples of delay, each of which adds a state.
 
     D(s) must have fewer zeros than poles, which is not checked. Raises ValueError for a negative delay and for a period
     that is not a positive number.

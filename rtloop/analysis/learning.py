@@ -33,7 +33,9 @@ again."""
 
 
 def cycle_periods(period_ticks: int, rate_hz: float) -> tuple[int, int]:
-    """Return how many whole periods of a cycle the loop has to settle, and how many after them are evaluated."""
+    """Return the least whole numbers of periods that settle (SETTLE_S) and that are then evaluated (EVALUATION_S) in a
+    cycle.
+    """
     period_s = period_ticks / rate_hz
     return math.ceil(SETTLE_S / period_s), math.ceil(EVALUATION_S / period_s)
 
@@ -78,8 +80,8 @@ class LearningGains:
 def learning_gains(loops: Sequence[tuple[str, Loop]], period_ticks: int) -> LearningGains:
     """Return the learning gains for a table of `period_ticks`, for all named loops, of one rate, at once.
 
-    Raises ValueError, with the name of the loop, where a loop is unstable or in continuous time, and where the error at
-    0 Hz or at the first harmonic would not shrink in each loop.
+    Raises ValueError, with the name of the loop, where a loop is unstable or in continuous time, and where a cycle
+    would leave LARGEST_CONTRACTION or more of the error at 0 Hz or at the first harmonic in any loop.
     """
     period_s = loops[0][1].period_s
     if period_s is None:

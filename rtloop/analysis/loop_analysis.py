@@ -56,9 +56,10 @@ class LoopAnalysis:
 def analyse_loop(
     loop: Loop, margin_values: Margins, delay_ticks: int, times_s: Sequence[float] = TIMES_S
 ) -> LoopAnalysis:
-    """Return the analysis of a loop, with its margins, `delay_ticks` and positions at `times_s` after a step.
+    """Return the analysis of a loop, with its margins and its positions at `times_s` after a unit step.
 
-    `poles` are in rising order of their real, then imaginary parts.
+    `delay_ticks` is only reported: `loop` includes its delay. `poles` are in rising order of their real, then imaginary
+    parts. Step figures of an unstable loop are NaN.
     """
     continuous = loop.period_s is None
     poles = loop.poles[np.lexsort((loop.poles.imag, loop.poles.real))]

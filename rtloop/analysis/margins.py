@@ -24,7 +24,7 @@ class OpenLoop(Protocol):
 
     @property
     def static_gain(self) -> float:
-        """Open loop L at 0 Hz; NaN where it is not known."""
+        """Open loop L at 0 Hz: ±inf for an integrating loop, NaN where L is not known."""
         ...
 
     @property
@@ -58,8 +58,8 @@ class Margins(NamedTuple):
 
 
 def loop_margins(loop: OpenLoop) -> Margins:
-    """Return the lowest crossover, the smallest phase margin over all crossovers, the smallest gain factor > 1 that
-    brings L to −1, and max |S|.
+    """Return the lowest crossover, the smallest phase margin in degrees over all crossovers, the smallest gain factor >
+    1 that brings L to −1, and max |S|.
 
     Without a crossover it is NaN and the phase margin inf; without such a factor the gain margin is inf.
     """
@@ -74,7 +74,10 @@ def loop_margins(loop: OpenLoop) -> Margins:
 
 
 def gain_crossovers(loop: OpenLoop) -> list[float]:
-    """Return the frequencies in Hz within the grid at which |L| of the open loop is 1, rising; [] without one."""
+    """Return the frequencies in Hz at which |L| of the open loop is 1, rising; [] without one.
+
+    They lie between points of the grid and are refined there.
+    """
     hz = loop.frequencies
     changes = _sign_changes(hz, np.abs(loop.open(hz)) - 1)
     return [zero_between(lambda f: np.abs(loop.open(f)) - 1, *ends) for ends in changes]
@@ -129,10 +132,11 @@ def _refine_maximum(function: Callable[[Real], Real], low: float, high: float) -
 
 
 def delay_margin(loop: OpenLoop) -> tuple[float, float]:
-    """Return the smallest further delay in s that makes a stable loop unstable, and its crossover in Hz; inf, NaN
-    without one.
+    """Return the smallest further delay in s that makes the loop unstable, and its crossover in Hz; inf, NaN without
+    one.
 
-    L exp(−jωτ) meets −1 where |L| = 1 and the phase left above −180°, counted downwards, is ωτ.
+    The loop must be stable, which is not checked. L exp(−jωτ) meets −1 where |L| = 1 and the phase left above −180°,
+    counted downwards, is ωτ.
     """
     phases = [(math.degrees(np.angle(loop.open(f)[0])) % 360 - 180, f) for f in gain_crossovers(loop)]
     return min(((phase_deg % 360 / (360 * f), f) for phase_deg, f in phases), default=(math.inf, math.nan))

@@ -52,7 +52,8 @@ def loop_builder(controller: Transfer | DiscreteController | SampledController, 
 
 
 def stability_range(build_loop: LoopBuilder, plant: Transfer, change: PlantChange) -> PercentRange:
-    """Return the range of a change of `plant`, in percent, over which the loop stays stable.
+    """Return the range of a change of `plant`, downwards and upwards in percent (both ≥ 0), over which the loop stays
+    stable.
 
     It is (0, 0) for a loop that is unstable without change; an end is None if the search found no unstable loop there.
     Raises the errors of `build_loop`.
@@ -90,7 +91,8 @@ def change_gain(plant: Transfer, percent: float) -> Transfer:
 
 
 def change_damping(plant: Transfer, percent: float) -> Transfer:
-    """Return the plant with the damping ratio of its least damped pole pair changed by `percent`; |pole| and D(0) stay.
+    """Return the plant with the damping ratio of its least damped pole pair multiplied by 1 + `percent`/100; |pole| and
+    D(0) stay.
 
     Raises ValueError where all poles are real, and for a damping ratio above 1.
     """
@@ -118,8 +120,8 @@ def plant_changes(plant: Transfer) -> dict[str, PlantChange]:
 
 
 def shift_resonance(plant: Transfer, percent: float) -> Transfer:
-    """Return the plant with the frequency of its least damped pole pair changed by `percent`; damping ratio and D(0)
-    stay.
+    """Return the plant with the frequency of its least damped pole pair multiplied by 1 + `percent`/100; damping ratio
+    and D(0) stay.
 
     Raises ValueError for a plant without complex poles.
     """

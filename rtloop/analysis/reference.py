@@ -35,7 +35,9 @@ class ReferencePath:
 
     @property
     def settling_ticks(self) -> int:
-        """Ticks until the pre-filter's response to a step is constant, to MEMORY_TOLERANCE."""
+        """Ticks until the pre-filter's response to a step is constant, to MEMORY_TOLERANCE; 1 for a path that changes
+        nothing.
+        """
         poles = [np.abs(np.roots([1.0, *section[3:]])).max(initial=0.0) for section in self.sections]
         slowest = max(poles, default=0.0)
         ringing = np.log(MEMORY_TOLERANCE) / np.log(slowest) if 0 < slowest < 1 else 2.0
@@ -51,7 +53,10 @@ class ReferencePath:
         return np.asarray(filtered, np.float64)
 
     def command_input(self, values: npt.ArrayLike) -> Real:
-        """Return the addition to the command: `values` (…, ticks) filtered by the command's taps, from rest."""
+        """Return the addition to the command: `values` (…, ticks) filtered by the command's taps, from rest.
+
+        Raises ValueError for a path that has no command taps.
+        """
         return _convolve(self.command_taps, values)
 
     def response(self, points: npt.ArrayLike) -> tuple[Complex, Complex]:

@@ -14,7 +14,7 @@ minutes."""
 
 
 def find_limit(holds: Callable[[float], bool], largest: float, step: float, tolerance: float) -> float:
-    """Return the largest value up to `largest` such that `holds` is true from 0 to it, within `tolerance`.
+    """Return the largest value up to `largest` such that `holds` is true from 0 to it, or at most `tolerance` less.
 
     `holds` is taken to be true at 0. The search steps outwards, first by `step`, each further step a tenth longer, then
     bisects; a failure narrower than a step may be missed. `largest` is returned only if no step failed.

@@ -29,7 +29,8 @@ class ArchivedRecording(NamedTuple):
 
 
 def find_recordings(patterns: Iterable[Path]) -> list[ArchivedRecording]:
-    """Return the recordings that patterns, files and folders name, sorted by path, each once.
+    """Return the recordings that patterns, files and folders name, sorted by path, each once; the files of a rotated
+    run are one recording.
 
     In a pattern, ** stands for any number of folders; a folder stands for all recordings below it. A subfolder that
     cannot be read is returned like a recording. An unfinished file beside its recovered one is left out. Raises
@@ -114,7 +115,10 @@ def _is_one_run(paths: Sequence[str]) -> bool:
 
 
 def _read_status(paths: tuple[str, ...]) -> ArchivedRecording:
-    """Return the recording of some files, with the size and time of its files; a missing file has size 0 and time 0."""
+    """Return the recording of some files, with the total size and the latest time of the files.
+
+    A missing file has size 0 and time 0.
+    """
     sizes, times_ns = [], []
     for path in paths:
         try:

@@ -38,7 +38,8 @@ class VerdictTable:
         """Make and lock `folder`, and read the rows of unchanged recordings there; without a folder there are none.
 
         `columns` are the names of the columns of the examination. A stored row whose verdict may change without the
-        file, one of REPEATED, is left out.
+        file, one of REPEATED, is left out. Raises UnavailableError if another process writes to the folder, OutputError
+        if the system refuses.
         """
         self._recordings, self._columns = recordings, columns
         self.rows: dict[str, Row] = {}
@@ -81,13 +82,13 @@ class VerdictTable:
                 self.rows[recording.paths[0]] = {**self._empty(recording), **row}
 
     def close(self) -> None:
-        """Close the file and release the lock, so that other processes may write to the folder."""
+        """Close the file and release the lock, if there are any, so that other processes may write to the folder."""
         for descriptor in (self._file, self._lock):
             if descriptor >= 0:
                 close_descriptor(descriptor)
 
     def missing(self) -> list[ArchivedRecording]:
-        """Return the recordings that have no row."""
+        """Return the recordings that have no row, in order."""
         return [recording for recording in self._recordings if recording.paths[0] not in self.rows]
 
     def add(self, recording: ArchivedRecording, values: Row) -> None:
@@ -114,7 +115,7 @@ class VerdictTable:
         return dict(Counter(row["verdict"] for row in self.ordered_rows()).most_common())
 
     def _append(self, rows: Iterable[Row]) -> None:
-        """Append rows to the file, and wait until they are on the disk. Raises OSError."""
+        """Append rows to the file, which must be open, and wait until they are on the disk. Raises OSError."""
         content = "".join(json.dumps(row) + "\n" for row in rows).encode()
         while content:
             content = content[os.write(self._file, content) :]

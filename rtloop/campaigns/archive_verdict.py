@@ -158,7 +158,9 @@ def _figures(summary: Summary) -> Row:
 
 
 def _is_unfinished(paths: Sequence[Path]) -> bool:
-    """Whether a recording has the name of an unfinished file."""
+    """Whether the first of a recording's files has the name of an unfinished file; the names of the others do not
+    count.
+    """
     return paths[0].name.endswith(UNFINISHED_SUFFIX)
 
 

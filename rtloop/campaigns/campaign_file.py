@@ -120,8 +120,8 @@ def load_campaign(path: Path, rigs: int | None = None, configuration: Path | Non
     `rigs` replaces the number of sampled rigs, `configuration` the path of the configuration; its axis's specification,
     and so its limits, count then.
 
-    Raises InputFileError for an unreadable file, ConfigError with all faults of the file or of its configuration, and
-    for a recording without lateness, RecordingError for a file that is no recording.
+    Raises InputFileError for an unreadable file; ConfigError with all faults of the file or of its configuration, and
+    for a recording without lateness; RecordingError for a file of `lateness` that is no recording.
     """
     try:
         raw = parse_toml(read_text(path))

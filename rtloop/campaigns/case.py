@@ -121,7 +121,8 @@ class CaseRunner:
         """Run all experiments of a rig; return its figures and verdict, with a `refusal` for a rig that cannot run.
 
         `values` by key replace all drawn ones; of a key that they lack, also of "driver.seed", the configured value
-        counts. Raises RuntimeError if the rig that runs has another value than the one given or drawn.
+        counts. Raises RuntimeError if the rig that runs has another value than the one given or drawn; without
+        `values`, raises as `sample_values`.
         """
         drawn = self.sample_values(rig) if values is None else dict(values)
         try:
@@ -137,7 +138,8 @@ class CaseRunner:
     def configuration_text(self, values: Mapping[str, Any], experiment: Experiment, heading: str) -> str:
         """Return the configuration of a rig with `values` in one experiment as TOML, for a run that is recorded.
 
-        Its first line is the comment `heading`. Raises ValueError for values that the configuration has no place for.
+        Its first line is `heading` as a comment, after "# ". Raises ValueError for values that the configuration has no
+        place for.
         """
         return self._builder.text(values, experiment, heading)
 
@@ -239,7 +241,7 @@ class _Outcome(NamedTuple):
 
 
 def _require_equal(computed_um: Real, recorded_um: Real) -> None:
-    """Raise ValueError unless the positions at ticks, computed from the record, are the recorded ones.
+    """Raise ValueError unless the positions at ticks, computed from the record, are exactly the recorded ones.
 
     They differ where the actuator moved in periods without a tick: by a drive on its way, by creep or by a fault.
     """

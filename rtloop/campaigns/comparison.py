@@ -104,7 +104,7 @@ def mcnemar(only_first: int, only_second: int) -> float:
 
 
 def paired_difference(first: Real, second: Real, seed: int = 0) -> FigureDifference:
-    """Return the median of `second` − `first` (n,) over the pairs that are finite, with its bootstrap interval.
+    """Return the median of `second` − `first` (n,) over the pairs that are finite, with its bootstrap interval (95 %).
 
     The bootstrap draws with `seed`. The interval is NaN for less than two pairs, the median for none.
     """
@@ -124,12 +124,15 @@ def paired_difference(first: Real, second: Real, seed: int = 0) -> FigureDiffere
 
 
 def _columns(folder: Path) -> dict[str, Any]:
-    """Return the columns of all sampled rigs in a folder that could run and are independent, by name."""
+    """Return the columns of all sampled rigs in a folder that could run and are independent, by name.
+
+    Raises as `read_columns`.
+    """
     columns = read_columns(folder)
     counted = independent_rigs(columns, read_manifest(folder))
     return {name: values[counted] for name, values in columns.items()}
 
 
 def _yield(passed: Any) -> Yield:
-    """Return the yield of rigs, with its interval; `passed` (n,) are truth values."""
+    """Return the yield of rigs, with its interval (95 %); `passed` (n,) are truth values."""
     return clopper_pearson(int(np.count_nonzero(passed)), len(passed))

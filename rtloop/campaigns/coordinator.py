@@ -44,7 +44,7 @@ class Coordinator:
     def run(
         self, units: list[Unit], on_progress: Callable[[Progress], None], is_stop_requested: Callable[[], bool]
     ) -> bool:
-        """Run the rigs of `units` without a result; return whether all of them have results now.
+        """Run the rigs of `units` without a result; return whether all of them have results now, crashed rigs included.
 
         After a request to stop, the tasks that were submitted end and no other one starts. Raises the error of a task,
         such as OtherVersion; UnavailableError if the scheduler is gone; LoopFault if the nominal rig kills its workers;

@@ -61,11 +61,11 @@ class Dispatcher:
     def run(
         self, tasks: Iterable[Task], on_progress: Callable[[int], None], is_stop_requested: Callable[[], bool]
     ) -> int:
-        """Run the tasks; return the number of items that are stored or set aside, which `on_progress` receives too.
+        """Run the tasks; return the number of items that are stored or set aside.
 
-        `on_progress` is called after each end of tasks. After a request to stop, submitted tasks end and are stored,
-        and no other one starts. Raises the error of a task, UnavailableError if the scheduler is gone, and the errors
-        of the job. Results that came before are stored.
+        `on_progress` receives their number so far after each end of tasks. After a request to stop, submitted tasks end
+        and are stored, and no other one starts. Raises the error of a task, UnavailableError if the scheduler is gone,
+        and the errors of the job. Results that came before are stored.
         """
         waiting, done = iter(tasks), 0
         while self._fill(waiting, is_stop_requested()):

@@ -69,7 +69,7 @@ def _step(node: Any, part: str, key: str) -> Any:
 
 
 def _list_index(entries: list[Any], part: str, key: str) -> int:
-    """Return the index of an entry, by its name or by its number. Raises ValueError where there is none."""
+    """Return the index of an entry, by its name or by its number, from 0. Raises ValueError where there is none."""
     names = [entry.get("name") for entry in entries if isinstance(entry, dict)]
     if part in names:
         return names.index(part)

@@ -259,7 +259,9 @@ def rank_keys(keys: Sequence[str], columns: Columns, summary: CampaignSummary) -
 
 
 def _distribution_distance(first: Real, second: Real) -> float:
-    """Return the largest difference between the distribution functions of two samples (n,) and (m,)."""
+    """Return the largest difference between the distribution functions of two samples (n,) and (m,), neither of them
+    empty.
+    """
     values = np.concatenate([first, second])
     shares = (np.searchsorted(np.sort(sample), values, "right") / sample.size for sample in (first, second))
     return float(np.max(np.abs(np.subtract(*shares))))

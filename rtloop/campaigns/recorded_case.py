@@ -17,15 +17,18 @@ from rtloop.supervision.supervisor import Processes, Supervisor
 def record_rig(runner: CaseRunner, rig: int, folder: Path) -> list[Path]:
     """Run all experiments of a rig in virtual time, each recorded in `folder`; a recording that exists is kept.
 
-    Returns the paths of all recordings, rig-NUMBER-EXPERIMENT.mcap, in the order of the experiments. Raises ConfigError
-    for a rig that cannot run, OutputError for a file that cannot be written, RtloopError for a run that cannot start;
-    recordings of earlier experiments stay.
+    Returns the paths of all recordings, rig-NUMBER-EXPERIMENT.mcap with nine digits in NUMBER, in the order of the
+    experiments. Raises ConfigError for a rig that cannot run, OutputError for a file that cannot be written,
+    RtloopError for a run that cannot start; recordings of earlier experiments stay.
     """
     return record_values(runner, runner.sample_values(rig), f"rig-{rig:09d}", folder)
 
 
 def record_values(runner: CaseRunner, values: Mapping[str, Any], name: str, folder: Path) -> list[Path]:
-    """Record a rig with `values` by key, as `record_rig` does; the names of the recordings begin with `name`."""
+    """Record a rig with `values` by key, as `record_rig` does, to NAME-EXPERIMENT.mcap for each experiment.
+
+    Keys that `values` lacks have their configured values.
+    """
     with output_errors(folder):
         folder.mkdir(parents=True, exist_ok=True)
     return [

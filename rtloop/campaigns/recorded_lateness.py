@@ -23,8 +23,8 @@ US_PER_S, NS_PER_US = 1e6, 1e3
 def recorded_lateness(path: Path) -> tuple[float, ...]:
     """Return the lateness of the ticks of a recording in µs, sorted, at most MAX_LATENESS_SAMPLES numbers.
 
-    Raises RecordingError for a file that is no recording, ConfigError for a recording without lateness, as one of a run
-    in virtual time is, and for a tick that is later than LARGEST_LATENESS_US.
+    Raises RecordingError for a file that is no recording; ConfigError for a recording without lateness, as of a run in
+    virtual time, and for a recording with a tick that is later than LARGEST_LATENESS_US.
     """
     recording = load(path)
     lateness_us, missed = recording.read("lateness_us", "periods_missed")
@@ -50,7 +50,9 @@ def _new_lateness(lateness_us: Real, missed: Real, period_us: float) -> Real:
 
 
 def reduce_samples(ordered: Real, count: int) -> Real:
-    """Return at most `count` of sorted numbers, at evenly spaced ranks, the least and the largest included."""
+    """Return at most `count` of sorted numbers, at evenly spaced ranks, the least and the largest included; all, if
+    they are not more.
+    """
     if ordered.size <= count:
         return ordered
     return ordered[np.rint(np.linspace(0, ordered.size - 1, count)).astype(np.int64)]

@@ -75,9 +75,9 @@ class RigBuilder:
         )
 
     def driver(self, loop: Loop, values: Mapping[str, Any], experiment: Experiment) -> SimDriver:
-        """Return the driver, not opened, of a rig with `values` in one experiment; keys of the driver alone count.
+        """Return the driver, not opened, of a rig with `values` and with the disturbance of one experiment.
 
-        Raises ValueError for options that no rig fits.
+        Of `values`, keys of the driver alone count. Raises ValueError for options that no rig fits.
         """
         changed = replace_values({"driver": self._tables["driver"]}, _rig_values(values))
         tables = self._add_disturbance(changed, experiment)

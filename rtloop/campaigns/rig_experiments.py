@@ -38,7 +38,7 @@ class Motion(NamedTuple):
         return self.reference_um[:, None] * (1 - shares) + ends_um[:, None] * shares - self.position_um
 
     def tick(self, time_s: float) -> int:
-        """Return the number of the tick nearest to `time_s`."""
+        """Return the number of the tick nearest to `time_s`, counted from the first tick."""
         return round(time_s * self.rate_hz)
 
 
@@ -59,7 +59,7 @@ class ExperimentOptions(Options):
         raise NotImplementedError
 
     def ticks(self, rate_hz: float) -> int:
-        """Return the number of ticks of the experiment, at least 1."""
+        """Return the number of ticks of the experiment, rounded, at least 1."""
         return max(round(self.duration_s * rate_hz), 1)
 
     @property
@@ -213,7 +213,7 @@ class DisturbanceExperiment(ExperimentOptions):
 
     @model_validator(mode="after")
     def _check(self) -> Self:
-        """Require a step or a sine."""
+        """Require a step, a sine or both."""
         if not (self.step_um or self.sine_um):
             raise ValueError("step_um and sine_um are 0; allowed: at least one other than 0")
         return self
@@ -239,7 +239,8 @@ class DisturbanceExperiment(ExperimentOptions):
         return ("error_peak_um", "error_rms_um", "settling_ms")
 
     def measure(self, motion: Motion) -> tuple[float, ...]:
-        """Return largest magnitude and root mean square (µm) of the error from `start_s` on, and settling time (ms).
+        """Return largest magnitude and root mean square (µm) of the error from `start_s` on, and settling time from
+        there (ms).
 
         The time is 0 without a step, infinite if the error is outside the band at the end. All three are infinite if a
         position is not finite.

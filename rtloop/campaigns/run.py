@@ -25,7 +25,7 @@ def campaign(
     jobs: int | None = None,
     scheduler: Any = None,
 ) -> Any:
-    """Run a campaign and return its results, a row for each rig and one for the nominal rig, which has number 0.
+    """Run a campaign and return its results, a row for each rig in rising order; the nominal rig has number 0.
 
     They are a DataFrame of pandas, or without pandas a dict of arrays (rigs,) by column: rig, status, missed, ratio,
     the seed and the values of the keys, the figures, and the causes of each experiment's trip.
@@ -77,5 +77,5 @@ def run_campaign(
 
 
 def default_folder(campaign: Campaign) -> Path:
-    """Return the folder of a campaign's results where none is chosen: campaigns/NAME."""
+    """Return the folder of a campaign's results where none is chosen: campaigns/NAME in the working directory."""
     return Path("campaigns") / campaign.name

@@ -23,7 +23,7 @@ BITS, SOBOL_BITS = 52, 30
 
 
 def stream_word(*names: object) -> int:
-    """Return a random integer of 64 bits that depends on `names` alone."""
+    """Return a random integer, 0 … 2⁶⁴ − 1, that depends on `names` alone."""
     digest = hashlib.sha256("/".join(map(str, names)).encode()).digest()
     return int.from_bytes(digest[:8], "little")
 
@@ -34,7 +34,7 @@ def noise_seed(seed: int, rig: int) -> int:
 
 
 def unit_samples(sampling: Sampling, keys: Sequence[str], first: int, count: int, total: int, seed: int) -> Real:
-    """Return numbers in (0, 1) for samples `first` … `first` + `count` − 1, (count, keys).
+    """Return numbers in (0, 1) for samples `first` … `first` + `count` − 1, counted from 0, (count, keys).
 
     `total` is the number of all samples, which Latin hypercubes alone use. Raises ValueError for samples beyond it, and
     for more keys than Sobol's sequence has dimensions.

@@ -88,9 +88,10 @@ def find_worst(
 ) -> SearchResult:
     """Return the rig with the largest `figure` among about `rigs` tried ones; without a name, the largest ratio.
 
-    Whole generations run, at least one; the search ends early once the figure reaches `target`. A rig that is refused
-    counts with the figure 0, one whose figure is not finite as the worst. Raises ConfigError for an unknown figure, for
-    keys without numbers, and for the ratio of a campaign without limits; and as `evaluate` does.
+    Whole generations of differential evolution run, at least one; the search ends early once the figure reaches
+    `target`. A rig that is refused counts with the figure 0, one that trips or whose figure is not finite as the worst.
+    Raises ConfigError for an unknown figure, for keys without numbers, and for the ratio of a campaign without limits;
+    and as `evaluate` does.
     """
     from scipy.optimize import differential_evolution
 
@@ -139,9 +140,9 @@ def find_worst(
 def find_boundary(runner: CaseRunner, key: str, evaluate: Evaluate, tolerance: float = 0.0) -> Boundary:
     """Return the range of `key` around its nominal value in which rigs pass, all other keys at their nominal values.
 
-    The noise is the nominal rig's. Bisection ends at `tolerance`, in the key's unit, or after BISECTIONS halvings.
-    Raises ConfigError for a key that is not uncertain, has no range of numbers or no configured value; and as
-    `evaluate` does.
+    An end is None where no tried rig fails; both are the nominal value if the nominal rig fails. The noise is the
+    nominal rig's. Bisection ends at `tolerance`, in the key's unit, or after BISECTIONS halvings. Raises ConfigError
+    for a key that is not uncertain, has no range of numbers or no configured value; and as `evaluate` does.
     """
     distribution = runner.options.uncertain.get(key)
     if distribution is None or distribution.choice is not None:

@@ -75,7 +75,8 @@ class Store:
     def __init__(self, folder: Path, campaign: Campaign, nominal: Mapping[str, Any]) -> None:
         """Open or make the folder of a campaign; `nominal` has the values of its keys, for the columns' types.
 
-        Of two files of one unit, as a killed process leaves them, the shorter one is removed.
+        Of two files of one unit, as a killed process leaves them, the shorter one is removed. Raises as the class
+        says.
         """
         self._arrow, self.folder, self._campaign = arrow(), folder, campaign
         self._schema = _schema(self._arrow, campaign, nominal)
@@ -123,9 +124,10 @@ class Store:
         close_descriptor(self._lock)
 
     def missing(self, unit: Unit) -> Sequence[int]:
-        """Return the rigs of a unit that have no result. A damaged file is renamed, and its rigs are missing.
+        """Return the rigs of a unit that have no result.
 
-        Raises OutputError for a file that cannot be read.
+        A file that is damaged or has other columns is renamed, and its rigs are missing. Raises OutputError for a file
+        that cannot be read or renamed.
         """
         if unit.first not in self._paths:
             return unit.rigs
@@ -145,7 +147,10 @@ class Store:
             replaced.unlink(missing_ok=True)
 
     def equals(self, case: CaseResult) -> bool | None:
-        """Whether the stored row of the rig equals the row of its result `case` byte for byte; None without a row."""
+        """Whether the stored row of the rig equals the row of its result `case` byte for byte; None without a row.
+
+        A damaged file is treated, and OutputError raised, as in `missing`.
+        """
         firsts = [first for first in self._paths if first <= case.rig]
         rows = {} if not firsts else {row["rig"]: row for row in self._rows(Unit(max(firsts), case.rig))}
         if case.rig not in rows:

@@ -109,9 +109,11 @@ class _Hashed:
         self.key, self.campaign = (digest, campaign.options.rigs), campaign
 
     def __hash__(self) -> int:
+        """Return the hash of digest and number of rigs."""
         return hash(self.key)
 
     def __eq__(self, other: Any) -> bool:
+        """Whether `other` has a campaign with the same digest and the same number of rigs."""
         return isinstance(other, _Hashed) and self.key == other.key
 
 

@@ -80,7 +80,10 @@ class ProcessWorkers:
         self._executor = self._start()
 
     def submit(self, function: Callable[..., Any], *arguments: Any) -> Future[Any]:
-        """Start a function of a module in one of the processes; return the future of its result."""
+        """Start a function of a module in one of the processes; return the future of its result.
+
+        Raises BrokenProcessPool if a process of the pool has died.
+        """
         return self._executor.submit(function, *arguments)
 
     def explain(self, error: BaseException) -> BaseException:
@@ -128,7 +131,8 @@ class DaskWorkers:
     def __init__(self, scheduler: Any) -> None:
         """Use a scheduler by its address, such as tcp://HOST:8786, or a `dask.distributed.Client`.
 
-        With an address, a client is made, which `close` ends, and NOISY_LOGGERS are silenced.
+        With an address, a client is made, which `close` ends, and NOISY_LOGGERS are silenced. Raises as the class
+        says.
         """
         try:
             from distributed import Client

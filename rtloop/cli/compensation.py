@@ -57,10 +57,13 @@ def compensation_report(
 
     Returns the JSON report. Its `bounds` have a row for each choice of the gain ρ: {gain ("eq_2", "best" or "unity"),
     rho, xi_um: the bound ξ, simulated_um: {sine, random, worst_case}, the largest |Ω| = |y − ρ v|, y being the output
-    for a command v}. `axis` None is the first axis. `command_um` is the largest |v| (None: the axis's limit). Writes a
-    picture to `plot`, if given. Raises ConfigError for a file
-    without a hysteresis model of the axis and for a compensator whose loading curve does not increase, RecordingError
-    for an unreadable file, OutputError and MissingExtra for the picture.
+    for a command v}. Further keys: config, identified, command_um, thresholds_um, weights, eq_3_um and
+    triangle_bound_um (other bounds), dead_band, same_model (whether the inverse is computed from the actuator's own
+    model), plot.
+
+    `axis` None is the first axis. `command_um` is the largest |v| (None: the axis's limit). Writes a picture to `plot`,
+    if given. Raises ConfigError for a file without a hysteresis model of the axis and for a compensator whose loading
+    curve does not increase, RecordingError for an unreadable file, OutputError and MissingExtra for the picture.
     """
     import numpy as np
 

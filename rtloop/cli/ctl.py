@@ -253,7 +253,7 @@ def controller(axis: str, config: Path) -> dict[str, Any]:
 def read_numbers(file: Any) -> list[list[float]]:
     """Return the rows of an open file: one number each, or two each (comma or spaces); empty lines are skipped.
 
-    Raises click.UsageError for other text, and for rows of different lengths.
+    Returns [] for a file without numbers. Raises click.UsageError for other text, and for rows of different lengths.
     """
     rows: list[list[float]] = []
     for number, line in enumerate(file, start=1):

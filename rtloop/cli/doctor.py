@@ -134,7 +134,7 @@ def _print_examination(
 
 
 def _print_latency(latency: Latency) -> None:
-    """Print quantiles and histogram of the lateness of the loop's own clock."""
+    """Print quantiles in µs, missed periods, stolen time and the histogram of the lateness of the loop's own clock."""
     pacing, out = latency.pacing, console()
     p50_us, p99_us, p999_us, max_us = latency.quantiles_us.values()
     quantiles = f"p50 {p50_us:.2f}, p99 {p99_us:.2f}, p99.9 {p999_us:.2f}, max {max_us:.2f}"

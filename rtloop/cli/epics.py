@@ -21,7 +21,7 @@ class Address(click.ParamType):
     name = "address"
 
     def convert(self, value: Any, param: Any, ctx: Any) -> str:
-        """Return the address. Fails with a usage error for any other text."""
+        """Return the IPv4 address, such as "192.168.1.2". Fails with a usage error for any other text."""
         try:
             return str(ipaddress.IPv4Address(value))
         except ValueError:

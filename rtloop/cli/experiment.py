@@ -150,10 +150,11 @@ def run_experiments(
     """Run the experiments `names` on the driver of `config`, record them, and write and print their report.
 
     Returns the exit code: 0, or 1 if a run failed, was interrupted, or the report is incomplete. `settings` are
-    EXPERIMENT.KEY=VALUE; `out` is the folder for recordings and report. `comparison` is a configuration that does the
-    same experiments with the same parameters; `paced` runs in real time even a driver that allows virtual time. Raises
-    ConfigError for unknown names, settings or an invalid configuration; LoopFault if no experiment can be done, no run
-    was recorded, or Ctrl-C ends the report; and the errors of the first run.
+    EXPERIMENT.KEY=VALUE; `axis` None is the only axis; `out` is the folder for recordings and report, by default
+    NAME-experiments-TIME in `recording.folder`. `comparison` is a configuration that does the same experiments with the
+    same parameters; `paced` runs in real time even a driver that allows virtual time. Raises ConfigError for unknown
+    names, settings or an invalid configuration; LoopFault if no experiment can be done, no run was recorded, or Ctrl-C
+    ends the report; and the errors of the first run.
     """
     from rtloop.experiments.planning import plan_runs
     from rtloop.experiments.registry import parse_parameters, select_experiments
@@ -295,8 +296,8 @@ def _write_report(
 ) -> list[Path]:
     """Write report.html, report.json and a PNG of each picture in each theme to `folder`; return the paths, HTML first.
 
-    `recordings` are the paths, by file name, to which the HTML page links; `skipped` are reasons by experiment. Raises
-    OutputError if a file cannot be written; those before it are written then.
+    Existing files are overwritten. `recordings` are the paths, by file name, to which the HTML page links; `skipped`
+    are reasons by experiment. Raises OutputError if a file cannot be written; those before it are written then.
     """
     from rtloop.experiments.page import render_report
 
@@ -334,12 +335,12 @@ class RunsProgress(StatusLine):
         self._total_ticks += ticks
 
     def finish_run(self, planned_ticks: int) -> None:
-        """Count the present run, of `planned_ticks` ticks, as finished."""
+        """Count the present run, of `planned_ticks` ticks, as finished, even if it ended early."""
         self._done_ticks += planned_ticks
 
 
 def _duration_text(seconds: float) -> str:
-    """Return a duration as text: `2 min 05 s`, below a minute `48 s`."""
+    """Return a duration as text: `2 min 05 s`, below a minute `48 s`, an hour and more `125 min 00 s`."""
     minutes, remainder_s = divmod(round(seconds), 60)
     return f"{minutes} min {remainder_s:02d} s" if minutes else f"{remainder_s} s"
 

@@ -107,12 +107,13 @@ def import_command(
 def import_file(
     file: Path, selection: ColumnSelection, mapping: Path | None, output: Path | None, progress: Callable[[int], None]
 ) -> dict[str, Any]:
-    """Make a recording of a file by `selection` and a mapping file, and return its report.
+    """Make a recording of a file by `selection` and a mapping file.
 
-    The options of `selection` override the mapping file. Where neither names a column, no recording is made and a
-    `ColumnListing` is returned, unless `file` is an export of a recording. `mapping` None: a mapping file beside the
-    data, unless there is a selection. `output` None: FILE with .mcap. `progress` receives the ticks so far. Raises
-    UnreadableData, OutputError, MissingExtra as `import_data`; InputFileError, ConfigError for the mapping file.
+    Returns the report of `import_data`, and under `mapping` the path of the mapping file or None. The options of
+    `selection` override the mapping file. Where neither names a column, no recording is made and a `ColumnListing` is
+    returned, unless `file` is an export of a recording. `mapping` None: a mapping file beside the data, unless there is
+    a selection. `output` None: FILE with .mcap. `progress` receives the ticks so far. Raises UnreadableData,
+    OutputError, MissingExtra as `import_data`; InputFileError, ConfigError for the mapping file.
     """
     from rtloop.interchange.columns import find_mapping, read_mapping
     from rtloop.interchange.importing import import_data, list_columns

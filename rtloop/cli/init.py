@@ -79,7 +79,7 @@ def init(folder: Path, kind: str, name: str | None, config: Path | None, **figur
 
 
 def _require_in_folder(config: Path, folder: Path, kind: str) -> None:
-    """Raise UsageError unless `kind` is "law" and the configuration lies in `folder`.
+    """Raise UsageError unless `kind` is "law" and the configuration lies directly in `folder`.
 
     From another folder, its relative paths would point elsewhere.
     """

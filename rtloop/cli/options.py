@@ -34,7 +34,10 @@ class InputFile(click.File):
         super().__init__(encoding="utf-8", errors="replace")
 
     def convert(self, value: Any, param: Any, ctx: Any) -> Any:
-        """Return the file at the path `value`, open for reading text. Raises UnreadableInput if it cannot be opened."""
+        """Return the file at the path `value`, for "-" stdin, open for reading text.
+
+        Raises UnreadableInput if it cannot be opened.
+        """
         try:
             return super().convert(value, param, ctx)
         except click.BadParameter as error:
@@ -82,7 +85,7 @@ class NumberList(click.ParamType):
     name = "numbers"
 
     def convert(self, value: Any, param: Any, ctx: Any) -> tuple[float, ...]:
-        """Return the numbers in a text; a tuple is returned unchanged. Fails with a usage error for any other text."""
+        """Return the comma-separated numbers of a text; a tuple unchanged. Fails with a usage error for other texts."""
         if isinstance(value, tuple):
             return value
         try:
@@ -95,6 +98,8 @@ class PositiveFloat(click.FloatRange):
     """A number above 0; NaN is refused."""
 
     def convert(self, value: Any, param: Any, ctx: Any) -> float:
-        """Return `value` as a number. Fails with a usage error for NaN and for a number outside the type's range."""
+        """Return `value` as a float. Fails with a usage error for NaN, a number outside the range that the constructor
+        got, and a text that is no number.
+        """
         number = super().convert(value, param, ctx)
         return self.fail(f"value is {value}; allowed: a number above 0", param, ctx) if math.isnan(number) else number

@@ -20,7 +20,7 @@ PORT = 8321
 
 
 def port_option(name: str) -> Callable[[Any], Any]:
-    """Return a decorator that adds the option `name`, the port of the panel, to a command."""
+    """Return a decorator that adds the option `name` to a command: the TCP port of the panel, PORT by default."""
     return click.option(
         name,
         type=click.IntRange(0, 65535),
@@ -38,10 +38,11 @@ def panel_options(command: Any) -> Any:
 
 
 def panel_process(config: Path, enabled: bool, port: int, name: str | None = None) -> AbstractContextManager[None]:
-    """Return a context that runs the panel of the service of a configuration in a second process.
+    """Return a context that runs the panel of a configuration's service in a second process, until the context ends.
 
     Without `enabled`, the context has no effect. `name` replaces the name that the configuration gives the service.
-    Raises ConfigError for an invalid configuration, InputFileError for one that cannot be read.
+    The call, not the context, raises ConfigError for an invalid configuration, InputFileError for one that cannot be
+    read.
     """
     if not enabled:
         return nullcontext()
@@ -82,7 +83,7 @@ def panel(service: str | None, port: int, opens: bool, token_file: Path | None, 
 
 
 def terminate_at_stdin_end() -> None:
-    """Start a thread that sends SIGTERM to this process once the parent has closed its end of stdin."""
+    """Start a daemon thread that sends SIGTERM to this process once the parent has closed its end of stdin."""
 
     def wait() -> None:
         """Wait for the end of stdin, then send SIGTERM to this process."""

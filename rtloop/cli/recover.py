@@ -102,7 +102,7 @@ def _print_cut(report: dict[str, Any]) -> None:
 
 
 def _print_gaps(out: Console, report: dict[str, Any]) -> None:
-    """Print missing ticks and problems of a report, one a line."""
+    """Print each gap of missing ticks and each problem of a report in a line to `out`; nothing if there are none."""
     for first, count in report["gaps"]:
         out.print(f"missing: {count_text(count, 'tick')} from tick {first} on")
     print_problems(out, report["problems"])

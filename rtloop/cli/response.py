@@ -139,7 +139,7 @@ def recording_resonance(run: Path, axis: str | None, near_hz: float | None, as_j
 
 
 def _measure(context: click.Context, request: Mapping[str, Any]) -> dict[str, Any]:
-    """Let the service measure a closed loop, and return its response to `/response`, as `LoopMeasurement.for_json`.
+    """Let the service measure a closed loop by POST /response; return its answer, as `LoopMeasurement.for_json`.
 
     `request` are the command's options; options that are None are left out. After Ctrl-C the reference is restored and
     LoopFault is raised. Raises as `Client.measure`.
@@ -182,7 +182,7 @@ def _report_resonance(content: dict[str, Any], as_json: bool) -> None:
 
 
 def _print_response(content: dict[str, Any], files: Sequence[Path]) -> None:
-    """Print measured margins beside the model's, the lightly damped mode, the excitation, and written files."""
+    """Print measured margins, the model's and the mode if `content` has them, the excitation, and written files."""
     out, model = console(), content["model"]
     rows = table("margin", "measured", "± (1σ)", "model", "")
     for name, label, unit in MARGINS:
@@ -204,7 +204,7 @@ def _print_response(content: dict[str, Any], files: Sequence[Path]) -> None:
 
 
 def _print_resonance(content: dict[str, Any]) -> None:
-    """Print frequency and damping of the lightly damped mode with their uncertainty; warn if it is not linear."""
+    """Print frequency and damping of the lightly damped mode with their uncertainty; warn of a large misfit."""
     from rtloop.analysis.measured.mode import LARGEST_MISFIT, NOT_LINEAR
 
     mode = content["resonance"]

@@ -97,10 +97,11 @@ def retune_axis(client: Client, request: RetuneRequest, yes: bool, as_json: bool
 
 
 def swap_proposal(client: Client, axis: str, proposal: str, as_json: bool) -> int:
-    """Swap in, by stages, the taps of `proposal`, the text of an earlier `retune --json`; print the tick of the last.
+    """Swap in, by stages, the taps of `proposal`, the text of an earlier `retune --json`.
 
-    Returns 0. Raises ConfigError for another text or an unknown axis, LoopFault where the taps have changed since the
-    proposal, RtloopError if the service refuses a stage: the stages before it stay in force.
+    Prints the tick of the last stage, with `as_json` as {tick}. Returns 0. Raises ConfigError for another text or an
+    unknown axis, LoopFault where the taps have changed since the proposal, RtloopError if the service refuses a stage:
+    the stages before it stay in force.
     """
     from rtloop.client.retuning import swap_in
 

@@ -145,7 +145,7 @@ def _taps_as_dict(tap_design: TapDesign, files: list[Path]) -> dict[str, Any]:
     variation, plants: number of proved ones, worst: figures over them, trade_off: [[settling ms, overshoot], …],
     files}.
 
-    The overshoot is a fraction. `files` are the files that were written.
+    The overshoot is a fraction; `trade_off` is [] if it was not computed. `files` are the files that were written.
     """
     return {
         "taps": tap_design.taps.reference.tolist(),

@@ -98,11 +98,11 @@ class TerminalObserver:
     """Receiver of the stages of a run, which prints them on stderr."""
 
     def warn(self, warnings: Sequence[str]) -> None:
-        """Print the warnings about the configuration."""
+        """Print the warnings about the configuration on stderr, each as a line "warning: TEXT"."""
         print_warnings(warnings)
 
     def recover_leftovers(self, folder: Path) -> None:
-        """Complete the recordings that killed runs left in `folder`; print one line each."""
+        """Complete the recordings that killed runs left in `folder`, as the function of the same name does."""
         recover_leftovers(folder)
 
     @contextmanager
@@ -120,9 +120,9 @@ class TerminalObserver:
 
 
 def recover_leftovers(folder: Path) -> None:
-    """Complete the recordings that killed runs left in `folder`; print one line each. The old files stay.
+    """Complete the recordings that killed runs left in `folder`, *.mcap.part; print one line each on stderr.
 
-    A recording that cannot be recovered gives a warning.
+    The old files stay. A recording that cannot be recovered gives a warning there, and no error.
     """
     from rtloop.foundation.trusted import open_own
     from rtloop.recording.file.recover import find_leftovers, recover

@@ -96,7 +96,8 @@ def _serve_board(configuration: Configuration, axes: list[str], is_stopped: Call
     """Be the simulated board of a configuration with driver 'shm' until `is_stopped()`; tell systemd when it is ready.
 
     `axes` are the names of the axes in the order of outputs. Takes real-time priority for this process. Raises
-    ConfigError for a driver other than 'shm' or invalid options, UnavailableError if the system refuses.
+    ConfigError for a driver other than 'shm' or invalid options, UnavailableError if the system refuses the block's
+    file.
     """
     from rtloop.drivers.shm import ShmOptions
     from rtloop.engine.plan import Pacing
@@ -158,7 +159,7 @@ def _serve_node(configuration: Configuration, line: str, axes: list[str], is_sto
 def _node_program(options: CanOptions | NodeOptions) -> Callable[..., str]:
     """Return the function `serve(options, axes, is_stopped, on_ready)` that runs a node with options of this class.
 
-    It returns a sentence with the node's counts.
+    `serve` returns a sentence with the node's counts when `is_stopped()` is True.
     """
     from rtloop.drivers.can.options import CanOptions
 

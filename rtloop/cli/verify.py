@@ -105,9 +105,9 @@ def _require_second_opinion(
 def _write_report(folder: Path, name: str, verifications: Verifications, report: dict[str, Any]) -> list[Path]:
     """Write verify.json (`report`), verify.html and the pictures of each axis to `folder`, also over existing files.
 
-    `name` is the configuration's name in headings. Returns the paths: verify.json, verify.html, pictures. Raises
-    MissingExtra without matplotlib, with nothing written; OutputError if the system refuses a file, after those before
-    it.
+    A missing folder is made. `name` is the configuration's name in headings. Returns the paths: verify.json,
+    verify.html, pictures. Raises MissingExtra without matplotlib, with nothing written; OutputError if the system
+    refuses a file, after those before it.
     """
     from rtloop.design.verification.page import page
     from rtloop.design.verification.plots import draw_pictures
@@ -159,7 +159,7 @@ def _print_verification(name: str, verification: Verification) -> None:
 
 
 def _table(lines: Sequence[Sequence[str]]) -> Table:
-    """Return a table of `lines`, the headings first, with all columns to the left; cells that are in RED are red."""
+    """Return a table of `lines`, the headings first, with all columns to the left; cells "MISSED" and "NO" are red."""
     headings, *rows = lines
     cells = [[f"[red]{cell}[/]" if cell in RED else cell for cell in row] for row in rows]
     return table(*headings, rows=cells, words=range(len(headings)))

@@ -30,6 +30,7 @@ class Connection:
     """
 
     def __init__(self, client: Client) -> None:
+        """Use `client` for all requests; none is sent yet."""
         self._client = client
 
     def __enter__(self) -> Connection:
@@ -51,7 +52,8 @@ class Connection:
     @property
     def configuration(self) -> dict[str, Any]:
         """The configuration of the running loop with all changes (`values`), the `folder` of its files, `name`,
-        `rate_hz`, the `columns` of a record, and the paths of the shared `block` and of the `recordings`.
+        `rate_hz`, the `columns` of a record, and the paths of the shared `block` and of the `recordings`. Refused
+        without a loop.
         """
         return self._client.get("/configuration")
 
@@ -67,22 +69,28 @@ class Connection:
         return self._client.watch()
 
     def take(self, emergency_key: str | None = None) -> dict[str, Any]:
-        """Take the lock, with the emergency key also from another holder.
+        """Take the lock, from another holder only with the emergency key; refused without it, or with a wrong one.
 
         Returns the new holder: {name, since_unix_s, until_unix_s: end without a further command}, in s since 1970.
         """
         return self._client.lock(emergency_key)
 
     def release(self) -> None:
-        """Release the lock, so that another client may drive; refused while another client holds it."""
+        """Release the lock, so that another client may drive; refused while another client holds it.
+
+        A free lock stays free.
+        """
         self._client.delete("/lock")
 
     def arm(self) -> None:
-        """Allow the service to drive the outputs; none moves yet."""
+        """Allow the service to drive the outputs; none moves yet.
+
+        Refused while tripped, and if python-control computes other figures of the loop.
+        """
         self._client.post("/arm")
 
     def start(self) -> int:
-        """Change to the configured mode. Returns the tick at which it took effect."""
+        """Change to the configured mode. Returns the tick at which it took effect; refused as by `mode`."""
         return self._command("/start")
 
     def stop(self) -> int:
@@ -93,7 +101,10 @@ class Connection:
         return self._command("/stop")
 
     def mode(self, mode: str) -> int:
-        """Change the mode bumplessly: "off", "raw", "feedforward" or "closed_loop". Returns the tick of the change."""
+        """Change the mode bumplessly: "off", "raw", "feedforward" or "closed_loop". Returns the tick of the change.
+
+        Any mode but "off" is refused while tripped, not armed, or while the service prepares the actuator.
+        """
         return self._command("/mode", mode=mode)
 
     def reset(self) -> int:
@@ -109,13 +120,17 @@ class Connection:
         return self._client.post("/reload")
 
     def setpoint(self, axis: str, um: float) -> int:
-        """Hold the reference of an axis at a value, in µm (V in raw mode). Returns its first tick."""
+        """Hold the reference of an axis at a value, in µm (V in raw mode). Returns its first tick.
+
+        Refused beyond limits and position interlock of the axis.
+        """
         return self._command("/setpoint", axis=axis, value=um)
 
     def reference(self, axis: str, **settings: Any) -> int:
         """Change the reference of an axis, as in [axis.reference]: `kind="sine", amplitude=5.0, frequency_hz=2.0`.
 
-        Returns the first tick of the new reference.
+        Keys that are left out have their defaults. Returns the first tick of the new reference. Refused beyond
+        the limits of the axis.
         """
         return self._command("/reference", axis=axis, reference=settings)
 
@@ -139,7 +154,7 @@ class Connection:
     def tune(self, axis: str, section: str, **values: Any) -> int:
         """Change keys of [axis.SECTION], as in `"controller", gain=0.012`; verified first, then swapped bumplessly.
 
-        Returns the tick of the swap.
+        `section` is "controller", "limits", "interlocks", "prefilter" or "model". Returns the tick of the swap.
         """
         return self._command("/tune", axis=axis, section=section, values=values)
 
@@ -149,12 +164,15 @@ class Connection:
         Keys of each: crossover_hz, phase_margin_deg, gain_margin_db, modulus_margin, overshoot_percent, settling_ms,
         static_error_percent, tolerated_shift_percent ([down ≤ 0, up ≥ 0]: the shift of the resonance within which the
         loop is stable), step ({t_ms, y}) and problems (sentences). All but `problems` are None for an unstable loop or
-        a law that is not linear.
+        a law that is not linear, and so is each figure that is not finite.
         """
         return self._client.post("/preview", {"axis": axis, "section": section, "values": values})
 
     def undo(self, axis: str) -> dict[str, Any]:
-        """Revert the last `tune` or `controller` of an axis bumplessly. Returns {tick, undone: the change in words}."""
+        """Revert the last `tune` or `controller` of an axis bumplessly; the next call reverts the one before.
+
+        Returns {tick, undone: the change in words}. Refused if no change is left since the start or the last reload.
+        """
         return self._client.post("/undo", {"axis": axis})
 
     def controller(self, axis: str, controller: Mapping[str, Any] | Path | str) -> int:
@@ -211,7 +229,7 @@ class Connection:
         return propose_taps(self._client, RetuneRequest(axis, **options))
 
     def swap(self, proposal: Proposal) -> int:
-        """Replace the prefilter's taps of an axis by those of a proposal of `retune`, interpolated in several steps.
+        """Replace the prefilter's taps of the axis of a proposal by the proposed ones, interpolated in several steps.
 
         Returns the tick of the last step. Raises LoopFault if the taps in force changed since the proposal, RtloopError
         if the service refuses a step; the steps before that one then stay in force.
@@ -247,7 +265,7 @@ class Connection:
         return capture_span(self._client, seconds, trigger, at, pre_percent, timeout_s, folder)
 
     def _command(self, resource: str, **body: Any) -> int:
-        """Post a command with the JSON fields `body` to `resource`, and return the tick at which it took effect."""
+        """Post a command, JSON fields `body`, to `resource`. Returns its tick of effect; raises as `Client.post`."""
         return int(self._client.post(resource, body)["tick"])
 
 

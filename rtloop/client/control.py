@@ -35,8 +35,8 @@ class _UnixConnection(http.client.HTTPConnection):
         self._path = path
 
     def connect(self) -> None:
-        """Connect to the UNIX socket. Raises OSError if no process listens or the system refuses, HostRefusal for a
-        server or folder that is not trusted.
+        """Connect to the UNIX socket, and set the timeout. Raises OSError if no process listens or the system refuses,
+        HostRefusal for a server or folder that is not trusted.
         """
         self.sock = _open_connection(self._path)
         self.sock.settimeout(self.timeout)
@@ -108,14 +108,14 @@ class Cancellation:
         self._is_cancelled = False
 
     def attach(self, connection: socket.socket) -> None:
-        """Store the connection of the request; shut it down at once if `cancel` was called before."""
+        """Store the connection of the request; shut it down at once if `cancel` was called before. Thread-safe."""
         with self._lock:
             self._connection = connection
             if self._is_cancelled:
                 _shut_down(connection)
 
     def cancel(self) -> None:
-        """Shut the connection down, now or once it is attached; the waiting thread gets UnansweredRequest."""
+        """Shut the connection down from any thread, now or once attached; the waiting thread gets UnansweredRequest."""
         with self._lock:
             self._is_cancelled = True
             if self._connection is not None:
@@ -123,7 +123,7 @@ class Cancellation:
 
 
 def _shut_down(connection: socket.socket) -> None:
-    """Shut a connection down in both directions, so that its peer and its waiting thread notice."""
+    """Shut a connection down in both directions, so that peer and waiting thread notice; a closed one is ignored."""
     with suppress(OSError):  # It may be closed already.
         connection.shutdown(socket.SHUT_RDWR)
 

@@ -79,9 +79,9 @@ class Proposal(NamedTuple):
     def for_json(self) -> dict[str, Any]:
         """Return the proposal as plain values, as `rtloop ctl retune --json` prints it and `swap_in` takes it.
 
-        Keys: resonance, percent_from_model, gain, gain_percent_from_model (fields of `stage`), before, after (dicts of
-        step figures), better, settling_ms, replaces (the taps in force) and prefilter (the new taps), both {taps,
-        command_taps}.
+        Keys: resonance, percent_from_model, gain, gain_percent_from_model (fields of `stage`, the last two may be
+        None), before, after (dicts of step figures), better, settling_ms, replaces (the taps in force) and prefilter
+        (the new taps), both {taps, command_taps}.
         """
         return {
             "resonance": self.stage.resonance,
@@ -103,7 +103,7 @@ def propose_taps(client: Client, request: RetuneRequest) -> Proposal:
     The loop moves for the measurement. A gain that was not measured, or not to GAIN_CERTAIN_PERCENT, is replaced by the
     model's. Raises ConfigError for an axis or model that does not allow it, LoopFault if no resonance is found or a
     measured value that is used is further than `bound_percent` from the model's, NoDesign if no taps meet the
-    specification, RtloopError if the service refuses.
+    specification, InputFileError for a specification that cannot be read, RtloopError if the service refuses.
     """
     axis, subject, _ = load_subject(_running_configuration(client), request.axis, request.spec)
     stage = _measure_stage(client, request, subject)

@@ -58,7 +58,7 @@ def option_cautions(prepared: Prepared) -> list[str]:
 
 
 def comparison_warnings(check: AxisCheck) -> list[str]:
-    """Return a warning for each notch or resonance that C(z) has at another frequency than C(s)."""
+    """Return a warning for each notch or resonance of C(s) that C(z) lacks or shifts clearly; [] for other laws."""
     if check.comparison is None:
         return []
     return [f"axis.{check.name}.controller: {warning}" for warning in check.comparison.warnings]
@@ -77,7 +77,7 @@ def _pacing(configuration: Configuration) -> Iterator[str]:
 
 
 def _service(configuration: Configuration) -> Iterator[str]:
-    """Yield a warning for each option of [service] that a run ignores, and that `rtloop serve` refuses or ignores."""
+    """Yield a warning for each [service] option that `rtloop serve` refuses with a schedule, or ignores with `arm`."""
     options = configuration.service
     if configuration.schedule:
         yield from (f"{fault}; `rtloop serve` refuses this configuration" for fault in options.faults_with_schedule())
@@ -155,7 +155,8 @@ def _references(prepared: Prepared, axis: AxisOptions) -> Iterator[str]:
 
 
 def _unreachable(axis: AxisOptions, lowest_um: float, highest_um: float, ends_um: tuple[float, float]) -> Iterator[str]:
-    """Yield a line for each limit that a reference from `lowest_um` to `highest_um` exceeds.
+    """Yield a line for each limit (position interlock, sensor, drive) that a reference `lowest_um` … `highest_um`
+    exceeds.
 
     A reference beyond the command's limit gets that line alone. `ends_um` are the ends of the sensor's range.
     """

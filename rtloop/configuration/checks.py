@@ -141,7 +141,7 @@ class AxisCheck:
 
     @cached_property
     def margins(self) -> Margins | None:
-        """Margins of the loop as it will run; None without a loop."""
+        """Margins of the loop as it will run, computed also for an unstable one; None without a loop."""
         return None if self.on_model is None else loop_margins(self.on_model)
 
     @property
@@ -168,8 +168,8 @@ class AxisCheck:
 def check_axes(configuration: Configuration, findings: Findings) -> list[AxisCheck]:
     """Build each axis's controller and its loop on the model. Returns a check for each axis, in their order.
 
-    Unstable loops and other faults are appended to `findings`. Each law gets the numbers of its inputs and outputs.
-    With a user law, all this is done in the limited process, which is killed if a law does not return. Raises
+    Faults, such as unstable loops, and warnings are appended to `findings`. Each law gets the numbers of its inputs and
+    outputs. With a user law, all this is done in the limited process, which is killed if a law does not return. Raises
     ConfigError for mistakes in the code of such a law.
     """
     if needs_limited_process(configuration.laws):
@@ -214,7 +214,7 @@ def loop_delay_ticks(model: ModelOptions | None, driver_delay_ticks: int) -> int
 def promised_loop(axis: AxisOptions, rate_hz: float, delay: int, plant: Transfer | None = None) -> Loop | None:
     """Return the loop of an axis on its model, or on another `plant`, with a `delay` in samples.
 
-    None without a model, for a controller of several axes or none, and for a law that is not linear.
+    None without a model, also with `plant`; for a controller of several axes or none, and for a law that is not linear.
     """
     law = make_controller(axis, 1 / rate_hz)
     if axis.model is None or law is None or law.count > 1:
@@ -324,7 +324,7 @@ def _check_shared(configuration: Configuration, axes: Sequence[AxisOptions], fin
 
 
 def _coupled_plant(axes: Sequence[AxisOptions], delays: Sequence[int], findings: Findings) -> CoupledPlant | None:
-    """Return the plant of several axes; None, and a warning for each, where a model is missing.
+    """Return the plant of several axes; None where models are missing, with a warning in `findings` for each of these.
 
     A coupling to an axis that the controller does not have is a fault.
     """

@@ -25,7 +25,7 @@ from rtloop.linear.coupled_systems import SampledCoupledSystem
 def make_controller(
     axis: AxisOptions, period_s: float, models: Sequence[ModelOptions | None] = ()
 ) -> Controller | None:
-    """Return the controller of an axis, without its coefficients; None without one.
+    """Return the controller of an axis; None without one. `axis_coefficients` builds, and may refuse, its coefficients.
 
     `models` has one entry for each axis of a controller with several axes.
     """

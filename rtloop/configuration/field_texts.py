@@ -10,7 +10,10 @@ from functools import cache
 
 
 def texts_below(owner: type) -> dict[str, str]:
-    """Return the string below each field or member of a class and of its bases in this project, by its name."""
+    """Return the string below each field or member of a class and of its bases in this project, by its name.
+
+    A class's own text replaces that of a base.
+    """
     texts: dict[str, str] = {}
     for base in reversed(owner.__mro__):
         if base.__module__.startswith("rtloop."):

@@ -149,7 +149,7 @@ class Configuration:
         return tuple(owner_numbers)
 
     def axes_sharing(self, number: int) -> tuple[int, ...]:
-        """Return the numbers of the axes that share the controller of axis `number`, itself included."""
+        """Return the numbers, rising, of the axes that share the controller of axis `number`, itself included."""
         return tuple(i for i, owner in enumerate(self.owners) if owner == self.owners[number])
 
     @property
@@ -282,7 +282,8 @@ def _validated(kind: Any, raw: Any, prefix: str, faults: list[str], context: dic
 def describe(error: ValidationError, prefix: str, raw: Any, known_keys: set[str] | None = None) -> list[str]:
     """Return a line for each fault of `raw`, the value of key `prefix`; `raw` None: not available.
 
-    Beyond MAX_FAULTS, a last line says how many more there are. `known_keys` are suggested for an unknown key.
+    Beyond MAX_FAULTS, a last line says how many more there are. `known_keys` are suggested for an unknown key that
+    resembles one; None: no suggestion.
     """
     errors = error.errors(include_url=False)
     # A list that is too short only because entries are faulty is reported by the faults of its entries.
@@ -308,7 +309,8 @@ def _keys(schema: Any) -> set[str]:
 def _fault(detail: Any, prefix: str, raw: Any, known_keys: set[str], missing_beside: Sequence[str]) -> str:
     """Return one error of pydantic, `detail`, as key, value and allowed values; other parameters as in `describe`.
 
-    `missing_beside` are required keys that the table of the faulty key lacks.
+    `missing_beside` are required keys that the table of the faulty key lacks; an unknown key is compared with these
+    first.
     """
     path = [prefix] if prefix else []
     node = raw
@@ -347,12 +349,12 @@ def _fault(detail: Any, prefix: str, raw: Any, known_keys: set[str], missing_bes
 
 
 def _format_value(value: Any) -> str:
-    """Return the value as in the file, or a note in place of a very long integer."""
+    """Return the value as Python writes it, True for true, or a note in place of a very long integer."""
     return "a very long integer" if isinstance(value, int) and abs(value) > LARGEST_INTEGER else repr(value)
 
 
 def _shorten(fault: str) -> str:
-    """Return the first MAX_CHARACTERS of a fault, with "…" if it is longer."""
+    """Return the first MAX_CHARACTERS of a fault, with "…" behind them if it is longer."""
     return fault if len(fault) <= MAX_CHARACTERS else f"{fault[:MAX_CHARACTERS]}…"
 
 

@@ -171,14 +171,14 @@ def _lateness_faults(configuration: Configuration) -> list[str]:
 
 
 def refuse_simulated_lateness(prepared: Prepared) -> None:
-    """Raise ConfigError for a paced run with simulated lateness; its ticks are as late as the host makes them."""
+    """Raise ConfigError for a paced run with simulated lateness, which acts in virtual time alone."""
     if prepared.plan.pacing.paced and prepared.plan.pacing.simulated_lateness_us:
         fault = f"{LATENESS_KEY}: set; allowed in virtual time only; add --unpaced, or remove the key"
         raise ConfigError(prepared.configuration.source, [fault])
 
 
 def _ticks(duration_s: float | None, rate_hz: float, findings: Findings) -> int | None:
-    """Return the duration in ticks; None for an endless run, and, with a fault, for an impossible duration."""
+    """Return the duration in ticks, rounded; None for an endless run and, with a fault, for an impossible duration."""
     if duration_s is None:
         return None
     ticks = duration_s * rate_hz
@@ -222,7 +222,7 @@ def _generators(
 ) -> np.ndarray[Any, Any]:
     """Return the reference generators that the axes begin with, (axes,) of GENERATOR; samples go to `table`.
 
-    Faults go to `findings`.
+    A faulty reference stays all zeros, and its fault goes to `findings`.
     """
     generators = np.zeros(len(configuration.axes), GENERATOR)
     for i, axis in enumerate(configuration.axes):
@@ -241,7 +241,7 @@ def _schedule(
 ) -> np.ndarray[Any, Any]:
     """Return the commands, (n,) of MESSAGE, in the order of their ticks; entries of one tick keep the file's order.
 
-    Samples go to `table`, faults to `findings`.
+    Samples go to `table`. A faulty entry is left out, and its fault goes to `findings`.
     """
     names = [axis.name for axis in configuration.axes]
     entries = sorted(configuration.schedule, key=lambda entry: entry.at_tick)

@@ -144,7 +144,11 @@ def read_samples(path: Path, folder: Path | None = None) -> npt.NDArray[np.float
 
 
 def _numbers(text: str) -> npt.NDArray[np.float64]:
-    """Return one or two numbers a line, (n, 1 or 2); skip empty lines and comments (#). Raises _NotANumber."""
+    """Return one or two numbers a line, (n, 1 or 2); skip empty lines and comments (#). Commas or spaces separate.
+
+    Raises _NotANumber for a text that is no number, and for a line of more than two numbers or not as many as the
+    first.
+    """
     rows: list[list[float]] = []
     for count, line in enumerate(text.splitlines(), start=1):
         if content := line.partition("#")[0].strip():
@@ -172,7 +176,7 @@ def references_in_plan(plan: Plan, axis: int) -> Iterator[tuple[str, Mode, list[
 
 
 def volts(lowest: float, highest: float) -> str:
-    """Return a range of voltages as text; a single voltage where both ends are equal."""
+    """Return a range of voltages as text, such as "0 V … 10 V"; "5 V" where both ends are equal."""
     return f"{lowest:g} V" if lowest == highest else f"{lowest:g} V … {highest:g} V"
 
 

@@ -60,8 +60,8 @@ def true_positions(
     """Return the true positions of an axis in a run of the simulated rig, in µm, (ticks, points).
 
     A row has the position at `points` evenly spaced times of the period, the tick first. `rig` has the coefficients and
-    a copy of the state before the run; `columns` are recorded ones by name: periods_missed, and AXIS_hysteresis_um of
-    all axes.
+    a copy of the state before the run, which both stay unchanged; `columns` are recorded ones by name: periods_missed,
+    and AXIS_hysteresis_um of all axes.
     """
     axes = sorted(driver.wiring, key=lambda name: int(driver.wiring[name].output.removeprefix("dac")))
     number = axes.index(axis)

@@ -35,7 +35,7 @@ class ScheduleOptions(Options):
 
     @model_validator(mode="after")
     def _check(self) -> Self:
-        """Require exactly one of mode, reference and reset_trip, and an axis with a reference only."""
+        """Require exactly one of mode, reference and reset_trip; `axis` is optional with a reference, else refused."""
         changes = [self.mode is not None, self.reference is not None, self.reset_trip]
         if sum(changes) != 1:
             raise ValueError(f"{sum(changes)} changes; allowed in an entry: exactly one of mode, reference, reset_trip")

@@ -33,7 +33,7 @@ DRIVER_TEXT = "The hardware, or the simulated rig in its place."
 
 @cache
 def schema_text() -> str:
-    """Return the schema of a configuration as the text of a JSON file."""
+    """Return the schema of a configuration as the text of a JSON file, with a newline at its end."""
     return json.dumps(configuration_schema(), indent=2, ensure_ascii=False) + "\n"
 
 

@@ -178,8 +178,8 @@ def second_opinion(numbers: LoopNumbers) -> Opinion:
 def coupled_opinion(axes: Sequence[LoopNumbers], coupling: Real, place: int) -> Opinion:
     """Return the opinion on the loop of axis number `place` of `axes`, broken at its sensor, the other loops closed.
 
-    The controller of each of `axes` is the shared one, from all errors to all commands; `coupling` (axes, axes) is each
-    position per command.
+    The controller of each of `axes` is the shared one, from all errors to all commands; `coupling` (axes, axes) is
+    position (row) per command (column).
     """
     period_s, count = axes[place].period_s, len(axes)
     plants = library.append(*(_sampled_plant(numbers) for numbers in axes))
@@ -254,7 +254,8 @@ def _margins(open_loop: Any, poles: Complex) -> dict[str, float]:
     """Return margins by name as `rtloop.analysis.margins` defines them, from responses on a grid that is dense near
     `poles` (in z).
 
-    Keys: crossover_hz, phase_margin_deg, gain_margin, max_sensitivity.
+    Keys: crossover_hz (NaN without a crossover), phase_margin_deg and gain_margin, a factor (inf where none exists),
+    max_sensitivity.
     """
     period_s = float(open_loop.dt)
     rates: Any = np.log(poles[np.abs(poles) > LEAST_POLE].astype(complex))

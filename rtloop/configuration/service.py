@@ -83,7 +83,7 @@ class ServiceOptions(Options):
 
     @property
     def prepares(self) -> bool:
-        """Whether `depolarise` or `tare_s` is set: a start without `arm` or a schedule then prepares the actuator."""
+        """Whether `depolarise` or `tare_s` is set: a start then prepares the actuator, unless `arm` is set."""
         return self.depolarise is not None or self.tare_s > 0
 
     def faults_with_schedule(self) -> list[str]:

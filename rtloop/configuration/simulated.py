@@ -35,7 +35,9 @@ class RigComparison(NamedTuple):
 
 
 def contradictions(configuration: Configuration, axis: AxisOptions, check: AxisCheck) -> list[str]:
-    """Return a line for each key of the axis that makes its loop another one than the checked loop."""
+    """Return a line for each key of the axis that contradicts the simulated rig or, of another driver, the sensor's
+    range or the delay: another loop than the checked one would run. [] without contradiction.
+    """
     return [
         *_weights(configuration, axis),
         *_sensor_scale(configuration, axis),
@@ -81,7 +83,7 @@ def _check_on_rig(configuration: Configuration, axis: AxisOptions, check: AxisCh
 def drive_ends_um(axis: AxisOptions) -> tuple[float, float]:
     """Return the positions in µm at the drive's lower and upper limit, from rest, by the feedforward's model.
 
-    With weights above 0, the first is ≤ 0 and the second ≥ 0.
+    With weights above 0, the first is ≤ 0 and the second ≥ 0. (0, 0) without plays.
     """
     ends_v = np.array([axis.limits.lowest_v, axis.limits.drive_v])
     down_um, up_um = np.sign(ends_v) * loading_curve(axis.feedforward.actuator(), np.abs(ends_v))
@@ -180,7 +182,7 @@ def _delay(configuration: Configuration, axis: AxisOptions, check: AxisCheck) ->
 
 
 def delay_difference(configuration: Configuration, axis: AxisOptions, model_ticks: int, check: AxisCheck) -> str:
-    """Return the line that names the delays in samples: `model_ticks` of the model, the driver's, the margins'."""
+    """Return a line with the delays in samples: `model_ticks` of the model, the driver's, and that of the margins."""
     delay_ticks, kind = driver_delay_ticks(configuration), configuration.driver_kind
     driver_text = (
         f"the simulated rig has driver.latency_ticks = {delay_ticks}"

@@ -29,7 +29,7 @@ _QUOTED = re.compile(r"""\(['"].*['"],?\)|(['"]).{2,}\1""", re.DOTALL)
 
 
 def read_regular(path: Path, limit_bytes: int) -> bytes:
-    """Return all of a regular file.
+    """Return all of a regular file; links are followed.
 
     Raises OSError for a file that cannot be opened, another kind of file, and one of more than `limit_bytes`.
     """
@@ -37,7 +37,10 @@ def read_regular(path: Path, limit_bytes: int) -> bytes:
 
 
 def read_text(path: Path, refused: type[RtloopError] = InputFileError) -> str:
-    """Return a text in UTF-8. Raises `refused`, which names the file, where it cannot be read or is no text."""
+    """Return a text in UTF-8.
+
+    Raises `refused`, which names the file, where it cannot be read, has over MAX_TEXT_BYTES or is no text in UTF-8.
+    """
     try:
         return read_regular(path, MAX_TEXT_BYTES).decode()
     except OSError as error:

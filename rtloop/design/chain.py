@@ -151,7 +151,8 @@ def configuration_text(chain: Chain, axis: str | None, spec_name: str, spec_text
     """Return as TOML the step recording's configuration in closed loop, with the design in `axis`.
 
     `axis` is the name of one of its axes, None the first. `spec_name` is the specification's path relative to the
-    configuration, `spec_text` its content. Raises UnsuitableData for weights of the hysteresis without an inverse.
+    configuration, `spec_text` its content, whose SHA-256 a comment has. Raises UnsuitableData for weights of the
+    hysteresis without an inverse.
     """
     parts = {"controller": controller_values(chain.synthesis.controller, chain.design.controller)}
     comments = provenance(chain.synthesis, chain.design, spec_name, spec_text)

@@ -20,7 +20,8 @@ LIST_WIDTH = 90
 
 
 def write_section(name: str, values: Mapping[str, Any], comments: Sequence[str] = ()) -> str:
-    """Return TOML of `[name]` with its keys, below comment lines; nested tables become sections, lists of tables [[…]].
+    """Return TOML of `[name]` with its keys, below `comments`, lines without #; nested tables become sections, lists of
+    tables [[…]].
 
     For `name` "", `values` are the whole document; dots in it nest sections.
     """

@@ -59,7 +59,9 @@ class Host:
         return (int(major), int(minor)) if (major + minor).isdigit() else (0, 0)
 
     def stolen_s(self) -> float:
-        """Return the processor time that a hypervisor took from this host since its start, s; 0 if not shown."""
+        """Return the processor time in s that a hypervisor took from this host since its start, of all processors
+        together; 0 if not shown.
+        """
         fields = (self.read("/proc/stat") or "").partition("\n")[0].split()
         return int(fields[8]) / os.sysconf("SC_CLK_TCK") if len(fields) > 8 else 0.0
 

@@ -164,5 +164,5 @@ def low_latency(line: SerialLine, host: Host) -> Finding:
 
 
 def _terminal(line: SerialLine) -> str:
-    """Return the name of a terminal in /sys: ttyUSB0 for /dev/ttyUSB0."""
+    """Return the name of a terminal in /sys, the last part of its path: ttyUSB0 for /dev/ttyUSB0."""
     return line.device.rpartition("/")[2]

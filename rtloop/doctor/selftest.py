@@ -247,8 +247,8 @@ def _open_loop(configuration: Configuration, mode: ModeName, rate_hz: float) -> 
 def _run_and_load(prepared: Prepared) -> tuple[Recording, dict[str, Any]]:
     """Run once. Returns (the recording, all in memory; the host's real-time grants). Its file is deleted.
 
-    Ctrl-C and SIGTERM stop the run. Raises LoopFault for a run that ends early or trips, RtloopError or DriverError for
-    one that cannot start.
+    Raises LoopFault for a run that trips or ends early, as by Ctrl-C or SIGTERM; RtloopError or DriverError for a run
+    that cannot start.
     """
     with tempfile.TemporaryDirectory(prefix="rtloop-selftest-") as folder, Processes() as processes:
         supervisor = Supervisor(processes, prepared, Path(folder) / "selftest.mcap")

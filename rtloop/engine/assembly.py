@@ -78,7 +78,7 @@ class Assembly:
 
     @property
     def outputs_v(self) -> np.ndarray[Any, Any]:
-        """Values of the outputs after the last successful write, (outputs,) in V."""
+        """Values of the outputs in V after the last successful write, before one those at rest: a copy (outputs,)."""
         outputs_v = self._arrays["outputs"].copy()
         outputs_v[self._arrays["output_index"]] = self._arrays["last_drive_v"]
         return outputs_v

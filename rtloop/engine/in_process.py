@@ -45,8 +45,9 @@ class LoopsInProcess:
 
         `consume` is called for each full ring of ticks, and at the end, with the number of the first tick and the
         records, (n, columns) in the order of `plan.columns`; they are overwritten afterwards. At the end the driver is
-        closed, but not after an error. Raises ValueError for a law that cannot be compiled and for a channel that the
-        driver lacks, DriverError if the driver cannot be opened or closed, and what `consume` raises.
+        closed, but not after an error. Raises ValueError for a law that cannot be compiled, for a channel that the
+        driver lacks and for a clock that `virtual_clock` refuses, DriverError if the driver cannot be opened or closed,
+        and what `consume` raises.
         """
         block = self._empty_block(plan.sizes._replace(rate_hz=SMALLEST_RING_RATE_HZ))
         ring, facts, pointers = block.ring("ticks"), driver.facts, driver.open()
@@ -65,7 +66,8 @@ class LoopsInProcess:
     def _law_memory(self, plan: Plan) -> LawMemory:
         """Return the memory of the plan's laws at rest: the present one, restored, or a new one.
 
-        The present one fits plans that share mode, laws and coefficients with the plan that it was made for.
+        The present one fits plans that share mode, laws and the array of coefficients with the plan that it was made
+        for. Raises ValueError as `law_at_rest`.
         """
         key = plan.mode, plan.laws, plan.extras, id(plan.coefficients)
         if self._law is None or self._law.key != key:

@@ -247,7 +247,7 @@ def _hold_outputs(loop):
 def _evaluate_law(loop, status, now_ns, lateness_us):
     """Compute references and the law from the inputs that were read; set the driver's outputs, in V.
 
-    `status` is the read's, `now_ns` the wake in ns of CLOCK_MONOTONIC.
+    `status` is the read's, below 0 for a failure, which trips; `now_ns` is the wake in ns of CLOCK_MONOTONIC.
     """
     inputs = float_array(loop.inputs, loop.input_count + 1 + loop.observed_count)
     outputs = float_array(loop.outputs, loop.output_count)
@@ -309,7 +309,9 @@ def _set_extras(loop, outputs):
 
 @jit_rare
 def _fill_extras(loop, row, column):
-    """Fill the columns of `row` from `column` on with the volts of the extra inputs, then of the extra outputs."""
+    """Fill the columns of `row` from `column` on with the volts of the extra inputs, then of the extra outputs; return
+    nothing.
+    """
     law = law_record(loop)
     read, extras = extra_inputs(law), extra_outputs(law)
     for k in range(law.extra_input_count):
@@ -374,7 +376,7 @@ def _publish_trip(loop, causes):
 
 @jit_rare
 def _record_lateness(loop, missed):
-    """Begin or continue an episode of late ticks; it ends after a second without a missed period."""
+    """Begin an episode of late ticks, with an event, or continue it; it ends after a second without a missed period."""
     if loop.tick >= loop.late_until:
         _end_late_episode(loop)
     if loop.late_ticks == 0:

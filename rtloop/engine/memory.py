@@ -105,7 +105,10 @@ class SharedBlock:
     """Named numpy arrays over a mapped file; `fd` may be handed to child processes."""
 
     def __init__(self, fd: int) -> None:
-        """Map the block in the file `fd`. Raises one of UNREADABLE if the file holds no block, or a damaged one."""
+        """Map the block in the file `fd`, which stays the caller's to close.
+
+        Raises one of UNREADABLE if the file holds no block, or a damaged one.
+        """
         self.fd = fd
         self._map = mmap.mmap(fd, 0)
         directory = json.loads(self._map[:DIRECTORY_BYTES].rstrip(b"\0"))
@@ -124,7 +127,10 @@ class SharedBlock:
 
     @staticmethod
     def reserve() -> int:
-        """Return the descriptor of a new anonymous file for a later block; child processes may inherit it before."""
+        """Return the descriptor of a new anonymous file, empty, for a later block.
+
+        It is closed on exec: a child process gets it by `pass_fds` alone, also before the block exists.
+        """
         return os.memfd_create("rtloop")
 
     @classmethod
@@ -215,7 +221,7 @@ class SharedBlock:
         return claimant_pid(self.fd)
 
     def kill_driver(self) -> None:
-        """Kill the process that claimed the block, by SIGKILL; without one do nothing.
+        """Kill the process that claimed the block, by SIGKILL; do nothing without one, or if it is the calling process.
 
         Another process that has been given its number is never killed.
         """
@@ -235,7 +241,7 @@ class SharedBlock:
             close_descriptor(process)
 
     def ring(self, name: str) -> Ring:
-        """Return the ring `name`: `ticks`, `events` or `snapshots`."""
+        """Return the ring `name`: `ticks`, `events` or `snapshots`. Raises KeyError for another name."""
         return Ring(self[f"{name}_head"], self[f"{name}_marks"], self[f"{name}_slots"])
 
 

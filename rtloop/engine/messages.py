@@ -1,7 +1,7 @@
 """Commands to the loop and events from it: one fixed-size record for both.
 
-A command enters the queue or the schedule with the tick from which it may take effect. The loop alone decides at which
-tick it does, and acknowledges it by an event of the same kind, values and origin.
+A command enters the schedule with the tick from which it takes effect, or the queue, where its tick does not count. The
+loop alone decides at which tick it takes effect, and acknowledges it by an event of the same kind, values and origin.
 """
 
 from __future__ import annotations
@@ -68,6 +68,8 @@ def message(
     kind: Kind, *, tick: int = 0, axis: int = ALL_AXES, origin: Origin = Origin.OPERATOR, values: Any = ()
 ) -> np.ndarray[Any, Any]:
     """Return one MESSAGE record, shape (1,); its identity and its other values are 0.
+
+    A command of the schedule takes effect from `tick` on, one of the queue at once, whatever its `tick`.
 
     Raises ValueError for more than MESSAGE_VALUES values.
     """

@@ -84,17 +84,17 @@ class Plan:
 
     @property
     def layout(self) -> Layout:
-        """Record types of the plan's laws."""
+        """Types of the records with which the plan's laws run: an axis's coefficients, and its state."""
         return law_layout(self.laws)
 
     @property
     def columns(self) -> tuple[str, ...]:
-        """Names of the columns of a tick's record."""
+        """Names of the values of a tick's record, in their order in it."""
         return column_names(self.axes, self.observed, self.extras.columns)
 
     @property
     def sizes(self) -> Sizes:
-        """Dimensions of the shared block: columns, axes, rate, bytes of a snapshot, samples with the spare ones."""
+        """Dimensions of the shared block: columns, axes, rate, bytes of a snapshot, samples with `spare_samples`."""
         axes = len(self.axes)
         samples = self.table.size + self.spare_samples
         return Sizes(len(self.columns), axes, self.pacing.rate_hz, self.layout.snapshot_bytes(axes), samples)

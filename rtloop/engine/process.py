@@ -123,7 +123,7 @@ def _open_driver(driver: Driver) -> Pointers:
 
 
 def _run_plan(plan: Plan, block: SharedBlock, driver: Driver, facts: Facts) -> Outcome:
-    """Ramp to safe, wait for GO, run all ticks, ramp down; return why the run ended.
+    """Open the driver, ramp to safe, wait for GO, run all ticks, ramp down; return why the run ended.
 
     A stop, or a lost heartbeat, before GO ends it without a tick. Raises HostRefusal if real time is required and
     refused, DriverError if the driver cannot be opened or refuses the ramp, ValueError for a law that cannot be

@@ -46,19 +46,25 @@ def prepare_realtime(pacing: Pacing) -> dict[str, Any]:
 
 
 def freeze_garbage_collection() -> None:
-    """Collect garbage, then disable collection for the run."""
+    """Collect garbage, freeze the objects that remain (gc.freeze), and disable collection until the process ends."""
     gc.collect()
     gc.freeze()
     gc.disable()
 
 
 def die_with_parent() -> None:
-    """Let the kernel kill this process when its parent ends; for virtual time alone, without a ramp of outputs."""
+    """Let the kernel kill this process (SIGKILL) when its parent ends; a refusal is ignored.
+
+    For virtual time alone: the outputs are not ramped down.
+    """
     _libc.prctl(PR_SET_PDEATHSIG, 9, 0, 0, 0)
 
 
 def _request(report: dict[str, Any], name: str, request: Any) -> None:
-    """Call `request` and store its result in `report[name]`; its OSError becomes a message in `report["refused"]`."""
+    """Call `request` and store its result in `report[name]`.
+
+    An OSError leaves that value, and becomes a message "name: cause" in `report["refused"]`.
+    """
     try:
         report[name] = request()
     except OSError as error:
@@ -66,14 +72,14 @@ def _request(report: dict[str, Any], name: str, request: Any) -> None:
 
 
 def _require_success(result: int) -> int:
-    """Return 0, the result of a C function. Raises OSError for any other."""
+    """Return 0, the result of a C function. Raises OSError, with the C library's errno, for any other result."""
     if result != 0:
         raise OSError(ctypes.get_errno(), "refused")
     return result
 
 
 def _set_affinity(cpu: int | None) -> list[int]:
-    """Pin the thread to processor `cpu`, unless it is None; return the thread's processors.
+    """Pin the thread to processor `cpu`, unless it is None; return the thread's processors, ascending.
 
     Raises OSError if refused.
     """

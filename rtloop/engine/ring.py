@@ -60,8 +60,8 @@ def drain(ring: Ring, cursor: int, out: npt.NDArray[Any]) -> tuple[int, int, int
     """Copy all readable slots from position `cursor` on into `out` (m, …), oldest first.
 
     Returns (copied, first, lost): `out[:copied]` holds positions first … first + copied − 1, without a hole, and
-    `lost` positions from `cursor` to `first` were overwritten before. The next cursor is first + copied. Raises
-    ValueError for an `out` that does not fit the slots.
+    `lost` positions from `cursor` to `first` were overwritten before. The next cursor is first + copied; `copied` is 0
+    if nothing is readable. Raises ValueError for an `out` that is not contiguous or does not fit the slots.
     """
     slots, first = ring.slots, np.array([cursor], np.uint64)
     if out.dtype != slots.dtype or out.shape[1:] != slots.shape[1:] or not out.flags.c_contiguous:

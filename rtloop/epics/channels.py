@@ -100,7 +100,7 @@ class Channel(ChannelData):
             await self.writer(self, self.from_client(self.preprocess_value(value)))
 
     def from_client(self, value: Any) -> Any:
-        """Return a client's value as the service's requests have it."""
+        """Return a client's value as the service's requests have it: unchanged, unless a subclass converts it."""
         return value
 
 
@@ -122,7 +122,10 @@ class ChoiceChannel(Channel, ChannelEnum):
     """A channel with one of some words."""
 
     def from_client(self, value: Any) -> str:
-        """Return the word of a number. Raises CaprotoValueError for a number without a word."""
+        """Return the word with the number `value`; caproto converts a written word to its number before.
+
+        Raises CaprotoValueError for a number without a word.
+        """
         if value not in range(len(self.enum_strings)):
             raise CaprotoValueError(value)
         return self.enum_strings[int(value)]
@@ -139,7 +142,10 @@ class TextChannel(Channel, ChannelChar):
 
 
 def make_channel(name: str, variable: Variable) -> Channel:
-    """Return the channel of a variable: read only, INVALID until its first value."""
+    """Return the channel of a variable, a ChoiceChannel, TextChannel or NumberChannel, with `name` as its full name.
+
+    It is read only, and INVALID until its first value.
+    """
     alarm = ChannelAlarm(status=AlarmStatus.UDF, severity=AlarmSeverity.INVALID_ALARM)
     if variable.choices:
         channel = ChoiceChannel(alarm=alarm, value=variable.choices[0], enum_strings=variable.choices)

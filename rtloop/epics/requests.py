@@ -26,7 +26,7 @@ class Requests:
     async def stop(self, request: Callable[[], object]) -> None:
         """Execute a request that stops the loop, at once, and wait for its end. Raises as `request`.
 
-        The requests of `execute` that wait are withdrawn: each of their calls raises LoopFault.
+        The requests of `execute` that wait are withdrawn: each of their calls raises LoopFault. One that runs goes on.
         """
         self._stop_count += 1
         await asyncio.get_running_loop().run_in_executor(self._stops, request)
@@ -54,6 +54,9 @@ class Requests:
             self._pending_count -= 1
 
     def close(self) -> None:
-        """Withdraw the requests that have not begun; the others end by themselves."""
+        """Withdraw the requests that have not begun, whose calls raise CancelledError, and return at once.
+
+        Requests that have begun end by themselves.
+        """
         for executor in (self._ordinary, self._stops):
             executor.shutdown(wait=False, cancel_futures=True)

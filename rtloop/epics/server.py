@@ -48,7 +48,10 @@ class ChannelServer:
         self._add((*LOOP_VARIABLES, self._message))
 
     def _add(self, variables: tuple[Variable, ...]) -> None:
-        """Add the channels of variables that have none yet; they are writable if clients may write them."""
+        """Add the channels of variables that have none yet.
+
+        With `allows_control`, those of variables with a `request` are writable.
+        """
         for variable in variables:
             name = f"{self._prefix}{variable.suffix}"
             if name in self._channels:
@@ -78,7 +81,10 @@ class ChannelServer:
                 await self.show_status(status)
 
     async def show_status(self, status: dict[str, Any]) -> None:
-        """Show a response of `/status` in all channels; an axis that is new gets its channels."""
+        """Show a response of `/status` in all channels; an axis that is new gets its channels.
+
+        The first response after a loss is logged.
+        """
         if self._lost_text:
             self._log("the service answers")
         self._lost_text = ""
@@ -88,7 +94,7 @@ class ChannelServer:
             await channel.show(channel.variable.read(status), status.get("mode"))
 
     async def _show_lost(self, text: str) -> None:
-        """Make all channels INVALID, and show the reason as the message."""
+        """Make all channels INVALID, and show the reason `text` in MESSAGE; a reason that is new is logged."""
         if text != self._lost_text:
             self._log(f"{text}; the channels are INVALID until it answers")
         self._lost_text = text
@@ -96,7 +102,10 @@ class ChannelServer:
             await channel.show_lost(text if channel.variable is self._message else channel.variable.lost)
 
     async def _send(self, channel: Channel, value: Any) -> None:
-        """Send the request of a written value to the service. Raises RtloopError for a refusal."""
+        """Send the request of a written value to the service: a stop at once, others after those before them.
+
+        Raises RtloopError for a refusal.
+        """
         variable = channel.variable
         assert variable.request is not None
         request = partial(variable.request, self._connection, value)
@@ -110,7 +119,7 @@ class ChannelServer:
         await self.refresh()
 
     def close(self) -> None:
-        """End the threads, and release the lock if clients could take it."""
+        """End the threads, and release the lock if clients could take it; a refusal of the release is ignored."""
         self._requests.close()
         self._reader.shutdown(wait=False, cancel_futures=True)
         if self._allows_control:

@@ -48,7 +48,10 @@ def axis_variables(axis: str) -> tuple[Variable, ...]:
         return lambda status: status.get("axes", {}).get(axis, {}).get(name)
 
     def set_setpoint(loop: Connection, value: float) -> int:
-        """Hold the reference of the axis at a value, in µm (V in mode raw). Returns its first tick."""
+        """Hold the reference of the axis at a value, in µm (V in mode raw). Returns its first tick.
+
+        Raises RtloopError if the service refuses it or does not answer.
+        """
         return loop.setpoint(axis, value)
 
     return (
@@ -61,7 +64,7 @@ def axis_variables(axis: str) -> tuple[Variable, ...]:
 
 
 def unit_in_mode(variable: Variable, mode: str | None) -> str:
-    """Return the unit of a variable in a mode: a reference is in V in mode raw."""
+    """Return the unit of a variable: V for a reference or setpoint in mode raw, else its `unit`, also for mode None."""
     is_reference = variable.suffix.endswith((":REFERENCE", ":SETPOINT"))
     return "V" if is_reference and mode == MODES[Mode.RAW] else variable.unit
 

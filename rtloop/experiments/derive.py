@@ -89,8 +89,8 @@ def read_metadata(configuration: str) -> dict[str, Any] | None:
     """Return the description of the run in the first line of a configuration's text; None for any other first line.
 
     Keys, as `derive_configuration` writes them and unchecked: name (of the experiment), run (its label), runs (their
-    number), axis, may_trip, ticks, middle_um (the middle of its motion; 0 if missing), parameters, asked (the axis's
-    specification), beside (whether the run is one of the second configuration), reduced (sentences on reduced
+    number), axis, may_trip, ticks, middle_um (the middle of its motion; an absent key means 0), parameters, asked (the
+    axis's specification), beside (whether the run is one of the second configuration), reduced (sentences on reduced
     defaults), segments (each a list of the fields of Segment).
     """
     first_line = configuration.partition("\n")[0].removeprefix("# ")
@@ -115,5 +115,5 @@ def _change_plant(driver: dict[str, Any], axis: str, changes: Any) -> None:
 
 
 def _file_name(label: str) -> str:
-    """Return a label as part of a file's name: "-" for all but letters, digits, "+", "-", "."; no "-" at the end."""
+    """Return a label as part of a file's name: "-" for each character but letters, digits, "+", "."; no final "-"."""
     return "".join(letter if letter.isalnum() or letter in "+-." else "-" for letter in label).rstrip("-")

@@ -119,9 +119,10 @@ def largest_part_of_drive(setting: Setting) -> Bound:
 
 
 def largest_true(condition: Callable[[float], bool], upper: float) -> float:
-    """Return the largest number from 0 to `upper` up to which `condition` holds, to a part in 10⁹ of `upper`.
+    """Return a number from 0 to `upper` for which `condition` holds, at most 10⁻⁹ `upper` below the largest one.
 
-    By bisection: `condition` must be true up to one number, and false above it. 0 if it is true nowhere.
+    By bisection: `condition` must be true up to one number, and false above it. `upper` if it is true there, 0 if it is
+    true nowhere.
     """
     if condition(upper):
         return upper

@@ -135,7 +135,9 @@ class LinearModel:
 
     @cached_property
     def step_reversal(self) -> float | None:
-        """Largest command beyond 0, per height, of a step of the reference from 0 or back to it; None without a loop.
+        """Largest command beyond 0, per height, of a step of the reference from 0 or back to it; ≥ 0.
+
+        None without a loop.
 
         The command of a step up may begin below 0. The command of a step back passes 0 by the overshoot of the step up.
         """
@@ -158,7 +160,7 @@ class LinearModel:
     def tracking_peak(self) -> float | None:
         """Largest amplitude of the position per amplitude of a sine of the reference, over all frequencies.
 
-        None without a loop.
+        It contains the pre-filter. None without a loop.
         """
         tracking = None if self.loop is None else self.tracking(self.loop.frequencies)
         return None if tracking is None else float(np.abs(tracking).max())
@@ -218,7 +220,7 @@ def linear_model(axis: AxisOptions, rate_hz: float, rig_delay_ticks: int = 0) ->
 def simulate(a: Real, b: Real, c: Real, d: Real | float, values: Real) -> Real:
     """Return outputs (outputs, n) of the discrete system a, b, c, d from rest for one input `values` (n,).
 
-    `c` is (outputs, states), `d` (outputs,); (states,) and a number for one output.
+    `c` is (outputs, states), `d` (outputs,). For one output, (states,) and a number will do; the result is (1, n).
     """
     states = System(a, b, b, 0.0).simulate_states(values)
     return np.atleast_2d(c) @ states.T + np.outer(d, values)

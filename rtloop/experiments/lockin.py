@@ -37,7 +37,7 @@ class Response(NamedTuple):
 
 
 def tone(signal: Real, hz: float, rate_hz: float) -> Tone:
-    """Return amplitude and power ratio of `signal` (samples,) at `hz`; the phase refers to its first sample.
+    """Return complex amplitude and power ratio of `signal` (samples,) at `hz`; the phase refers to its first sample.
 
     Raises ValueError for a frequency outside 0 … half the rate, and for less than MIN_CYCLES or three samples.
     """

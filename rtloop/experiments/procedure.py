@@ -136,7 +136,7 @@ def _scale_down(value: Any, limits: Sequence[float]) -> Any:
     """Return a number, or a tuple of numbers, scaled down to `limits`, the largest positive and negative magnitudes.
 
     The limits are first rounded down to two significant digits. Equal limits scale all numbers by one factor, unequal
-    ones each sign by its own. Numbers within the limits stay.
+    ones each sign by its own; no factor is above 1.
     """
     numbers = np.atleast_1d(np.asarray(value, dtype=float))
     rounded = [_round_down(limit) for limit in limits]

@@ -66,7 +66,7 @@ class RecordedRun:
 
     @property
     def paths(self) -> tuple[Path, ...]:
-        """The files of the recording."""
+        """The files of the recording, in the order of the run."""
         return self.recording.paths
 
     @property
@@ -81,7 +81,10 @@ class RecordedRun:
 
     @cached_property
     def axis_options(self) -> AxisOptions:
-        """Options of the run's axis, from the recorded configuration, with defaults."""
+        """Options of the run's axis, from the recorded configuration, with defaults.
+
+        Raises pydantic's ValidationError, a ValueError, if they are not valid.
+        """
         return AxisOptions.model_validate(
             next(axis for axis in self.configuration["axis"] if axis["name"] == self.axis)
         )

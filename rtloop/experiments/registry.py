@@ -29,7 +29,7 @@ EXPERIMENTS: dict[str, Experiment] = {module.EXPERIMENT.name: module.EXPERIMENT 
 
 
 def select_experiments(names: Sequence[str]) -> list[Experiment]:
-    """Return the named experiments in the order of a report. Raises ConfigError for an unknown name."""
+    """Return the named experiments, and no others, in the order of a report. Raises ConfigError for an unknown name."""
     unknown = [name for name in names if name not in EXPERIMENTS]
     if unknown:
         known_names = ", ".join(EXPERIMENTS)

@@ -165,7 +165,7 @@ def _configuration_name(run: RecordedRun) -> str:
 
 
 def _require_distinct(runs: Sequence[RecordedRun]) -> None:
-    """Raise RecordingError where two recordings are of the same run."""
+    """Raise RecordingError where two recordings are of the same run: one experiment, label and configuration."""
     run_by_key: dict[tuple[str, str, bool], RecordedRun] = {}
     for run in runs:
         key = run.experiment, run.label, run.is_comparison

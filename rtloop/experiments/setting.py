@@ -92,9 +92,9 @@ class Setting:
         return self._trip_bound(self.sensor_ends_um[1] if direction > 0 else -self.sensor_ends_um[0], "on this side")
 
     def _trip_bound(self, sensor_end_um: float, place: str) -> Bound:
-        """Return the smaller one of the bounds by the position interlock, and by the sensor's range at `sensor_end_um`.
+        """Return the largest displacement before the dynamics, µm, by position interlock and sensor: the smaller bound.
 
-        `place` says in the reason where the sensor's range ends there, such as "about 0".
+        The sensor's range ends at the position `sensor_end_um`; `place` says in the reason where, such as "about 0".
         """
         interlocks, gain = self.axis.interlocks, abs(self.model.static_gain) if self.model else 1.0
         ends = f"sensor_min_v = {interlocks.sensor_min_v:g} and sensor_max_v = {interlocks.sensor_max_v:g}"
@@ -130,7 +130,7 @@ class Setting:
 
     @property
     def is_one_sided(self) -> bool:
-        """Whether the drive has one sign alone."""
+        """Whether the drive has one sign alone: its lowest value is 0 V."""
         return self.axis.limits.lowest_v == 0.0
 
     @cached_property

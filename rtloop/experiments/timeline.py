@@ -99,7 +99,7 @@ class Timeline:
     def depolarise(self, amplitude_v: float, middle_v: float = 0.0) -> None:
         """Append DEPOLARISING_CYCLES cycles of a sine about `middle_v`, in V in mode raw, which erase the memory.
 
-        Each is a little smaller than the one before. Half a cycle leads from 0 to the middle, another one back.
+        Each is a little smaller than the one before. To a middle other than 0 leads half a cycle, and another one back.
         """
         half_s, half_v = 0.5 / DEPOLARISING_HZ, middle_v / 2
         if middle_v:

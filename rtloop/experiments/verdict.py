@@ -72,7 +72,7 @@ class Row:
 
     @property
     def mark(self) -> str:
-        """good: every answer is yes; bad: the limit is missed; mixed: another answer is no; empty: no answer."""
+        """Return "good" if every answer is yes, "bad" if the limit is missed, else "mixed"; "" without an answer."""
         answers = [answer for answer in (self.is_met, self.is_as_claimed, self.is_as_modelled) if answer is not None]
         if not answers:
             return ""

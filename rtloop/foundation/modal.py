@@ -130,7 +130,7 @@ def quadratic_roots(b: float, c: float) -> list[complex]:
 
 
 def _ratio_of_products(numerators: Complex, denominators: Complex) -> complex:
-    """Return Π numerators / Π denominators, multiplied one ratio at a time to avoid overflow."""
+    """Return Π numerators / Π denominators, multiplied one ratio at a time to avoid overflow; either may be longer."""
     ratio = 1.0 + 0.0j
     for i in range(max(numerators.size, denominators.size)):
         ratio *= (numerators[i] if i < numerators.size else 1.0) / (denominators[i] if i < denominators.size else 1.0)

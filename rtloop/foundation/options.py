@@ -23,7 +23,10 @@ LARGEST_INTEGER = 2**63 - 1
 
 
 def _nested_numbers(value: Any) -> Iterator[int | float]:
-    """Yield the numbers of a value: itself, or those in its nested lists and tuples; all else is ignored."""
+    """Yield the numbers of a value, True and False included: itself, or those in its nested lists and tuples.
+
+    All else is ignored.
+    """
     if isinstance(value, int | float):
         yield value
     elif isinstance(value, list | tuple):
@@ -56,7 +59,8 @@ class Options(BaseModel):
     def of_absent_table(cls) -> Self:
         """Return the options of a table that a file lacks: the defaults, without building the model's validator.
 
-        Use it for the default of a field whose type is a model. Every option of the model must have a default.
+        Use it for the default of a field whose type is a model. Every option of the model must have a default: one
+        without would be missing in the result, with no error here.
         """
         return cls.model_construct()
 

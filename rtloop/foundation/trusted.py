@@ -39,7 +39,7 @@ class UntrustedPath(PermissionError):
     """A path that another user owns, or may change."""
 
     def __init__(self, path: Path | str, reason: str) -> None:
-        """Store the path as `filename` and the reason as `strerror`."""
+        """Store the path as `filename`, the reason as `strerror`, and EPERM as `errno`."""
         super().__init__(errno.EPERM, reason, str(path))
 
 
@@ -113,7 +113,8 @@ def open_user_file(path: Path | str) -> int:
 def open_without_link(path: Path | str) -> int:
     """Return a descriptor, for reading, of a regular file of any owner.
 
-    Raises UntrustedPath for a link, OSError if it cannot be opened or is not a regular file.
+    Raises UntrustedPath if `path` itself is a link, OSError if it cannot be opened or is not a regular file; links
+    among its folders are followed.
     """
     try:
         fd = os.open(path, _READ | _NOFOLLOW)
@@ -340,7 +341,10 @@ def _stat_or_make(name: str, folder: int, mode: int | None) -> os.stat_result:
 
 
 def _open_subfolder(fd: int, name: str) -> int:
-    """Open the folder `name` inside the folder `fd`, close `fd`, and return the new descriptor."""
+    """Open the folder `name` inside the folder `fd`, close `fd`, and return the new descriptor.
+
+    Raises OSError if it cannot be opened; `fd` then stays open.
+    """
     following = os.open(name, _FOLDER, dir_fd=fd)
     close_descriptor(fd)
     return following

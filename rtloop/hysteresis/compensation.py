@@ -123,7 +123,10 @@ def _inverse_loading_curve(inverse: PlayModel, drives: Real) -> Real:
 
 
 def _loading_slope(model: PlayModel, points: Real) -> Real:
-    """Return the slope dφ/du of the initial loading curve at each of `points` ≥ 0; 0 before the first threshold."""
+    """Return the slope dφ/du of the initial loading curve at each of `points` ≥ 0; 0 before the first threshold.
+
+    At a threshold it is the slope beyond.
+    """
     slopes = np.concatenate([[0.0], loading_slopes(model)])
     return slopes[np.searchsorted(model.thresholds, points, side="right")]
 
@@ -135,7 +138,7 @@ def _distinct_values(values: Real, largest: float) -> Real:
 
 
 def _weighted_median(values: Real, weights: Real) -> float:
-    """Return the ρ at which Σ weights·|values − ρ| is least."""
+    """Return the least of the `values` ρ at which Σ weights·|values − ρ| is least."""
     order = np.argsort(values)
     reached = np.cumsum(weights[order])
     return float(values[order][np.searchsorted(reached, 0.5 * reached[-1])])

@@ -51,7 +51,10 @@ def covered_intervals(drive: Real) -> npt.NDArray[np.intp]:
 
 
 def missing_stroke(drive: Real) -> MissingStroke:
-    """Return the stroke after which a covered interval over the drive's whole range would have been recorded."""
+    """Return the stroke after which a covered interval over the drive's whole range would have been recorded.
+
+    There is always one: the caller asks only about a drive without such an interval.
+    """
     low, high = int(np.argmin(drive)), int(np.argmax(drive))
     if low > high:
         return MissingStroke(float(drive[low]), float(drive[low:].max()), float(drive[high]))

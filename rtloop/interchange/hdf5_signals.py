@@ -12,7 +12,10 @@ COMPRESSION = {"compression": "gzip", "compression_opts": 1, "shuffle": True}
 
 
 def descriptor_path(file: IO[bytes]) -> str:
-    """Return a path by which the HDF5 library opens this open file itself, even if its name leads elsewhere by now."""
+    """Return a Linux path, valid while `file` is open, by which the HDF5 library opens this file itself.
+
+    The file's name may lead to another file by now.
+    """
     return f"/proc/self/fd/{file.fileno()}"
 
 

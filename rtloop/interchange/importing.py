@@ -74,16 +74,17 @@ def import_data(
     table: Table | None = None,
     progress: ReportTicks | None = None,
 ) -> dict[str, Any]:
-    """Write the selected columns of a file as the recording `output`, NAME.mcap beside it by default.
+    """Write the selected columns of a file, all where none is selected, as the recording `output`.
 
-    All columns where none is selected. `table` is the file's content, if it was read already; `progress` receives the
-    ticks so far. Returns {file, output, ticks, rate_hz, duration_s, time, signals, notes, about, in_other_files};
-    `signals` are {name, unit, from, least, largest}, `from` being the mapping as text; `about` has texts about the file
-    by topic, `in_other_files` names data that the file only points to.
+    `output` is by default NAME.mcap beside the file, NAME.imported.mcap for a file NAME.mcap. `table` is the file's
+    content, if it was read already; `progress` receives the ticks so far. Returns {file, output, ticks, rate_hz,
+    duration_s, time, signals, notes, about, in_other_files}; `signals` are {name, unit, from, least, largest}, `from`
+    being the mapping as text; `about` has texts about the file by topic, `in_other_files` names data that the file only
+    points to.
 
     Raises UnreadableData if the file cannot be read, or a column, its unit or the time does not fit; MissingExtra if
-    the format's package is missing; OutputError if the output exists or cannot be written. An incomplete output is
-    removed.
+    the format's package is missing; OutputError if the output exists or cannot be written; OSError if the file
+    disappears meanwhile. An incomplete output is removed.
     """
     table = read_table(path, selection.group) if table is None else table
     time_base = find_time_base(table, path, selection.time, selection.rate_hz)
@@ -112,7 +113,8 @@ def list_columns(path: Path, table: Table, selection: ColumnSelection) -> dict[s
     """Return the content of a file, with unit and extremes of each column.
 
     Keys: file, rows, time, time_column, rate_hz, notes, columns, about, in_other_files; `columns` are {name, unit,
-    grows_evenly, least, largest}, `time_column` is a name, None without one. Of `selection`, only time and rate count.
+    grows_evenly, least, largest}, `time_column` is the name of the table's own column of times, None without one. Of
+    `selection`, only time and rate count.
     Where the time is unusable, `time`, a text on its source, and `rate_hz` are None, and `notes` says why.
     """
     columns = [
@@ -168,7 +170,7 @@ def _select_signals(table: Table, path: Path, selection: ColumnSelection, time_b
 
 
 def _select_columns(table: Table, path: Path, selection: ColumnSelection) -> dict[str, MappedColumn]:
-    """Return the selected columns by signal name.
+    """Return the selected columns by signal name; where none or `all` is selected, also all others except the times.
 
     A column kept under its own name gets a number behind it if a signal, the tick or the deadline has this name.
     Raises UnreadableData for a missing or ambiguous column, a unit that does not fit, a reserved name, two mappings of
@@ -294,7 +296,7 @@ def _write_recording(
     writer = Writer(output, header, header["created_unix_ns"], message_index=True, suffix=UNFINISHED_SUFFIX)
 
     def final_message(ticks_logged: int) -> Message:
-        """Return the event that ends the recording, with the totals if it holds `ticks_logged` ticks."""
+        """Return the event that ends a recording of `ticks_logged` ticks, with its totals."""
         executed, end_ns = int(ticks[-1]) + 1, round(deadlines[-1] + 1e9 / rate_hz)
         lost = executed - header["first_tick"] - ticks_logged
         totals = {"ticks_executed": executed, "ticks_logged": ticks_logged, "ticks_lost": lost, "events_lost": 0}
@@ -312,5 +314,5 @@ def _write_recording(
 
 
 def _header_text(text: str) -> str:
-    """Return text suitable for a header: no control characters, and at most MAX_TEXT_CHARACTERS."""
+    """Return text suitable for a header: spaces for control characters, cut to MAX_TEXT_CHARACTERS."""
     return re.sub(r"[\x00-\x1f\x7f-\x9f]", " ", text)[:MAX_TEXT_CHARACTERS]

@@ -61,8 +61,9 @@ class MappedColumn(NamedTuple):
 def map_column(table: Table, path: Path, signal: str, source: str) -> MappedColumn:
     """Return the column for `signal` by the mapping `source`, such as `Sensor [V] * 2.5 µm/V - 3 µm`.
 
-    A `signal` without a known unit gets the unit of the column, or of its product with a sensitivity. Raises
-    UnreadableData if the column is missing or ambiguous, or its unit is unknown or not convertible to the signal's.
+    A `signal` without a known unit gets the unit of the column, or of its product with a sensitivity. A column without
+    a unit counts as in the unit that the mapping needs; `assumption` says so. Raises UnreadableData if the column is
+    missing or ambiguous, its unit unknown or not convertible to the signal's, or the factor too large or too small.
     """
     match = None if source in table.columns else _SOURCE.fullmatch(source)
     parts = match.groupdict() if match else {}
@@ -96,7 +97,7 @@ def map_column(table: Table, path: Path, signal: str, source: str) -> MappedColu
 def _exact_factor(text: str) -> Fraction:
     """Return the number that a text states, exactly.
 
-    Raises ValueError for a magnitude above LARGEST_FACTOR or below its reciprocal.
+    Raises ValueError for a magnitude above LARGEST_FACTOR or below its reciprocal; 0 is allowed.
     """
     magnitude = abs(float(text))  # Fraction alone would compute all digits of 1e999999999.
     if magnitude and not 1 / LARGEST_FACTOR <= magnitude <= LARGEST_FACTOR:
@@ -129,7 +130,8 @@ def _describe_mapping(name: str, unit: str, parts: dict[str, str | None]) -> str
 def find_column(table: Table, path: Path, name_or_path: str) -> str:
     """Return the name of the file's column with this name or end of a path; case and unit do not matter.
 
-    Raises UnreadableData for none or several.
+    An equal name has priority over a similar one, and a name over the end of a path. Raises UnreadableData for none or
+    several.
     """
     if name_or_path in table.columns:
         return name_or_path
@@ -176,8 +178,9 @@ def signal_name(text: str) -> str:
 
 
 def default_signal_name(column: str) -> str:
-    """Return a column's name in a recording, made of letters, digits and underscores.
+    """Return a column's name in a recording: without its unit, of ASCII letters, digits and underscores.
 
+    A long name loses its beginning: the last MAX_NAME_CHARACTERS stay.
     `column_` precedes a name that does not begin with a letter, `file_` one that every recording has.
     """
     plain = (
@@ -226,10 +229,10 @@ def _normalised_name(name: str) -> str:
 
 
 def _normalised_path(name: str) -> str:
-    """Return a normalised name with slashes between the parts of its path."""
+    """Return a normalised name with slashes, in place of dots and backslashes too, between the parts of its path."""
     return re.sub(r"[\\./]+", "/", _normalised_name(name).replace('"', "").strip("/"))
 
 
 def _quoted_list(names: list[str]) -> str:
-    """Return the names in quotes, separated by commas."""
+    """Return the names as `repr` quotes them, separated by commas."""
     return ", ".join(map(repr, names))

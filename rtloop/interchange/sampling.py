@@ -42,8 +42,10 @@ def find_time_base(table: Table, path: Path, time: str | None, rate_hz: float | 
     """Return the times by `rate_hz`, or else by the column of the mapping `time`, such as "Clock [ms]", or by the
     file's own column of times.
 
-    With `rate_hz`, the samples are counted from 0. Raises UnreadableData without a time column, for fewer than two
-    samples, for a time that does not grow, is not finite or has an unknown unit, and for a rate outside the limits.
+    With `rate_hz`, which is not checked, the samples are counted from 0, and no column of times is needed. Else a
+    time without a unit counts as s, with a note. Raises UnreadableData without a column of times, for fewer than two
+    samples, for a time that does not grow, is not finite, spans too long or has an unknown unit, and for times that
+    give a rate outside LOWEST_RATE_HZ to HIGHEST_RATE_HZ.
     """
     if rate_hz is not None:
         deadlines = np.rint(np.arange(row_count(table)) * (1e9 / rate_hz))
@@ -103,7 +105,7 @@ def _first_column_as_time(table: Table) -> str | None:
 def grows_evenly(values: Real) -> bool:
     """Whether each value exceeds the one before, by steps that differ by less than a factor of GAP_PERIODS.
 
-    False for fewer than three values.
+    False for fewer than three values, and with NaN.
     """
     with np.errstate(invalid="ignore"):  # inf − inf, which does not grow
         steps = np.diff(values)

@@ -24,8 +24,8 @@ FormatRows = Callable[[Sequence[str], Real], bytes]
 def write_csv(file: IO[bytes], names: Sequence[str], blocks: Iterable[Real], progress: Callable[[int], None]) -> int:
     """Write a line of names, then a line for each row of `blocks` (n, names). Returns the number of rows.
 
-    Signals of COUNTS have no decimal point. `progress` receives the number of rows so far. pyarrow formats the rows, in
-    a thread for each processor; without pyarrow, Python does, in one thread.
+    Whole numbers in signals of COUNTS have no decimal point. `progress` receives the number of rows so far. pyarrow
+    formats the rows, in a thread for each processor; without pyarrow, Python does, in one thread.
     """
     file.write((",".join(names) + "\n").encode("ascii"))
     row_count = 0

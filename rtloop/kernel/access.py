@@ -59,13 +59,13 @@ def axis_state(law, a):
 
 @jit
 def loop_state(law):
-    """Return the LOOP_STATE record, common to all axes: mode, causes of a trip, flags of the tick."""
+    """Return the LOOP_STATE record, common to all axes, a view: mode, causes of a trip, flags of the tick."""
     return carray(address_pointer(law.loop), 1, LOOP_STATE)[0]
 
 
 @jit
 def axis_control(law, a):
-    """Return the CONTROL record: the signals that the controller of axis number `a` receives."""
+    """Return the CONTROL record, a view: the signals for the controller of axis number `a`, which is not checked."""
     return carray(address_pointer(law.controls + a * CONTROL_BYTES), 1, CONTROL)[0]
 
 
@@ -80,11 +80,14 @@ def joint_control(law, first, count):
 
 @jit
 def law_functions(law, number):
-    """Return the FUNCTIONS record of law number `number`: addresses of its functions, sizes of its records."""
+    """Return the FUNCTIONS record of law `number`, a view: addresses of functions, sizes of records; not checked."""
     return carray(address_pointer(law.functions + number * FUNCTIONS_BYTES), 1, FUNCTIONS)[0]
 
 
 @jit
 def trip_record(law):
-    """Return the TRIP record: axis, cause, law, value and limit of the newest trip's first cause."""
+    """Return the TRIP record, a view: axis, cause, law, value and limit of the newest trip's first cause.
+
+    All are 0 before the first trip.
+    """
     return carray(address_pointer(law.trip), 1, TRIP)[0]

@@ -106,7 +106,7 @@ def pass_extra_inputs(record):
 def set_marks(record, a, step_um, position_um):
     """Set `is_high` of the marks of axis `a`, 1 or 0, from the reference's change since the last tick and the position.
 
-    `step_um` is this change, with its sign; outputs without a mark get 0.
+    `step_um` is this change, with its sign; outputs of axis `a` that are no marks get 0.
     """
     outputs = extra_outputs(record)
     for k in range(record.extra_output_count):

@@ -147,7 +147,10 @@ CONTROL = np.dtype([*((name, np.float64) for name in CONTROL_SIGNALS), *_EXTRAS]
 
 
 def control_dtype(axes: int) -> np.dtype[Any]:
-    """Return the type of the signals for a controller of `axes` axes: with several, each signal is an array (axes,)."""
+    """Return the type of the signals for a controller of `axes` axes.
+
+    With several axes, each of CONTROL_SIGNALS is an array (axes,); `inputs` and `outputs` stay (MAX_EXTRAS,).
+    """
     if axes == 1:
         return CONTROL
     return np.dtype([*((name, np.float64, (axes,)) for name in CONTROL_SIGNALS), *_EXTRAS], align=True)

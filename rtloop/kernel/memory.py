@@ -92,7 +92,7 @@ class Layout:
         return np.dtype([*axis_record.descr, *((slot, np.uint8, (self.slot_bytes(slot)[part],)) for slot in slots)])
 
     def snapshot_bytes(self, axes: int) -> int:
-        """Return the length of a snapshot in bytes: tick, coefficients and state."""
+        """Return the length of a snapshot in bytes: tick, coefficients and states of the axes, state of the loop."""
         return 8 + axes * (self.coefficients.itemsize + self.state.itemsize) + LOOP_STATE.itemsize
 
     def slot_law(self, coefficients: Any, slot: Slot) -> LawRecords | None:
@@ -244,7 +244,8 @@ class LawMemory:
     ) -> None:
         """Take the records without copying them: `axes` are the states of the axes, `state` is the loop's.
 
-        `functions` is copied, and completed with the sizes and rules of the layout's laws.
+        `functions` is copied, and completed with the sizes and rules of the layout's laws. Raises ValueError as
+        `Layout.rules` does. Coefficients and states are not checked.
         """
         self.layout, self.coefficients, self.axes, self.state = layout, coefficients, axes, state
         rules = layout.rules()
@@ -294,7 +295,7 @@ class LawMemory:
     ) -> LawMemory:
         """Return the memory of a loop at rest: mode OFF, outputs at their safe values, an actuator that never moved.
 
-        `coefficients` are copied.
+        `coefficients` are copied, and not checked. Raises ValueError as `Layout.rules` does.
         """
         owned_coefficients = copy_records(coefficients)
         axes = new_records(layout.state, owned_coefficients.size)
@@ -318,7 +319,7 @@ class LawMemory:
 
 
 def field_tables(layout: Layout, coefficients: Records, record_kind: RecordKind) -> list[list[Any]]:
-    """Return, for each axis, (name, type, offset in bytes) of every field of its coefficients or state.
+    """Return, for each axis, (name, dtype, offset in bytes) of every field of its coefficients or state.
 
     The fields of its laws precede the slot's own entry, which has the remaining bytes of the slot.
     """

@@ -35,7 +35,7 @@ def tap_outputs_um(coefficients, state):
 def _tap_outputs_um(coefficients, state):
     """Return the outputs of both rows of taps for the stored history, in µm: target, addition to the command.
 
-    The sums have four lanes: the same order on every processor.
+    The memory must be filled. The sums have four lanes: the same order on every processor.
     """
     begin, history = np.uint8(state.tap_index), state.tap_history
     taps, command_taps = coefficients.taps, coefficients.command_taps

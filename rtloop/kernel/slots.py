@@ -49,7 +49,7 @@ def record_failure(state, failure, value):
 
 @jit
 def _call_controller(law, a, function, control_address):
-    """Call a function of the controller whose first axis is `a`.
+    """Call a function of the controller whose first axis is `a`; its result goes to the address `law.result`.
 
     Returns its status: OK, NONE, or another if it raised.
     """
@@ -71,7 +71,7 @@ def _call_feedforward(law, a, function, result, value):
 
 @jit
 def controller_output(law, a, coefficients, control_address):
-    """Compute the output of the controller whose first axis is `a`. Returns (succeeded, command in µm).
+    """Compute the output of the controller whose first axis is `a`. Returns (succeeded, command in µm, not checked).
 
     `control_address` is `law.controls` for a controller of one axis, `law.together` for a coupled one, which writes its
     commands there; the number returned is then meaningless. A law that raised is recorded in the axis's state: (False,
@@ -118,7 +118,7 @@ def controller_update(law, a, coefficients, control_address):
 def feedforward_output(law, a, coefficients, state, command_um):
     """Return the drive in V for a command in µm; NaN if the law raised.
 
-    Records that failure, and a drive that is not a usable number, in `state`.
+    Records that failure, and a drive that is not a usable number but returned all the same, in `state`.
     """
     function = law_functions(law, coefficients.feedforward_law).output
     if _call_feedforward(law, a, function, law.result, command_um) not in (OK, NONE):
@@ -132,7 +132,10 @@ def feedforward_output(law, a, coefficients, state, command_um):
 
 @jit_rare
 def feedforward_enter(law, a, drive_v):
-    """Let the feedforward of axis `a` start at `drive_v`, if it has such a function; records its failure."""
+    """Call `enter` of the feedforward of axis `a`, if it has one, with the drive in force; its state is not zeroed.
+
+    A law that raised is recorded in the axis's state; nothing is returned.
+    """
     functions = law_functions(law, coefficients_record(law, a).feedforward_law)
     if functions.enter != 0 and _call_feedforward(law, a, functions.enter, law.result, drive_v) not in (OK, NONE):
         record_failure(axis_state(law, a), FEEDFORWARD_ENTER + RAISED, np.nan)

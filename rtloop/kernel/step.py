@@ -105,7 +105,7 @@ def set_mode(law, mode, at_rest):
     """Change the mode, bumplessly, and clear failures of laws; `at_rest`: before the first tick, the state is zero.
 
     A mode that drives restarts the pre-filter with the present reference: its history may be volts. A latched trip is
-    not cleared.
+    not cleared, and sets mode OFF again in the next tick.
     """
     loop_state(law).mode = mode
     for a in range(law.axis_count):
@@ -141,7 +141,7 @@ def continue_prefilter(law, a, last_um):
 
 @jit
 def reset_trip(law):
-    """Clear the latched causes of a trip; the mode stays OFF until it is set."""
+    """Clear the latched causes of a trip, and set mode OFF; the TRIP record stays."""
     loop_state(law).trip = 0
     loop_state(law).mode = OFF
 
@@ -273,7 +273,7 @@ def _control_coupled(law, first, count):
 
 @jit
 def _gather_signals(law, first, count):
-    """Copy the signals of the axes from `first` on into the record of the controller that they share."""
+    """Copy the signals of the `count` axes from `first` on into the record of the controller that they share."""
     joint = joint_control(law, first, count)
     for i in range(count):
         signals = carray(address_pointer(law.controls + (first + i) * CONTROL_BYTES), CONTROL_FIELDS, np.float64)
@@ -317,7 +317,10 @@ def _set_command(law, i, coefficients, state, command_um):
 
 @jit
 def _set_drive(law, a, loop, reference):
-    """Set drive, demand and command of one axis; add its flags to the loop's, and clear `settled` if it is not safe."""
+    """Set drive, demand and command of one axis, and add its flags to the loop's.
+
+    The loop's `settled` becomes 0 if the drive is not the axis's safe value.
+    """
     coefficients, state = coefficients_record(law, a), axis_state(law, a)
     loop.tick_flags |= _compute_drive(law, a, loop, coefficients, state, reference)
     if state.drive_v != coefficients.safe_v:
@@ -326,9 +329,10 @@ def _set_drive(law, a, loop, reference):
 
 @jit
 def _compute_drive(law, a, loop, coefficients, state, reference):
-    """Set drive, demand and command of one axis. Returns the Flag bits of its limits, RAMPING during a ramp.
+    """Set drive, demand and command of one axis. Returns the Flag bits of its limits, RAMPING if it ramps or is held.
 
-    A feedforward that fails trips the loop, and the drive is held in this tick.
+    A feedforward that fails trips the loop. In a tick that trips, the drive is held if the axis has an unusable input
+    or a failed law.
     """
     last_v, mode = state.drive_v, loop.mode
     if loop.new_trip != 0 and (state.usable == 0 or state.failed != 0):

@@ -181,7 +181,7 @@ class LawConformance:
 
 @cache
 def _compiled(function: Any, signature: Any) -> Any:
-    """Return a strictly compiled kernel of `function` for this signature."""
+    """Return a kernel of `function` compiled for this signature, with checked indices and divisions."""
     kernel = jit_strict(function)
     kernel.compile(signature)
     return kernel

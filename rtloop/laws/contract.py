@@ -88,14 +88,14 @@ class Law(ABC):
 
     @abstractmethod
     def build(self) -> Mapping[str, Any]:
-        """Return a value for each coefficient, by name; arrays may be shorter than their fields.
+        """Return a value for each coefficient, by name; arrays may be shorter than their fields, whose rest is 0.
 
         Raises ValueError for options without a solution.
         """
 
     @property
     def count(self) -> int:
-        """Number of axes; 0 for a feedforward."""
+        """Number of axes: 0 for a feedforward, 1 for a controller that is not coupled."""
         return self.axes
 
     @classmethod
@@ -146,7 +146,7 @@ class CoupledController(Controller):
 
     @property
     def count(self) -> int:
-        """Number of axes of this instance."""
+        """Number of axes of this instance: the length of the option `axes`, unless the class states a number."""
         return len(self.options.axes) if self.axes == ANY_NUMBER else self.axes
 
     @staticmethod
@@ -164,7 +164,7 @@ class Feedforward(Law):
     @staticmethod
     @abstractmethod
     def output(c: Any, s: Any, command_um: float) -> float:
-        """Return the drive in V for a command, from coefficients `c` and state `s`."""
+        """Return the drive in V for a command in µm, from coefficients `c` and state `s`, which it may change too."""
 
     @staticmethod
     @abstractmethod
@@ -204,8 +204,8 @@ def build_record(law: Law) -> Any:
     """Return the coefficients that a law builds, shape (1,).
 
     A shipped law may leave names out: their values, and those behind a shorter array, are 0. Raises ValueError for a
-    result that is no dict, unknown names, missing names of a user law, values that are not numbers, NaN, and shapes
-    that do not fit; `build` may raise others."""
+    result that is no dict, unknown names, missing names of a user law, values that are not numbers, NaN (infinity is
+    allowed), and shapes that do not fit; `build` may raise others."""
     _announce(law)
     dtype = law.records().coefficients
     record = np.zeros(1, dtype)

@@ -107,7 +107,7 @@ def _wrong_fields(function: ast.FunctionDef, parameters: Mapping[str, _Parameter
 def _unknown_names(
     function: ast.FunctionDef, parameters: Collection[str], names: Mapping[str, Any]
 ) -> Iterator[Mistake]:
-    """Yield a mistake for each name that is undefined, and for each builtin function that may wait.
+    """Yield a mistake for each name that is undefined, and for each builtin function of WAITING, such as `open`.
 
     Defined are the function's `parameters` and own variables, the `names` of its module, and Python's builtins.
     """

@@ -48,7 +48,7 @@ class LimitedLoop:
 
     @property
     def edge_um(self) -> Real:
-        """Largest positions (axes,) in µm that the limited command can hold."""
+        """Positions (axes,) in µm that a command of `limit_um` holds: gain times limit, with the sign of the gain."""
         return self._gains * self.limit_um
 
     def follow(self, reference_um: Real, ticks: int, limited: bool) -> Real:
@@ -80,6 +80,7 @@ class LimitedLoop:
     def limited_return(self, saturated_ticks: int, most_ticks: int) -> Return | None:
         """Saturate the loop for `saturated_ticks`, then let it return to 0; return the ticks and overshoot of this way.
 
+        The reference is BEYOND times the edge, then 0.
         None if it takes more than `most_ticks`.
         """
         self.follow(BEYOND * self.edge_um, saturated_ticks, limited=True)

@@ -98,7 +98,7 @@ def find_law(kind: str) -> LawReference:
 def laws_in(text: str, file: str) -> tuple[LawReference, ...]:
     """Return all laws that a text defines, in the order of their kinds; the text is run once in a process.
 
-    Raises ValueError if it cannot be run.
+    Raises ValueError if it cannot be run or has a mistake.
     """
     announce(Path(file).stem, file)
     return _laws_in(text, file)
@@ -112,7 +112,8 @@ def _laws_in(text: str, file: str) -> tuple[LawReference, ...]:
 def law_from_text(text: str, file: str, kind: str | None = None) -> LawReference:
     """Return the law that a text defines; `kind` selects one of several. The text is run once in a process.
 
-    Raises ValueError if it defines no law, or no law `kind`, if the choice is open, or if it cannot be run.
+    Raises ValueError if it defines no law, or no law `kind`, if the choice is open, if it cannot be run or has a
+    mistake.
     """
     announce(kind or Path(file).stem, file)
     laws = {law.kind: law for law in _laws_in(text, file)}

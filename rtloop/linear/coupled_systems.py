@@ -27,7 +27,10 @@ class CoupledSystem(NamedTuple):
     d: Real
 
     def response(self, complex_points: npt.ArrayLike) -> Complex:
-        """Return D + C (xI − A)⁻¹ B at complex points (k,), shape (k, m, m)."""
+        """Return D + C (xI − A)⁻¹ B at complex points (k,), shape (k, m, m).
+
+        Raises LinAlgError at an eigenvalue of A.
+        """
         points = np.atleast_1d(np.asarray(complex_points, dtype=complex))
         pencil = points[:, None, None] * np.eye(self.a.shape[0]) - self.a
         states = np.linalg.solve(pencil, np.broadcast_to(self.b, (points.size, *self.b.shape)))

@@ -97,7 +97,10 @@ class DiscreteController:
         return math.inf if np.any(self.poles == 1) else float(self.c @ self.steady_state_gain + self.d)
 
     def response(self, hz: npt.ArrayLike) -> Complex:
-        """Return C(exp(2πj f T)) at frequencies f (k,) in Hz, computed from the running matrices."""
+        """Return C(exp(2πj f T)) at frequencies f (k,) in Hz, computed from the running matrices.
+
+        Raises LinAlgError at an eigenvalue of A, as at 0 Hz with an integrator.
+        """
         return self.system.response(np.exp(2j * np.pi * np.atleast_1d(np.asarray(hz, float)) * self.period_s))
 
 

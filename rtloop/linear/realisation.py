@@ -34,7 +34,7 @@ class System(NamedTuple):
     d: float
 
     def response(self, complex_points: npt.ArrayLike) -> Complex:
-        """Return d + c (xI − A)⁻¹ b at complex points (k,), shape (k,)."""
+        """Return d + c (xI − A)⁻¹ b at complex points (k,), shape (k,). Raises LinAlgError at an eigenvalue of A."""
         return self.d + self.states(complex_points) @ self.c
 
     def states(self, complex_points: npt.ArrayLike) -> Complex:
@@ -202,15 +202,16 @@ def row_bands(a: Real) -> npt.NDArray[np.int64]:
 def imaginary_axis_points(roots: Complex) -> Complex:
     """Return 401 points, from a tenth of the smallest to ten times the largest of `roots` (rad/s), right of s = jω.
 
-    On the axis itself, a point could hit an undamped root. Roots at 0 do not count; without others, the scale is 1
-    rad/s.
+    The points rise in a constant ratio. On the axis itself, a point could hit an undamped root. Roots at 0 do not
+    count; without others, the scale is 1 rad/s.
     """
     sizes = np.abs(roots[roots != 0]) if np.any(roots != 0) else np.ones(1)
     return (0.01 + 1j) * np.geomspace(0.1 * sizes.min(), 10 * sizes.max(), 401)
 
 
 def unit_circle_points() -> Complex:
-    """Return 401 points just outside |z| = 1, up to nine tenths of half the sampling rate: at z = −1, zeros
-    dominate.
+    """Return 401 points just outside |z| = 1, from 1e-6 to 0.9 of half the sampling rate, in a constant ratio.
+
+    At z = −1, zeros dominate.
     """
     return np.exp((0.01 + 1j) * np.pi * np.geomspace(1e-6, 0.9, 401))

@@ -40,7 +40,7 @@ class SampledController:
 
     @cached_property
     def dc_gain(self) -> float:
-        """C(z = 1); +inf if a pole is closer than AT_ONE to 1."""
+        """C(z = 1); +inf, whatever the sign, if a pole is closer than AT_ONE to 1."""
         if np.any(np.abs(self.poles - 1) < AT_ONE):
             return math.inf
         return float(self.system.response(1.0)[0].real)

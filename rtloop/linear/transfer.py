@@ -97,7 +97,7 @@ class Transfer:
         return Transfer(zeros, poles, self.gain * other.gain)
 
     def response(self, s: npt.ArrayLike) -> Complex:
-        """Return G, complex, at points `s` in rad/s, in the shape of `s`."""
+        """Return G, complex, at points `s` in rad/s, in the shape of `s`; not finite at a pole."""
         return factored_response(self.zeros, self.poles, self.gain, s)
 
     @property
@@ -107,7 +107,10 @@ class Transfer:
 
     @property
     def dc_gain(self) -> float:
-        """G(0); +inf with an integrator, 0 with a differentiator; equal numbers of zeros and poles at 0 cancel."""
+        """G(0); +inf with an integrator, whatever the sign, 0 with a differentiator.
+
+        Equal numbers of zeros and poles at 0 cancel.
+        """
         surplus = int(np.sum(self.poles == 0)) - int(np.sum(self.zeros == 0))
         if surplus > 0:
             return math.inf
@@ -162,7 +165,8 @@ def _finite(name: str, values: npt.ArrayLike) -> npt.NDArray[np.float64]:
 def _conjugate_roots(name: str, roots: Complex) -> Complex:
     """Return `roots` as a read-only array of exact conjugate pairs and real roots, sorted by `conjugate_pairs`.
 
-    Raises ValueError, naming `name`, for a root that is not finite and for a complex root without its conjugate.
+    Raises ValueError, naming `name`, for a root that is not finite and for a complex root without its conjugate, with
+    the tolerance of `conjugate_pairs`.
     """
     values = np.atleast_1d(np.asarray(roots, dtype=complex))
     if not np.all(np.isfinite(values)):

@@ -58,7 +58,8 @@ class RecordedSignals:
     def __init__(self, paths: Sequence[Path]) -> None:
         """Open the files of one run, in any order, and read headers, events and totals; signals are read on first use.
 
-        Raises RecordingError if a file is missing or no recording, is given twice, or belongs to another run.
+        Damage is skipped and added to `problems`. Raises RecordingError if a file is missing or no recording, is given
+        twice, or belongs to another run.
         """
         self._signals: dict[str, Real] = {}
         self._start_s, self._end_s = -math.inf, math.inf
@@ -143,7 +144,10 @@ class RecordedSignals:
         return iter(self.columns)
 
     def __len__(self) -> int:
-        """Number of ticks present in the recording, or in the part; the signal `tick` is read on first use."""
+        """Number of ticks present in the recording, or in the part.
+
+        The signal `tick` is read on first use. Raises RecordingError for a file that cannot be read.
+        """
         return len(self["tick"])
 
     def read(self, *names: str) -> list[Real]:
@@ -165,8 +169,9 @@ class RecordedSignals:
     def blocks(self, names: Sequence[str] | None = None, *, ahead: bool = True) -> Generator[Rows]:
         """Yield arrays (n, names) of the ticks, in order, for recordings larger than memory; None reads all columns.
 
-        Nothing is cached. Damaged chunks are skipped and added to `problems`. With `ahead`, threads decompress the next
-        chunks. Raises RecordingError for an unknown name and for a file that cannot be read.
+        A part of a recording yields its own ticks. Nothing is cached. Damaged chunks are skipped and added to
+        `problems`. With `ahead`, threads decompress the next chunks. Raises RecordingError for an unknown name and for
+        a file that cannot be read.
         """
         if self.is_part:
             yield from self.between(self.columns if names is None else names, self._start_s, self._end_s)
@@ -207,7 +212,8 @@ class RecordedSignals:
     def _part(self, times: slice) -> Self:
         """Return the part of this recording between two times, in s since the start, both included; None: no limit.
 
-        Raises RecordingError for a step and for a limit that is no number.
+        In a part of a recording, the times are limited to the part's. Raises RecordingError for a step and for a limit
+        that is no number.
         """
         if times.step is not None:
             raise RecordingError(

@@ -212,7 +212,7 @@ class CanSupervision:
     def _send(self, name: str, *values: float) -> None:
         """Send the CAN frame `name` of the DBC with these values, in the order of its signals.
 
-        A failure is logged, not raised.
+        A value beyond a signal's range is clipped. A failure is logged, not raised.
         """
         try:
             self._bus.send(self._frames[name].message(self._options, values))

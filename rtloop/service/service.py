@@ -182,7 +182,10 @@ class Service:
         return live
 
     def ctl(self, command: str) -> str:
-        """Return the command line of `rtloop ctl` for this service in backticks; `command` is such as "start"."""
+        """Return the command line of `rtloop ctl` for this service in backticks, with --name if the service has one.
+
+        `command` is such as "start".
+        """
         return f"`rtloop ctl {command}`" if self._name is None else f"`rtloop ctl --name {self._name} {command}`"
 
     def arm(self) -> None:
@@ -202,11 +205,12 @@ class Service:
     def set_mode(self, mode: str) -> int:
         """Change the mode bumplessly, and return the tick at which it took effect.
 
-        `mode` is the name of a Mode in lower case, such as "closed_loop". A reference in µm is meaningless in volts: on
-        entry to and exit from mode raw, the present output is held. In a loop that is tripped or stops, mode off
-        changes no output: all are safe, or ramp there. Raises Refusal while tripped or not armed (mode off is allowed
-        then, too), while the actuator is prepared (off is allowed, and the loop is not started then), without a loop,
-        where the driver refuses the writes of a ramp, and as `Desk.submit`. Any accepted mode, and off, end a recovery.
+        `mode` is the name of a Mode in lower case, such as "closed_loop"; else KeyError. A reference in µm is
+        meaningless in volts: on entry to and exit from mode raw, the present output is held. In a loop that is tripped
+        or stops, mode off changes no output: all are safe, or ramp there. Raises Refusal while tripped or not armed
+        (mode off is allowed then, too), while the actuator is prepared (off is allowed, and the loop is not started
+        then), without a loop, where the driver refuses the writes of a ramp, and as `Desk.submit`. Any accepted mode,
+        and off, end a recovery.
         """
         target_mode = Mode[mode.upper()]
         self._require_permission(target_mode)

@@ -107,7 +107,7 @@ def _board_process(config: Path) -> Iterator[None]:
 
 
 def _wait_until_ready(notifications: socket.socket, process: subprocess.Popen[bytes]) -> None:
-    """Wait for the first message of a process. Raises UnavailableError if it ends without one."""
+    """Wait for the first message of a process, as long as it runs. Raises UnavailableError if it ends without one."""
     while process.poll() is None:
         with contextlib.suppress(TimeoutError):
             notifications.recv(64)

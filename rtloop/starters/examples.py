@@ -11,7 +11,7 @@ _REPOSITORY_PATH = re.compile(rf"\bdeploy/({'|'.join(map(re.escape, PAPER_FILES)
 
 
 def read_example(name: str) -> str:
-    """Return the text of an example by its file name, such as board.toml."""
+    """Return the text of an example by its file name, such as board.toml. Raises FileNotFoundError for another name."""
     return files("rtloop").joinpath("examples", name).read_text(encoding="utf-8")
 
 

@@ -41,7 +41,10 @@ def paper() -> Starter:
 
 
 def stage(figures: StageFigures) -> Starter:
-    """Return files and first commands: a simulated stage with its controller, its two excitations, a specification."""
+    """Return files and first commands: a simulated stage with its controller, its two excitations, a specification.
+
+    The ranges of `figures` are checked already: StageFigures raises ValueError.
+    """
     texts = stage_files(figures)
     excitations = [_first_command(texts[name]) for name in ("stage-sine.toml", "stage-step.toml")]
     commands = (
@@ -91,12 +94,12 @@ def write_starter(starter: Starter, folder: Path) -> list[Path]:
 
 
 def _test_commands(name: str) -> tuple[str, str]:
-    """Return the commands that run test_NAME.py with the Python that runs rtloop."""
+    """Return two commands, to be typed in this order: install pytest, then run test_NAME.py with it."""
     return "pip install pytest", f"python -m pytest test_{name}.py"
 
 
 def _first_command(text: str) -> str:
-    """Return the first command in the comments of a configuration."""
+    """Return the first `rtloop` command in the comments of a configuration, which must have one."""
     return next(line.removeprefix("#").strip() for line in text.splitlines() if line.startswith("#   rtloop "))
 
 

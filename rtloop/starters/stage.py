@@ -101,7 +101,11 @@ def _loop_numbers(figures: StageFigures, actuator: Actuator) -> dict[str, float]
 
 
 def _sensor_min_line(sensor_min_v: float | None, noise_v: float) -> str:
-    """Return the interlock at the sensor's lowest reading as a line of TOML, below the noise at rest; "" for none."""
+    """Return the line of TOML with the interlock against a low reading; "" if `sensor_min_v`, the lowest one, is None.
+
+    The interlock lies SENSOR_MARGIN_V above `sensor_min_v`, or lower: always below the noise at rest, about 0 V, whose
+    rms is `noise_v`.
+    """
     if sensor_min_v is None:
         return ""
     interlock_v = min(sensor_min_v + SENSOR_MARGIN_V, -max(SENSOR_MARGIN_V, NOISE_DEVIATIONS * noise_v))
@@ -127,7 +131,7 @@ def _levels_um(actuator: Actuator, position_um: float) -> list[float]:
     """Return the reference's four levels in µm: upper, middle, lower and again the middle one.
 
     They are the middle of the reachable travel, and a quarter of this travel to each side, rounded to about three
-    digits of the travel.
+    digits of the travel. The position interlock, ±`position_um`, limits the reachable travel.
     """
     top_um = min(actuator.rise_um(actuator.highest_v), position_um)
     bottom_um = max(actuator.lowest_um, -position_um)
@@ -150,7 +154,7 @@ def _headline(figures: StageFigures, actuator: Actuator) -> str:
 
 def _rate_hz(figures: StageFigures) -> float:
     """Return the rate of `figures`; None there: the lowest of RATES_HZ with SAMPLES_PER_PERIOD samples in a period of
-    the resonance.
+    the resonance. StageFigures bounds the resonance, so that there is one.
     """
     least_hz = SAMPLES_PER_PERIOD * figures.resonance_hz
     return figures.rate_hz or next(rate_hz for rate_hz in RATES_HZ if rate_hz >= least_hz)

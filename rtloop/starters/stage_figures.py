@@ -72,9 +72,10 @@ class StageFigures:
 
 
 def stage_figures(values: Mapping[str, float]) -> StageFigures:
-    """Return the figures of a stage from options by their names, with `gain_um_per_v` and `sensor_noise_mv` converted.
+    """Return the figures of a stage from options by their names, which are the fields of StageFigures and two more.
 
-    Raises ValueError for a value out of its range, and for two options that set one figure.
+    `gain_um_per_v` is converted to range_um, `sensor_noise_mv` to sensor_noise_um. Raises ValueError for a value out of
+    its range, and for two options that set one figure.
     """
     figures = dict(values)
     for option, replaced in (("gain_um_per_v", "range_um"), ("sensor_noise_mv", "sensor_noise_um")):

@@ -172,7 +172,7 @@ def _open_last_block(path: Path, account: ParkingAccount) -> Iterator[SharedBloc
 def _require_known_arrays(block: SharedBlock) -> None:
     """Raise ValueError or KeyError unless the block has its control words and last drive voltages as this version does.
 
-    The types and the dimensions of both arrays are checked.
+    Checked are the types and numbers of dimensions of both arrays, and that no control word is missing.
     """
     words, drives_v = block["words"], block["last_drive_v"]
     if words.dtype != np.uint64 or words.ndim != 1 or words.size < len(Word):

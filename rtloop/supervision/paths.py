@@ -25,7 +25,7 @@ SYSTEM_FOLDER = Path("/run/rtloop")
 
 def runtime_folder() -> Path:
     """Return RUNTIME_DIRECTORY (set by systemd), else SYSTEM_FOLDER for root, else the user's runtime folder, else a
-    folder of this user in /tmp.
+    folder of this user in /tmp. The folder is not made here.
     """
     directory = os.environ.get("RUNTIME_DIRECTORY", "").split(":")[0]
     if directory:
@@ -47,12 +47,12 @@ def socket_path(configuration: Configuration) -> Path:
 
 
 def block_path(name: str) -> Path:
-    """Return the path of the shared block of the service `name`, for `rtloop park`."""
+    """Return the path of the shared block of the service `name`: NAME.block in the runtime folder."""
     return runtime_folder() / f"{name}.block"
 
 
 def hardware_path(name: str) -> Path:
-    """Return the path of the hardware note of the service `name`."""
+    """Return the path of the hardware note of the service `name`: NAME.hardware in the runtime folder."""
     return runtime_folder() / f"{name}.hardware"
 
 

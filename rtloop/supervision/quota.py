@@ -162,10 +162,9 @@ class Quota:
         return sorted(files)
 
     def _read_new_files(self, entries: list[FileEntry], budget_s: float) -> None:
-        """Read and store the contents of finished files in `entries` that are new, oldest first; begin none after
-        `budget_s`.
+        """Read and store the contents of finished files in `entries` that are new, oldest first.
 
-        Files that are no longer in `entries` are forgotten.
+        Begins no file later than `budget_s` after the call. Files that are no longer in `entries` are forgotten.
         """
         until_s = time.monotonic() + budget_s
         self._contents = {entry: self._contents[entry] for entry in entries if entry in self._contents}
@@ -203,6 +202,6 @@ class Quota:
 
 
 def _overlaps_trip(file: FileContents, stored: Iterable[FileContents]) -> bool:
-    """Whether the file has ticks around a trip of its run; `stored` are the contents of all files."""
+    """Whether the file has ticks in one of the ranges `trips` of its run; `stored` are the contents of all files."""
     trips = [trip for candidate in stored if candidate.run == file.run for trip in candidate.trips]
     return any(first < file.end and last >= file.first for first, last in trips)

@@ -76,12 +76,12 @@ class RecorderKeeper:
 
     @property
     def written_state(self) -> dict[str, Any]:
-        """{file: path of the run's recording, written_ticks: number of ticks that are in its files, or lost}."""
+        """{file: path of the run's recording, written_ticks: number of ticks in its files plus lost ones before}."""
         return {"file": str(self._path.resolve()), "written_ticks": self._block.load(Word.FLUSHED_TICKS)}
 
     @property
     def exit_code(self) -> int | None:
-        """Exit code of the current recorder's process; None while it runs."""
+        """Exit code of the current recorder's process, −N after signal N; None while it runs."""
         return self._child.exit_code
 
     def start(self, header: dict[str, Any]) -> None:
@@ -107,7 +107,7 @@ class RecorderKeeper:
         """Run the recorder from start to finish, in the keeper's thread.
 
         Sets `recording` once the file is open, `failure` to an RtloopError that ends the thread, and `totals` at the
-        end in any case: after a failure a report that is not complete, with the reason.
+        end in any case: after a failure a report that is not complete, with the reason. Other exceptions pass through.
         """
         try:
             self._start_recording()
@@ -131,9 +131,10 @@ class RecorderKeeper:
             self._send_removals()
 
     def _enforce_quota(self, quota: Quota, *budget_s: float) -> list[Removal]:
-        """Enforce the quota; its messages, and a new failure once, are added to `removals`. Returns the removed files.
+        """Enforce the quota, and return the removed files, which are not sent to the recorder here.
 
-        `budget_s` as in `Quota.enforce`.
+        Appends a message for each file, and for a new failure, to the attribute `removals`. `budget_s` as in
+        `Quota.enforce`.
         """
         previous_failure = quota.failure
         new_removals = quota.enforce(*budget_s)
@@ -151,7 +152,10 @@ class RecorderKeeper:
             self._unsent_removals.clear()
 
     def _start_recording(self) -> None:
-        """Send the recorder its orders and wait until the file is open. Raises OutputError if that fails."""
+        """Send the recorder its orders and wait, without a time limit, until the file is open.
+
+        Raises OutputError, with the recorder's reason, if the recorder fails or ends before.
+        """
         self._send_orders()
         while self.state == ProcessState.READY and self.exit_code is None:
             time.sleep(0.002)
@@ -164,7 +168,8 @@ class RecorderKeeper:
     def _replace_if_dead(self) -> None:
         """Replace a dead or stalled recorder, up to MAX_REPLACEMENTS times; send a new one its orders once it is ready.
 
-        A recorder whose process exits after the loop's end is finished, and is not replaced.
+        After these, a dead recorder stays dead. A recorder whose process exits after the loop's end is finished, and
+        is not replaced.
         """
         if not self._has_orders:
             if self.state == ProcessState.READY:
@@ -211,7 +216,10 @@ class RecorderKeeper:
         return totals
 
     def _repair(self, part: Path) -> None:
-        """Recover the unfinished file `part` and remove it; results and failures are added to `notes`."""
+        """Recover the unfinished file `part` and remove it. Adds the result or the failure to `notes`; raises neither.
+
+        A file that cannot be recovered stays.
+        """
         try:
             report = recover(part, opener=open_without_link)
         except RtloopError as error:

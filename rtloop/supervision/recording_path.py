@@ -17,10 +17,10 @@ def recordings_folder(configuration: Configuration) -> Path:
 
 
 def new_recording_path(prepared: Prepared, chosen_folder: Path | None) -> Path:
-    """Return an unused path NAME-TIME.mcap or NAME-TIME-N.mcap in a folder, which is created.
+    """Create the folder for recordings, and return an unused path NAME-TIME.mcap or NAME-TIME-N.mcap in it.
 
-    The folder is `chosen_folder`, None for the configured one. Raises OutputError if it cannot be created or no N is
-    free.
+    No file is created. The folder is `chosen_folder`, None for the configured one. Raises OutputError if the folder
+    cannot be created or no N from 2 to 999 is free.
     """
     folder = chosen_folder or recordings_folder(prepared.configuration)
     with output_errors(f"{folder}: cannot create the folder for recordings"):

@@ -223,7 +223,7 @@ class Supervisor:
             self.startup_s = process_age_s()
 
     def poll(self) -> RunResult | None:
-        """Let the heartbeat go on, and watch the loop: kill it if it stands still, park its outputs if it died.
+        """Let the heartbeat go on for WATCH_TIMEOUT_S; kill the loop if it stands still, park its outputs if it died.
 
         Returns the result once loop and recorder have ended, None before. May take seconds when it kills the loop or
         parks its outputs, which ramp.
@@ -237,7 +237,10 @@ class Supervisor:
         return self._result(self.recorder.totals)
 
     def close(self) -> None:
-        """Stop the loop and wait for its end up to END_TIMEOUT_S; then end the heartbeat and kill both processes."""
+        """Tell the loop to ramp down and wait for its end up to END_TIMEOUT_S; then kill both processes.
+
+        The heartbeat ends. Outputs of a loop that is killed here are not parked.
+        """
         self.stop()
         deadline = time.monotonic() + END_TIMEOUT_S
         while self._loop.exit_code is None and time.monotonic() < deadline:
@@ -332,8 +335,8 @@ class Supervisor:
     def _result(self, totals: dict[str, Any]) -> RunResult:
         """Return the result of the run from the loop's reports and the recorder's `totals`.
 
-        The exit code is that of the loop's process, LoopFault's for an incomplete recording and for any other outcome
-        than done and stopped.
+        The exit code is that of the loop's process if it is above 0. Else it is LoopFault's for an incomplete recording
+        and for any other outcome than done and stopped, and 0 for the rest.
         """
         self._loop.wait(1.0)
         self._collect_reports()

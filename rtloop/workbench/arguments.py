@@ -108,7 +108,10 @@ def require_count(value: Any, argument: str, least: int, largest: int | None = N
 
 
 def require_numbers(value: Any, argument: str) -> list[float]:
-    """Return finite numbers as a list of floats; [] for none. Raises RtloopError, naming `argument`, for others."""
+    """Return a sequence of finite numbers as a list of floats, an empty one as [].
+
+    Raises RtloopError, naming `argument`, for any other value, None and a single number too.
+    """
     try:
         numbers = [math.nan] if isinstance(value, str | bytes) else [float(number) for number in value]
     except (TypeError, ValueError):

@@ -51,7 +51,11 @@ class AxisJudgement:
 
     @property
     def meets_specification(self) -> bool | None:
-        """Whether the loop meets the axis's specification; None without a specification or a loop."""
+        """Whether the loop meets the axis's specification; None without a specification or a loop.
+
+        It must do so on the simulated rig and within this host's delay margin too: False with an empty `missed` is
+        possible.
+        """
         return None if self.verification is None else self.verification.meets_specification
 
     @property

@@ -44,8 +44,8 @@ class CheckResult(Result):
     def as_dict(self) -> dict[str, Any]:
         """Return the object of `rtloop check --json`.
 
-        Keys: name, rate_hz, mode, driver, recordings (the folder), columns, warnings and axes (`AxisJudgement.as_dict`
-        of each).
+        Keys: name, rate_hz, mode, driver, recordings (the folder), columns, warnings and axes (a list with
+        `AxisJudgement.as_dict` of each).
         """
         plan = self.prepared.plan
         return to_jsonable(
@@ -111,7 +111,10 @@ def check(configuration: FileName | Configuration, *, strict: bool = False) -> C
 
 
 def _second_opinion_faults(prepared: Prepared) -> list[str]:
-    """Return a sentence for each quantity of a loop for which python-control computes another value, else []."""
+    """Return a sentence for each pole, margin or step of a loop for which python-control computes another value.
+
+    [] if all agree within the tolerances of `second_opinion`. python-control is a required package.
+    """
     from rtloop.configuration.second_opinion import faults_on_models  # more than a second of import
 
     return faults_on_models(prepared)
@@ -130,7 +133,10 @@ def _loops(check: AxisCheck) -> dict[str, Loop]:
 
 
 def _verdict(judgement: AxisJudgement) -> str:
-    """Return the verdict on an axis in a few words; "UNSTABLE" on the model or on the simulated rig comes first."""
+    """Return the verdict on an axis in a few words: "without a known loop", "UNSTABLE", or that of its specification.
+
+    The loop is UNSTABLE if it is so on the model or on the simulated rig. Without a specification it is "stable".
+    """
     if judgement.running is None:
         return "without a known loop"
     if not judgement.running.stable or judgement.is_stable_on_rig is False:

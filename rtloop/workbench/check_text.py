@@ -110,7 +110,10 @@ def _print_law(out: Console, check: AxisCheck) -> None:
 
 
 def _print_analyses(out: Console, judgement: AxisJudgement) -> None:
-    """Print the figures of an axis's loop, with C(s) and as it runs; of a shared controller also those of all axes."""
+    """Print the figures of an axis's loop, with C(s) and as it runs.
+
+    For the first axis of a shared controller, the margins of all its axes together follow.
+    """
     from rtloop.design.verification.text import format_range, simultaneous_rows
 
     check, shifts = judgement.check, judgement.shifts

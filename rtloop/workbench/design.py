@@ -49,7 +49,7 @@ class DesignResult(Result):
 
     @property
     def controller(self) -> Transfer:
-        """C(s) as zeros, poles (1/s) and gain."""
+        """C(s) of reduced order as zeros, poles (1/s) and gain."""
         return self.synthesis.controller
 
     @property
@@ -113,7 +113,7 @@ class DesignResult(Result):
         return lines
 
     def to_control(self) -> control.StateSpace | control.FrequencyResponseData:
-        """Return C(s) as a continuous state space of python-control."""
+        """Return C(s) as a continuous StateSpace of python-control, a required package."""
         from rtloop.design.interchange import to_control
 
         return to_control(self.controller)

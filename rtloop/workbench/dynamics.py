@@ -76,7 +76,7 @@ class DynamicsResult(IdentifiedModel):
     def section(self) -> str:
         """The dynamics as [axis.model]; before it, with an `actuator`, [axis.feedforward] times the static gain.
 
-        For the input "drive" [axis.feedforward] is the static gain alone.
+        For the input "drive" [axis.feedforward] is the static gain alone, left out if the gain is not above 0.
 
         Raises UnsuitableData for hysteresis without an inverse.
         """
@@ -90,7 +90,7 @@ class DynamicsResult(IdentifiedModel):
         return f"order {self.order}: {modes}; delay {delay}, fit {self.fit.fit_percent:.2f} %"
 
     def to_control(self) -> control.StateSpace | control.FrequencyResponseData:
-        """Return D(s), without its delay, as a continuous state space of python-control."""
+        """Return D(s), without its delay, as a continuous StateSpace of python-control, a required package."""
         from rtloop.design.interchange import to_control
 
         return to_control(self.model)
@@ -145,11 +145,11 @@ def fit_dynamics(
     """Identify D(s) from the first recording, and validate it with the others.
 
     `input` of D is the drive through the model of the hysteresis, the command, or the drive. `hysteresis` is a file
-    with the actuator's model (None: the recorded configuration). `order`, `delay` (samples) None: searched, the
-    order up to `largest_order` by `criterion` (None: "held-out"). `loop` says whether the loop was closed
+    with the actuator's model (None: the recorded configuration). `order`, `delay` (as `delay_ticks`) None: searched,
+    the order up to `largest_order` by `criterion` (None: "held-out"). `loop` says whether the loop was closed
     ("auto": by the recorded mode), `outside` which signals moved the closed loop. `compare` is a recording for a
-    measured frequency response. `warn` receives warnings before the fit. Raises RtloopError, ConfigError where no model
-    can be fitted.
+    measured frequency response. `warn` receives lists of warnings before the fit. Raises RtloopError for recordings
+    that cannot be used, ConfigError where no model can be fitted.
     """
     collect = WarningCollector(warn)
     runs = read_distinct_runs(paths, axis, collect)
@@ -176,8 +176,8 @@ def fit_dynamics(
 def _section_text(fit: DynamicsFit, run: AxisRecording, input_kind: Input, actuator: PlayModel | None) -> str:
     """Return [axis.model] as TOML; before it, where the input is not the command, [axis.feedforward].
 
-    [axis.feedforward] is `actuator` scaled by the static gain, or, for the input "drive", the static gain without
-    hysteresis; for a gain that is not above 0 it is left out. Raises UnsuitableData for hysteresis without an inverse.
+    [axis.feedforward] is `actuator` scaled by the static gain; for the input "drive", the static gain without
+    hysteresis, left out if it is not above 0. Raises UnsuitableData for scaled hysteresis without an inverse.
     """
     content = model_section(fit, dynamics_provenance(fit, run, input_kind))
     comments = [f"Hysteresis with the static gain {fit.static_gain:.6g} of the dynamics below included"]

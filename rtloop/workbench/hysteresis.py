@@ -81,7 +81,7 @@ class HysteresisResult(IdentifiedModel):
 
     @property
     def headline(self) -> str:
-        """Number of plays, held-out error and range."""
+        """Number of plays, held-out error (µm rms) and range of the position (µm)."""
         count = count_text(self.model.thresholds.size, "play")
         return f"{count}, held out {self.error_um:.3g} µm rms of {self.fit.range_um:.4g} µm"
 
@@ -134,11 +134,11 @@ def fit_hysteresis(
 ) -> HysteresisResult:
     """Identify `operators` plays from recordings.
 
-    `placement` is the rule for their thresholds, which `thresholds` (V) replace; `weights` "invertible" make a model
-    with an inverse, "free" perhaps one without. `memory` says whether the actuator has none at the start of
-    each recording ("rest"), an unknown one ("unknown"), or whether this is found from the drive ("auto"). `validate`
-    are recordings that judge the model, and are not fitted. Raises RtloopError, ConfigError where no model can be
-    fitted.
+    `placement` is the rule for their thresholds; `thresholds` (V) replace number and placement. `weights` "invertible"
+    make a model with an inverse, "free" perhaps one without. `memory` says whether the actuator has none at the start
+    of each recording ("rest"), an unknown one ("unknown"), or whether this is found from the drive ("auto"). `validate`
+    are recordings that judge the model, and are not fitted. `warn` receives lists of warnings before the fit. Raises
+    RtloopError for recordings that cannot be used, ConfigError where no model can be fitted.
     """
     collect = WarningCollector(warn)
     runs = read_distinct_runs(paths, axis, collect)
@@ -164,8 +164,8 @@ def read_distinct_runs(
 ) -> list[AxisRecording]:
     """Read recordings and return those that are no copies of one another or of `other_runs`.
 
-    `warn` is called once, with a sentence for each copy that is left out. Raises RtloopError for a recording that
-    cannot be read or lacks the axis (None: the only one).
+    `warn` is called once, with a list: a sentence for each copy that is left out, [] without copies. Raises RtloopError
+    for a recording that cannot be read or lacks the axis (None: the only one).
     """
     runs, warnings = distinct([read_axis_recording(path, axis) for path in paths], other_runs)
     warn(warnings)

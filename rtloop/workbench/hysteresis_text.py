@@ -77,13 +77,13 @@ def _print_held_out(out: Console, report: dict[str, Any]) -> None:
 
 
 def _rms_text(error: dict[str, Any]) -> str:
-    """Return `rms_um`, and `std_um` unless it is None, as text without a unit: `0.12 ± 0.03`."""
+    """Return `rms_um`, and `std_um` unless it is None, as text without a unit: `0.12 ± 0.03 (1σ)`."""
     std_um = error["std_um"]
     return f"{error['rms_um']:.3g}" + ("" if std_um is None else f" ± {std_um:.2g} (1σ)")
 
 
 def print_files(out: Console, report: dict[str, Any]) -> None:
-    """Print the paths of the files that a report names as written: its `output` and `plot`."""
+    """Print the paths of the files that a report names as written, `output` and `plot`; no line for None or no key."""
     for key in ("output", "plot"):
         if report.get(key):
             out.print(report[key], markup=False)

@@ -64,11 +64,13 @@ def identify(
 def identify(recordings: Any, kind: str = "hysteresis", **options: Any) -> HysteresisResult | DynamicsResult:
     """Identify the actuator's hysteresis, or the dynamics of an axis (`kind` "dynamics"), from recordings.
 
+    Hysteresis is fitted to all recordings; dynamics are fitted to the first and validated with the others. No file is
+    written.
     `options` have the names of the options of `rtloop identify hysteresis` and `rtloop identify dynamics`, with `_` for
     `-`: operators, placement, thresholds (V), weights, memory, validate; and hysteresis, input, order, largest_order,
     delay (samples), criterion, loop, outside, compare; axis for both. Raises UnsuitableData for recordings that tell
     too little, RecordingError for files that cannot be read, ConfigError where no model can be fitted, RtloopError for
-    an option that is not allowed.
+    a kind or an option that is not allowed.
     """
     require_choice(kind, "identify: kind", ("hysteresis", "dynamics"))
     fit = fit_hysteresis if kind == "hysteresis" else fit_dynamics
@@ -80,7 +82,10 @@ def identify(recordings: Any, kind: str = "hysteresis", **options: Any) -> Hyste
 
 
 def _checked_option(name: str, value: Any) -> Any:
-    """Return the value of an option, with recordings and files as paths. Raises RtloopError where it is not allowed."""
+    """Return the value of option `name`, with recordings and files as paths.
+
+    Raises RtloopError for a value that is not allowed. The name, and the value of `axis`, are not checked.
+    """
     where = f"identify: {name}"
     if name in CHOICES:
         require_choice(value, where, get_args(CHOICES[name]))

@@ -13,10 +13,10 @@ from rtloop.design.identification.hysteresis.judgement import Judgement
 def judgement_row(judgement: Judgement, fitted: bool) -> dict[str, Any]:
     """Return the report's row on the model's held-out error in one recording, which is `fitted` or validates only.
 
-    Keys: recording (name), fitted, rms_error_um, as_written_rms_um (of the plays alone), max_error_um and
-    max_error_percent (of range_um), offset_um, drift_um, memory ("rest" or "unknown"), known_from_s (time from which
-    the memory of the hysteresis is known, None: never), unsettled, unsettled_um, judged_percent (part with known
-    memory), early_max_error_percent (of the other part). Errors are NaN where their part is empty.
+    Keys: recording (name), fitted, rms_error_um, as_written_rms_um (of the plays alone), max_error_um, range_um (of the
+    position), max_error_percent (of this range), offset_um, drift_um, memory ("rest" or "unknown"), known_from_s (time
+    from which the memory of the hysteresis is known, None: never), unsettled, unsettled_um, judged_percent (part with
+    known memory), early_max_error_percent (of the other part). Errors are NaN where their part is empty.
     """
     return {
         "recording": judgement.name,

@@ -74,10 +74,10 @@ def replay(
 
     With `config`, run the law of this configuration on the recorded inputs, from rest; return a LawComparison. With
     `resimulate`, run the recorded reference in closed loop with the simulated rig of `config`, or the recorded one;
-    return a Resimulation. `law` are files with
-    recorded laws that are not installed; `trust_recorded_law` runs the recorded text of laws. `jobs` processes replay
-    at once, as forks of this process; `progress` receives the number of ticks so far. Raises RecordingError for a
-    recording that cannot be replayed, ConfigError for a configuration that does not fit, InputFileError.
+    return a Resimulation. `law` are files with recorded laws that are not installed; `trust_recorded_law` runs the
+    recorded text of laws. `jobs` processes replay at once, as forks of this process; the other two results use one.
+    `progress` receives the number of ticks so far. Raises RecordingError for a recording that cannot be replayed,
+    ConfigError for a configuration that does not fit, InputFileError for a file that cannot be read.
 
     >>> result = rtloop.replay("run.mcap")
     >>> result.identical, result.ticks, result.first_difference

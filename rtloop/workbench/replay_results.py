@@ -35,7 +35,10 @@ class ReplayResult(Result):
 
     @property
     def identical(self) -> bool:
-        """Whether every recorded tick was executed and compared, in order, once, and none differed."""
+        """Whether every recorded tick, at least one, was executed and compared, in order, once, and none differed.
+
+        Ticks that the recording itself declares as lost do not count; other missing ticks make it False.
+        """
         return self.report.identical
 
     @property
@@ -54,17 +57,20 @@ class ReplayResult(Result):
 
     @property
     def gaps(self) -> list[dict[str, int]]:
-        """Ticks that never reached the recorder: first_tick and count of each gap."""
+        """Ticks that are in no file: first_tick and count of each gap.
+
+        A gap that the recording does not declare as lost is in `not_verified` too.
+        """
         return self.report.gaps
 
     @property
     def not_verified(self) -> list[dict[str, Any]]:
-        """Recorded ticks that were not compared: first_tick, count and why; None for an unknown number."""
+        """Ticks that were not compared: [{first_tick, count, why}, …]; first_tick and count are None where unknown."""
         return self.report.not_verified
 
     @property
     def not_judged(self) -> list[str]:
-        """Contents of the recording that no replay can judge."""
+        """Contents of the recording that no replay can judge, each described in words."""
         return self.report.not_judged
 
     @property
@@ -154,8 +160,8 @@ class Resimulation(Result):
     @property
     def axes(self) -> dict[str, dict[str, Any]]:
         """Tracking figures by the axis's name: {name, recorded, resimulated}, the last two {rms_error_um,
-        max_abs_error_um, max_abs_drive_v, steps}; the errors are None if the loop was never closed, `steps` without
-        one.
+        max_abs_error_um, max_abs_drive_v, steps}. The errors are None if the loop was never closed; `steps` is
+        `StepMetrics.as_dict`, None without a step.
         """
         return {axis["name"]: axis for axis in self.report["axes"]}
 

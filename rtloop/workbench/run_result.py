@@ -44,12 +44,15 @@ class RunResult(Result):
 
     @property
     def outcome(self) -> str:
-        """Outcome: done, stopped, driver_failed, heartbeat_lost, law_failed, failed or killed."""
+        """Outcome: done, stopped, driver_failed, heartbeat_lost, law_failed, failed or killed.
+
+        A run that tripped and went on with parked outputs is done or stopped: see `trips`.
+        """
         return "stopped" if self.supervised is None else self.supervised.outcome
 
     @property
     def exit_code(self) -> int:
-        """Exit code of the command for this run: 0 for a good run, else the code of the failure.
+        """Exit code of the command for this run: 0 for a good run, done or stopped, else the code of the failure.
 
         It is LoopFault's, 1, after a trip and for an incomplete recording.
         """
@@ -58,7 +61,7 @@ class RunResult(Result):
 
     @property
     def error(self) -> str | None:
-        """Cause of a failed run in words; None for a good one."""
+        """Cause of a failed run or recording in words; None for a good one, also after a trip alone: see `trips`."""
         return None if self.supervised is None else self.supervised.error
 
     @property
@@ -73,7 +76,7 @@ class RunResult(Result):
 
     @cached_property
     def recording(self) -> Recording | None:
-        """The recording, opened as by `rtloop.load`; None if nothing was recorded."""
+        """The recording, opened as by `rtloop.load`, with its errors; None if nothing was recorded."""
         return load(self.recordings) if self.recordings else None
 
     @property

@@ -70,5 +70,5 @@ def _print_steps(out: Console, configuration: Configuration, steps: Mapping[str,
 
 
 def _red(text: str) -> str:
-    """Return text in red."""
+    """Return rich's markup for text in red, with the brackets in `text` escaped."""
     return f"[red]{escape(text)}[/]"

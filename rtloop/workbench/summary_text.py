@@ -123,7 +123,7 @@ def _print_timing(out: Console, summary: Summary) -> None:
 def histogram_table(histogram: list[dict[str, Any]], heading: str) -> Table:
     """Return a table of counts and percentages from the first to the last class with a count; a full bar is 100 %.
 
-    `histogram` are classes [{below_us, count}, …], ascending; the last one has no upper end.
+    `histogram` are classes [{below_us, count}, …], ascending; the last one, below_us None, has no upper end.
     """
     import numpy as np
 

@@ -68,12 +68,12 @@ def escape(text: object) -> str:
 
 
 def format_figure(value: float, digits: int, unit: str = "") -> str:
-    """Return a number with `digits` decimals and its unit as text; "–" where it is infinite or NaN."""
+    """Return a number with `digits` decimals and its unit as text; "–" without a unit where it is infinite or NaN."""
     return f"{value:.{digits}f}{unit}" if math.isfinite(value) else "–"
 
 
 def format_number(value: float | None, form: str = ".4g") -> str:
-    """Return a number in the format `form` as text; "–" for None."""
+    """Return a number in the format `form` as text; "–" for None, "nan" for NaN."""
     return "–" if value is None else f"{value:{form}}"
 
 

@@ -10,7 +10,10 @@ from rtloop.errors import output_errors
 
 
 def write_output(path: Path, content: bytes) -> None:
-    """Write a file, and make its folder; an existing file is replaced. Raises OutputError if the system refuses."""
+    """Write a file, and make its folder; an existing file is emptied first, so a failed write leaves a part.
+
+    Raises OutputError if the system refuses.
+    """
     from rtloop.foundation.trusted import overwrite_file
 
     with output_errors(path):
@@ -37,7 +40,7 @@ def path_from(file: Path, target: Path) -> str:
 
 
 def write_outputs(folder: Path, contents: Mapping[str, bytes]) -> list[Path]:
-    """Write a report's files to `folder`, by name, also over existing ones. Returns their paths.
+    """Write a report's files to `folder`, which is made, by name, also over existing ones. Returns their paths.
 
     Raises OutputError if the system refuses one; the files before it are written then.
     """

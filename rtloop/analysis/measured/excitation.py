@@ -37,7 +37,8 @@ def first_period(grid: LineGrid, amplitude_um: float) -> Real:
 def shape_period(
     grid: LineGrid, previous_period: Real, signals: PeriodSignals, amplitude_um: float, aim: float
 ) -> Real:
-    """Return a period (samples,) of the reference, µm, for a motion of `aim` times `amplitude_um`.
+    """Return a period (samples,) of the reference, µm, for a motion of `aim` times `amplitude_um`, within the limits of
+    `fit_period`.
 
     Its lines are shaped by the loop's response to `previous_period` (samples,) of the reference, of which `signals` are
     the recorded periods.

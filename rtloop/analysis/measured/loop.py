@@ -55,7 +55,10 @@ class MeasuredLoop:
         return self.lifted / _pole_distance(self.hz, self.rate_hz, self.image)
 
     def open(self, hz: npt.ArrayLike) -> Complex:
-        """Return the open loop L at frequencies (k,) in Hz, by a cubic spline over the logarithm of the frequency."""
+        """Return the open loop L at frequencies (k,) in Hz, by a cubic spline over the logarithm of the frequency.
+
+        Beyond the measured lines, the spline is extrapolated.
+        """
         at = np.atleast_1d(np.asarray(hz, dtype=float))
         return np.asarray(self._spline(np.log(at)), dtype=complex) / _pole_distance(at, self.rate_hz, self.image)
 

@@ -43,7 +43,7 @@ class LoopMeasurement:
     gain: StaticGain | None = None
 
     def figures(self) -> dict[str, Any]:
-        """Return values for status and metrics, without curves, null for NaN.
+        """Return values for status and metrics, without curves, null for numbers that are not finite.
 
         Keys: periods, lines (their number), from_hz, to_hz, moved_um, margins ({name: {value, std}}), resonance (the
         fields of LightMode), gain (those of StaticGain), model ({margins: {name: value}, gain_ratio}). The last three
@@ -104,11 +104,11 @@ def measure_loop(
 ) -> LoopMeasurement:
     """Identify loop, margins and lightly damped mode from recorded signals, each (ticks,); `gain` stays None.
 
-    `signals` has `reference_um`, `error_um`, `command_um` and `position_um`. The command includes, past the controller,
-    `feed_um` if given, and the reference filtered by `command_taps`. With `periods_missed`, periods with a missed tick
-    are left out. The lightly damped mode is searched near `near_hz`, or else where the plant answers most; `model` is
-    only stored. Raises ValueError for a reference without a multisine or without silent lines, for fewer than two
-    complete periods, and for a loop that does not answer.
+    `signals` has `reference_um`, `error_um`, `command_um` and `position_um`. Parts of the command that come from past
+    the controller, `feed_um` if given and the reference filtered by `command_taps`, are subtracted to find C. With
+    `periods_missed`, periods with a missed tick are left out. The lightly damped mode is searched near `near_hz`, or
+    else where the plant answers most; `model` is only stored. Raises ValueError for a reference without a multisine or
+    without silent lines, for fewer than two complete periods, and for a loop that does not answer.
     """
     reference = signals["reference_um"]
     part = find_periodic_part(reference)

@@ -61,9 +61,7 @@ class LightMode:
 def fit_light_mode(measured: MeasuredResponse, rate_hz: float, near_hz: float, band: float = BAND) -> LightMode | None:
     """Return the lightly damped mode, with standard deviations, within `band` (a fraction) of `near_hz`.
 
-    None where none stands out.
-
-    Raises ValueError for fewer than MIN_LINES lines in it.
+    None where none stands out. Raises ValueError for fewer than MIN_LINES lines within the band.
     """
     from scipy.optimize import least_squares  # a quarter of a second of import, when a service starts
 
@@ -126,7 +124,9 @@ class _ModeFit:
         return self._residuals(self._smooth)
 
     def _residuals(self, rows: Complex) -> Complex:
-        """Return residuals (k,), in standard deviations, of the plant's least-squares fit by `rows` (k, parameters)."""
+        """Return residuals (k,), plant minus fit in standard deviations, of the least-squares fit by `rows` (k,
+        parameters) with complex parameters.
+        """
         solution, *_ = np.linalg.lstsq(rows, self._scaled, rcond=None)
         return self._scaled - rows @ solution
 

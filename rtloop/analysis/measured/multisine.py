@@ -41,7 +41,7 @@ class LineGrid:
 
     @property
     def hz(self) -> Real:
-        """Frequencies in Hz of the excited lines, (excited,)."""
+        """Frequencies in Hz of the excited lines, (excited,), rising."""
         return self.excited * self.rate_hz / self.samples
 
     def waveform(self, amplitudes: Complex) -> Real:
@@ -119,7 +119,7 @@ def low_crest_amplitudes(grid: LineGrid, sizes: Real, seed: int = 0) -> Complex:
 
 
 def excitation_sequence(period: Real, periods: int, hold: float, fade_ticks: int) -> Real:
-    """Return a reference (ticks,) about `hold`: a settling period that begins gently, `periods` periods, and a fade
+    """Return a reference (ticks,): `hold` plus a settling `period` that begins gently, `periods` whole ones, and a fade
     back to `hold` in `fade_ticks`.
 
     The last sample is `hold`, where the reference stays after the sequence.

@@ -59,8 +59,8 @@ class MeasuredResponse:
 
 
 def measure_response(grid: LineGrid, signals: PeriodSignals) -> MeasuredResponse:
-    """Return the response from at least two periods. Raises ValueError for fewer, and if command, error or position has
-    no component at one of the excited lines.
+    """Return the response from at least two periods. Raises ValueError for fewer, and if the mean of command, error or
+    position is exactly 0 at one of the excited lines.
     """
     periods = len(signals.position)
     if periods < 2:

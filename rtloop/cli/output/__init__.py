@@ -12,7 +12,7 @@ from rtloop.values import to_jsonable
 
 
 def echo_json(content: Any, indent: int | None = None) -> None:
-    """Print JSON on standard output, with null for NaN and infinity, which strict readers refuse."""
+    """Print JSON on standard output, in one line without `indent`; null stands for NaN and infinity."""
     click.echo(json.dumps(to_jsonable(content), indent=indent, allow_nan=False))
 
 
@@ -25,6 +25,6 @@ def print_result(result: dict[str, Any], as_json: bool, print_text: Callable[[di
 
 
 def print_warnings(warnings: Iterable[object]) -> None:
-    """Print warnings on stderr, one a line."""
+    """Print warnings on stderr, each as a line "warning: TEXT"."""
     for warning in warnings:
         click.echo(f"warning: {warning}", err=True)

@@ -25,7 +25,7 @@ class StatusLine:
             self._status.stop()
 
     def update(self, text: str) -> None:
-        """Change the text of the line."""
+        """Change the text of the line; no effect without a terminal."""
         if self._status:
             self._status.update(text)
 
@@ -39,5 +39,5 @@ class Counter(StatusLine):
         self._label = label
 
     def show(self, count: int) -> None:
-        """Show `count` with the label."""
+        """Show `count` before the label; no effect without a terminal."""
         self.update(f"{count:,} {self._label}")

@@ -46,7 +46,7 @@ class Condition(Protocol):
     def is_exact(self, index: int, gap: bool) -> bool:
         """Return whether the change at `index` of a batch happened at that very tick.
 
-        False if it may have happened in ticks that were lost before the batch (`gap`).
+        False only for index 0 with `gap`: the change may have happened in the ticks that were lost before the batch.
         """
         return not (gap and index == 0)
 
@@ -57,6 +57,7 @@ class Crossing:
     """
 
     def __init__(self) -> None:
+        """Begin as after a sample that was neither "ready" nor "fired"."""
         self._ready = False
 
     def find(self, is_ready: Mask, is_fired: Mask, gap: bool) -> Indices:
@@ -77,12 +78,13 @@ class Crossing:
 
 
 class Edge(Condition):
-    """Trigger when the source reaches `level`, after it was more than `hysteresis` away on the other side.
+    """Trigger when the source reaches `level`, after it was more than `hysteresis` (≥ 0) away on the other side.
 
     Raises ValueError for an unknown slope, a level that is not finite and a hysteresis below 0.
     """
 
     def __init__(self, source: str, level: float, slope: Slope | str = Slope.RISING, hysteresis: float = 0.0) -> None:
+        """Watch `source`; `level` and `hysteresis` are in its unit. Raises ValueError as the class states."""
         if slope not in [*Slope]:
             raise ValueError(f"trigger slope: {slope!r}; allowed: {', '.join(Slope)}")
         _require_finite("trigger level", level)
@@ -111,6 +113,7 @@ class Window(Condition):
     """
 
     def __init__(self, source: str, low: float, high: float) -> None:
+        """Watch `source`; `low` and `high` are in its unit. Raises ValueError as the class states."""
         _require_finite("trigger window", low)
         _require_finite("trigger window", high)
         if not low < high:
@@ -119,7 +122,7 @@ class Window(Condition):
         self._exit_crossing = Crossing()
 
     def find(self, values: Real, gap: bool) -> Indices:
-        """Return the index in `values` (n,) of the first tick outside the band, for each exit.
+        """Return the indices, ascending, in `values` (n,) of the first tick outside the band after a tick inside.
 
         `gap`: ticks before `values` were lost.
         """
@@ -163,7 +166,7 @@ class ModeChanged(ChangeCondition):
     source = COMMON_SIGNALS[MODE].name
 
     def find(self, values: Real, gap: bool) -> Indices:
-        """Return the indices in `values` of the first tick in each new mode; `gap` is not used."""
+        """Return the indices in `values` of the first tick in each new mode; `gap` is not used, as in `Tripped`."""
         return np.flatnonzero(values != self._previous_values(values))
 
 
@@ -188,6 +191,7 @@ class Stepped(ChangeCondition):
     """
 
     def __init__(self, source: str, threshold: float = 0.0) -> None:
+        """Watch `source`; `threshold` is in its unit, 0 for any change. Raises ValueError as the class states."""
         _require_not_negative("trigger threshold", threshold)
         self.source, self._threshold = source, threshold
 

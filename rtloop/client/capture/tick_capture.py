@@ -69,10 +69,10 @@ def current_run(client: Client) -> RecordedRun:
 def capture_ticks(client: Client, file: Path, first: int, end: int, folder: Path | None = None) -> dict[str, Any]:
     """Wait until ticks `first` … `end` − 1 of the run with the recording `file` are written, and cut them out.
 
-    The new file is NAME.capture-FIRST.mcap beside the run's recording, or in `folder`; an existing one is never
-    replaced. Returns the report of `cut`: among others `output`, the new path as text, and `gaps`, [(first tick,
-    count)] of the missing ticks. Raises RecordingError for ticks that the run does not have, OutputError if the file
-    cannot be written, UnavailableError if the ticks are not recorded in time or the recording was interrupted.
+    The new file is NAME.capture-FIRST.mcap beside the run's recording, or in `folder`, with -2, -3, … before its ending
+    if the name is taken. Returns the report of `cut`: among others `output`, the new path as text, and `gaps`, [(first
+    tick, count)] of the missing ticks. Raises RecordingError for ticks that the run does not have, OutputError if the
+    file cannot be written, UnavailableError if the ticks are not recorded in time or the recording was interrupted.
     """
     _await_written(client, file, end)
     attempt = 1
@@ -144,7 +144,7 @@ def _unused_path(file: Path, tick: int, folder: Path | None) -> Path:
 
 def _replay_verdict(path: Path) -> str:
     """Replay a recording and return the verdict: "identical", or a text that states the first difference, the parts
-    that were not verified, or the reason why no replay is possible.
+    that were not verified, or the RtloopError for which no replay is possible.
     """
     try:
         report = replay(load(path))
@@ -160,7 +160,8 @@ def _replay_verdict(path: Path) -> str:
 def main() -> int:
     """Save the ticks FIRST … END − 1 of a run as a recording of their own, and check it by a replay of the law.
 
-    The module describes the command line, and the JSON line that is printed. Returns 0, or 1 after {error}.
+    The module describes the command line, and the JSON line that is printed. Returns 1 after {error}, else 0, also if
+    the replay differs.
     """
     parser = argparse.ArgumentParser(prog="rtloop.client.capture.tick_capture", description="save ticks of a run")
     for name, argument_type in (("socket", Path), ("file", Path), ("first", int), ("end", int)):

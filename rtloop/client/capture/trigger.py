@@ -75,7 +75,7 @@ class Settings:
 
     @cached_property
     def pre_ticks(self) -> int:
-        """Ticks of a sweep before its trigger."""
+        """Ticks of a sweep before its trigger: `pre_percent` of the other ticks, rounded."""
         return round((self.ticks - 1) * self.pre_percent / 100)
 
 
@@ -97,7 +97,7 @@ class Trigger:
         self._is_armed = True
 
     def force(self) -> None:
-        """Begin a sweep at the next tick, or at the end of the open sweep, in any mode, whether armed or not."""
+        """Trigger a sweep at the next tick, or at the end of the open sweep, in any mode, whether armed or not."""
         self._is_forced = True
 
     def close(self) -> Sweep | None:

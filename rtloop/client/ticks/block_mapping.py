@@ -20,7 +20,7 @@ class BlockMapping:
     """Read-only mapping of the block in `fd`, which may be closed afterwards; `identity` is its device and inode."""
 
     def __init__(self, fd: int) -> None:
-        """Map the block of the descriptor `fd`, and read names, types and places of its arrays."""
+        """Map the block of the descriptor `fd`, which stays open, and read names, types and places of its arrays."""
         self._map = mmap.mmap(fd, 0, prot=mmap.PROT_READ)
         self._directory = json.loads(self._map[:DIRECTORY_BYTES].rstrip(b"\0"))
         self.identity = _identity(os.fstat(fd))

@@ -57,8 +57,8 @@ class Reader:
     def read_messages(self) -> np.ndarray[Any, np.dtype[np.void]]:
         """Return the run's next events, (n,) of MESSAGE, oldest first, 0 ≤ n ≤ MAX_EVENTS, without waiting.
 
-        An event may come before `read` returns its tick. Events that were overwritten before they could be read are
-        skipped.
+        Empty before `read` has mapped a block. An event may come before `read` returns its tick. Events that were
+        overwritten before they could be read are skipped.
         """
         ready_count = 0 if self._events is None else int(self._events.head[0]) - self._event_cursor
         messages = np.zeros(min(ready_count, MAX_EVENTS), MESSAGE)

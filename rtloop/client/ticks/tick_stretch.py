@@ -56,7 +56,10 @@ class Batch:
         self._stretches: list[Stretch] = []
 
     def add(self, stretch: Stretch) -> Stretch | None:
-        """Add a stretch. Returns all collected ticks, which are then removed, once they last for BATCH_S, else None."""
+        """Add a stretch of the same run; remove and return all ticks once they are BATCH_S times the rate, else None.
+
+        The caller calls `take` before it adds a stretch of another run.
+        """
         self._stretches.append(stretch)
         return self.take() if sum(map(len, self._stretches)) >= self._ticks else None
 

@@ -220,7 +220,7 @@ def excitation_warnings(runs: Sequence[AxisRecording]) -> list[str]:
 def require_rising(run: AxisRecording) -> None:
     """Raise UnsuitableData where the position falls as a slow drive rises: a sign is wrong somewhere.
 
-    The limit is a correlation of LARGEST_ANTICORRELATION.
+    It falls if its correlation with the drive is below LARGEST_ANTICORRELATION, which is negative.
     """
     drive_v, position_um = run.drive_v[:-1], run.position_um[1:]
     if np.corrcoef(drive_v, position_um)[0, 1] < LARGEST_ANTICORRELATION:

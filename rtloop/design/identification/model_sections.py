@@ -34,7 +34,10 @@ Section = TypeVar("Section", bound=Options)
 
 
 def feedforward_section(model: PlayModel, comments: Sequence[str]) -> str:
-    """Return [axis.feedforward] as TOML below comment lines. Raises UnsuitableData for weights without an inverse."""
+    """Return [axis.feedforward] as TOML below `comments`, lines without #.
+
+    Raises UnsuitableData for weights without an inverse.
+    """
     return write_section("axis.feedforward", feedforward_values(model), comments)
 
 
@@ -51,7 +54,7 @@ def feedforward_values(model: PlayModel) -> dict[str, Any]:
 
 
 def model_section(fit: DynamicsFit, comment_lines: Sequence[str]) -> str:
-    """Return [axis.model] as TOML below comment lines: zeros, poles, gain and delay."""
+    """Return [axis.model] as TOML below `comment_lines`, without #: zeros, poles, gain and delay."""
     return write_section("axis.model", model_values(fit), comment_lines)
 
 
@@ -166,7 +169,8 @@ def parse_feedforward(content: str, source: str, axis: str | None = None) -> Pra
 
 
 def _axis_table(content: str, source: str, axis: str | None) -> dict[str, Any]:
-    """Return the table [axis], or, of several, the table of axis `axis` (None: first); {} without one.
+    """Return the table [axis], whatever its name, or, from a list [[axis]], the table named `axis` (None: the first);
+    {} if there is none.
 
     Raises ConfigError for text that is no TOML.
     """
@@ -187,7 +191,10 @@ def _missing_section(source: str, section: str, axis: str | None) -> ConfigError
 
 
 def _validated(model: type[Section], table: dict[str, Any], section: str, source: str) -> Section:
-    """Return a section of an axis's table as its options. Raises ConfigError for invalid ones; `source` names them."""
+    """Return `table[section]`, which must exist, as options of the class `model`.
+
+    Raises ConfigError, which names the file `source`, for invalid ones.
+    """
     try:
         return model.model_validate(table[section])
     except ValidationError as error:

@@ -112,7 +112,9 @@ def _zoom_range(fit: DynamicsFit, run: Excitation) -> tuple[int, int]:
 def _draw_over_frequency(
     fit: DynamicsFit, run: Excitation, measured: FrequencyResponse | None, magnitude: Any, phase: Any, input_unit: str
 ) -> None:
-    """Draw magnitude and phase of the model, and of a measured response where it can be trusted."""
+    """Draw magnitude and phase of the model, and of a measured response at the frequencies where its `is_trusted` is
+    True.
+    """
     model = fit.model.discrete()
     hz = np.geomspace(1.0, 0.499 / run.period_s, 4000)
     response = model.response(np.exp(2j * np.pi * hz * run.period_s))[0]

@@ -78,8 +78,8 @@ def design_robust_loop(
     stage: Stage, design: DesignOptions, axis: str | None, folder: Path, spec_name: str, spec_text: str,
     progress: Progress = lambda _: None,
 ) -> tuple[RobustChain, str]:  # fmt: skip
-    """Design a controller and its taps; return the results of all steps, and a configuration as TOML that has the
-    design in axis `axis` (None: the first).
+    """Design a controller and its taps; return the results of all steps, and the step recording's configuration as TOML
+    with the design in its axis `axis` (None: the first), which must exist.
 
     `spec_name` is the specification's path relative to `folder`, the configuration's folder. `design` has passed
     `require_specified`. `progress` receives a sentence after each attempt. Raises NoDesign with the missed requirement,

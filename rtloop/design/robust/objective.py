@@ -70,7 +70,7 @@ class Objective:
 
     def __call__(self, points: Real) -> Real:
         """Return costs (k,) of points (k, n): the log of the slowest decay in periods, half of the worst band and half
-        of the bands' mean, plus WALL_SLOPE times the log of each excess over a limit.
+        of the bands' mean, plus WALL_SLOPE times the log of each excess over INSIDE_SHARE of a limit.
 
         Outside the bounds, the cost is the cost of the nearest point inside plus the squared distance. An unstable
         point costs at least UNSTABLE_COST.

@@ -28,7 +28,9 @@ class Scenario(NamedTuple):
     delay_ticks: int
 
     def __str__(self) -> str:
-        """Return the changes as one line, such as "resonance +10 %, damping × 0.5, gain -5 %, delay_ticks 2"."""
+        """Return all changes, also those by 0, as one line: "resonance +10/+0 %, damping × 0.5, gain -5 %, delay_ticks
+        2", with a resonance for each mode, and none without modes.
+        """
         parts = [f"resonance {'/'.join(f'{percent:+.3g}' for percent in self.resonance)} %"] if self.resonance else []
         return ", ".join(
             [*parts, f"damping × {self.damping:.3g}", f"gain {self.gain:+.3g} %", f"delay_ticks {self.delay_ticks}"]
@@ -125,8 +127,8 @@ class Family:
             yield from (Scenario((float(place),) * self.modes.size, factor, gain, ticks) for place in places)
 
     def random_scenarios(self, count: int, seed: int) -> Iterator[Scenario]:
-        """Yield `count` random scenarios: frequencies and gain uniform, damping uniform in its logarithm, one of the
-        delays.
+        """Yield `count` random scenarios: each mode's frequency and the gain uniform, the common factor on the damping
+        uniform in its logarithm, one of the delays.
         """
         random, options = np.random.default_rng(seed), self.options
         r, g = options.resonance_percent, options.gain_percent

@@ -110,7 +110,7 @@ def robust_values(robust: RobustDesign, design: DesignOptions) -> dict[str, Any]
 def provenance(robust: RobustDesign, design: DesignOptions, source: str, text: str) -> list[str]:
     """Return comment lines, without #, on the origin of a controller and its certified figures.
 
-    `source` and `text` are the specification's name and content.
+    `source` and `text` are the specification's name and content, which is named by its digest.
     """
     digest, options = hashlib.sha256(text.encode()).hexdigest(), design.robust
     return [
@@ -143,5 +143,7 @@ def _remove_provenance(text: str, heading: str) -> str:
 
 
 def _output(design: DesignOptions) -> OutputOptions:
-    """Return the output options of `design` with the method "matched", which recovers the written roots exactly."""
+    """Return the output options of `design` with the method "matched", which recovers the written roots exactly, and
+    without `prewarp_hz`.
+    """
     return design.controller.model_copy(update={"method": "matched", "prewarp_hz": None})

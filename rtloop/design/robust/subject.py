@@ -68,7 +68,7 @@ def build_subject(axis: AxisOptions, check: AxisCheck, design: DesignOptions, la
 
     Its delay is the model's if the model states one, else the rig's `latency_ticks`, in samples.
     Raises ValueError, naming the key, without a linear controller, a model or a requirement of `missing_requirements`,
-    and for an axis with pre-filter sections or a slew limit.
+    and for an axis with pre-filter sections, a slew limit or a reference that v cannot hold (`step_bounds`).
     """
     model, specification, options = axis.model or design.plant, design.specification, design.shape
     if check.linear is None:
@@ -97,8 +97,9 @@ def step_bounds(axis: AxisOptions, model: ModelOptions, design: DesignOptions) -
 
     A range of v with equal sides gives levels to both sides of 0; so does one with unequal sides if the shorter one has
     room for `command_um`. Otherwise the levels lie between 0 and the reference on the longer side, or in the middle of
-    a range without 0, as a drive of one sign has it. Raises ValueError, naming the key, for a reference that v cannot
-    hold, and without [specification.command].
+    a range without 0, as a drive of one sign has it; if the negative side is the longer one, the bounds are those of
+    the mirror image, with all signs changed. Raises ValueError, naming the key, for a reference that v cannot hold, and
+    without [specification.command].
     """
     command, undershoot = design.specification.command, design.shape.undershoot_percent / 100
     if command is None:
@@ -132,9 +133,11 @@ def _controller_fault(check: AxisCheck) -> str:
 
 
 def command_range_um(axis: AxisOptions) -> tuple[float, float]:
-    """Return least and largest v in µm that the drive can hold in any order, with its memory, within ±`command_um`.
+    """Return least and largest v in µm that the drive can hold in any order, with its memory, within the axis's
+    ±`limits.command_um`, which is always set.
 
-    For other feedforward than a play model, ±`command_um`; the least is then 0 where the drive cannot be negative.
+    For other feedforward than a play model, ±`limits.command_um`; the least is then 0 where the drive cannot be
+    negative.
     """
     limits, law = axis.limits, axis.feedforward
     limit_um = limits.command_um

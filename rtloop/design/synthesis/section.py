@@ -37,7 +37,7 @@ def controller_section(synthesis: Synthesis, design: DesignOptions, source: str,
 
 
 def commented_section(controller: Transfer, output: OutputOptions, lines: Sequence[str]) -> str:
-    """Return [axis.controller] as TOML, below comment `lines`."""
+    """Return [axis.controller] as TOML, below the comment `lines`, without #."""
     return write_section("axis.controller", controller_values(controller, output), lines)
 
 
@@ -58,7 +58,8 @@ def configuration_around(
     controller: Transfer, design: DesignOptions, lines: Sequence[str], axis: str, specification: str,
     actuator: PlayModel | None = None,
 ) -> str:  # fmt: skip
-    """Return TOML, below comment `lines`: `controller` on axis `axis`, and a simulated rig of the plant of `design`.
+    """Return TOML, below the comment `lines`, without #: `controller` on axis `axis`, and a simulated rig of the plant
+    of `design`.
 
     Feedforward and rig have the `actuator`; None: a placeholder of RIG_UM_PER_V. `specification` is its file's path,
     relative to the configuration.
@@ -116,7 +117,7 @@ def _separate_poles(plant: Transfer) -> Transfer:
 
 def provenance(synthesis: Synthesis, design: DesignOptions, source: str, text: str) -> list[str]:
     """Return comment lines, without #, on the origin of the controller; `source` and `text` are the specification's
-    name and content.
+    name and content, which is named by its digest.
     """
     hinf, weights = synthesis.hinf, synthesis.weights
     order, full_order = synthesis.controller.order, synthesis.full.order

@@ -293,8 +293,8 @@ class DesignOptions(Options):
 
     @property
     def step_heights_um(self) -> tuple[float, ...]:
-        """Heights of the simulated steps in µm: `simulation.steps_um`, else STEP_HEIGHTS_UM and the reference step of
-        `specification.command`, if it is given and not within SAME_HEIGHT of one of them.
+        """Heights of the simulated steps in µm, not sorted: `simulation.steps_um`, else STEP_HEIGHTS_UM and, as the
+        last, the reference step of `specification.command`, if it is given and not within SAME_HEIGHT of one of them.
         """
         if self.simulation.steps_um is not None:
             return self.simulation.steps_um

@@ -44,7 +44,7 @@ def load_specification(path: Path) -> SpecificationFile:
 
 
 def _collect_keys() -> set[str]:
-    """Return all keys allowed in a specification, for suggestions on unknown keys."""
+    """Return the names of all keys allowed in any section of a specification, for suggestions on unknown keys."""
     schema = DesignOptions.model_json_schema()
     parts = [schema, *schema.get("$defs", {}).values()]
     return set().union(*(part.get("properties", {}) for part in parts))

@@ -56,8 +56,9 @@ def synthesise(
     γ is (1 + `backoff`)·γ_opt. `order` is the order of the reduced controller; None takes the lowest whose weighted
     loop has a norm of at most (1 + `largest_loss`)·γ, or the best there is. `finish` turns a reduced controller into
     the written one, or None if it would not run. Raises NoController, also if γ_opt exceeds `largest_gamma`;
-    NotRunnable if `finish` accepts none; ValueError for an order that is out of range or leaves no stable loop, for a
-    plant with direct feedthrough, and for a full controller with repeated poles beside unstable ones.
+    NotRunnable if no order gives a controller that `finish` accepts in a stable loop; ValueError for an `order` that is
+    out of range or gives no such controller, for a plant with direct feedthrough, and for a full controller with
+    repeated poles beside unstable ones.
     """
     augmented_plant = augment(plant, weights)
     hinf = synthesise_hinf(augmented_plant, backoff=backoff)

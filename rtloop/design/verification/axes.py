@@ -161,7 +161,9 @@ def _warn_unsimulated(verification: Verification, error: Exception) -> Verificat
 
 
 def _hardware_model(axis: AxisOptions, design: DesignOptions) -> HardwareModel:
-    """Return the model of an axis, else its specification's model, else None, with the specification's sensor."""
+    """Return the hardware of an axis: as `model` the axis's own, else its specification's, else None; sensor and
+    residual hysteresis from the specification.
+    """
     sensor, residual_percent = design.sensor, design.simulation.residual_percent
     model = axis.model or design.plant
     return HardwareModel(model, sensor.noise_um, sensor.resolution_um, sensor.bandwidth_hz, residual_percent)

@@ -97,7 +97,7 @@ class Bench:
 def _place_on_rig(
     configuration: Configuration, hardware_models: Mapping[str, HardwareModel], is_configured: bool
 ) -> tuple[Configuration, RigOptions]:
-    """Return the configuration in closed loop, at rest, without schedule, on a rig, and the rig's options.
+    """Return a copy of the configuration in closed loop, at rest, without schedule, on a rig, and the rig's options.
 
     A configured rig is used; otherwise one is made. Raises ValueError for [inputs] and [outputs] without a configured
     rig 'sim', for an axis without a model, and for a residual hysteresis that cannot be made.

@@ -147,8 +147,8 @@ def _noise(loop: Loop, sensor: SensorOptions) -> dict[str, float]:
 
 
 def noise_gains(loop: Loop) -> Real:
-    """Return the rms of x and of v per rms of white sensor noise, (2,), from the stationary covariance of a stable
-    sampled loop.
+    """Return the rms of the true position x and of v per rms of white sensor noise, (2,), from the stationary
+    covariance of a stable sampled loop.
     """
     a, b, c, d = loop.matrices
     covariance = c @ stationary_covariance(a, np.outer(b, b)) @ c.T

@@ -76,7 +76,9 @@ class SimulationResult:
 
     @property
     def missed(self) -> list[str]:
-        """Requirements that simulated steps do not meet, a text for each height; whatever `is_judged` says."""
+        """Requirements that simulated steps do not meet, whatever `is_judged` says: a text for each height and figure,
+        then a text for each height whose steps trip.
+        """
         return [
             f"{QUANTITIES[name][0]} of {step.height_um:g} µm steps"
             for step in self.steps
@@ -87,7 +89,7 @@ class SimulationResult:
     def as_dict(self) -> dict[str, Any]:
         """Return the result for JSON: `truth`; `steps`, each with the fields of SimulatedStep and `met` {figure:
         whether it meets its limit}, without figures that have none; `left_out_um`; `range_um` [low, high];
-        `noise_x_nm`; `noise_v_nm`; `judged`.
+        `noise_x_nm`; `noise_v_nm`; `judged`. Infinite figures are still infinite, not null.
         """
         steps = [
             {

@@ -73,8 +73,9 @@ def simulate(bench: Bench, axis: AxisOptions, slowest_s: float, design: DesignOp
 
 
 def _noise_at_rest_nm(bench: Bench, axis: str, reach_um: float) -> list[float]:
-    """Return the rms noise of position and command at rest in nm, averaged over REST_PLACES of the longer side of the
-    range, which ends at `reach_um`: in a dead band a loop may hunt.
+    """Return the rms noise of position and command at rest in nm, the root of its mean square over REST_PLACES of the
+    longer side of the range, which ends at `reach_um` (below 0 if it is the negative side): in a dead band a loop may
+    hunt.
     """
     squares = []
     for place in REST_PLACES:

@@ -20,7 +20,7 @@ NOTE = "Gain stands for D(0), the sensor's scale and all hysteresis weights toge
 
 
 def table(verification: Verification) -> list[tuple[str, ...]]:
-    """Return headings, then a row for each quantity.
+    """Return headings, then a row for the loop's stability and one for each quantity.
 
     Its cells: label, required; the value of C(s), if it exists; value and verdict of C(z); the claim. The column of
     claims is left out if the specification has none. C(s) does not run, and has no verdict.

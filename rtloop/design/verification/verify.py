@@ -64,7 +64,7 @@ class Row(NamedTuple):
         return QUANTITIES[self.name][1]
 
     def is_met(self, value: float | None) -> bool | None:
-        """Whether `value` meets the limit; None without limit or value."""
+        """Whether `value` meets the limit, as NaN never does; None without limit or value."""
         return None if self.limit is None or value is None else self.limit.accepts(value)
 
 
@@ -103,7 +103,8 @@ class ScenarioResults:
     def is_met(self, row: Row, worst_value: WorstValue) -> bool | None:
         """Whether `worst_value` meets the row's limit.
 
-        None for a step figure, which taps that fit the plant would correct, unless it is NaN, and without a limit.
+        None for one of STEP_QUANTITIES, which taps that fit the plant would correct, unless it is NaN, and without a
+        limit.
         """
         return (
             None if row.name in STEP_QUANTITIES and not math.isnan(worst_value.value) else row.is_met(worst_value.value)
@@ -249,7 +250,8 @@ def _robustness(
 ) -> Robustness:
     """Return the tolerated changes of the plant and the tolerated additional delay.
 
-    `rows` have the values that the loop reaches now: requirements that it misses do not limit the ranges.
+    `sensed_plant` is `plant` with the sensor's lag. `rows` have the values that the loop reaches now: requirements that
+    it misses do not limit the ranges.
     """
     make_continuous = None if subject.controller is None else loop_builder(subject.controller)
 

@@ -107,7 +107,10 @@ def analyse(recordings: Sequence[RecordedRun], _: CharacteriseOptions) -> Analys
 
 
 def _ends_v(segment: Segment) -> tuple[float, float]:
-    """Return the lowest and the highest drive in V of a segment; older recordings have one amplitude for both."""
+    """Return the lowest and the highest drive in V of a segment.
+
+    Older recordings store one amplitude A: the ends are −A and A, those of the minor loop 0 and 2 A.
+    """
     values = segment.values
     if "low_v" in values:
         return values["low_v"], values["high_v"]

@@ -113,7 +113,7 @@ def analyse(recordings: Sequence[RecordedRun], options: DisturbanceOptions) -> A
 
 
 def error_limit_um(run: RecordedRun, hz: float, amplitude_um: float) -> float | None:
-    """Return the error in µm that the specification allows for an Ω of this size and frequency.
+    """Return the error in µm, proportional to `amplitude_um`, that the specification allows for an Ω of this frequency.
 
     None without a limit, and above the frequency up to which it applies.
     """
@@ -134,7 +134,8 @@ def _row(
 ) -> Row:
     """Return the row of a remaining error in nm or, with `unit` "ms", of a duration; `value` and `model` are in `unit`.
 
-    `limit_um` is the largest error that the specification allows, in µm; None: no limit.
+    `limit_um` is the largest error that the specification allows, in µm, and becomes the row's limit in nm; None: no
+    limit.
     """
     row = run.row("disturbance_left_nm" if unit == "nm" else "", quantity, unit, value, model, tolerance)
     return row if limit_um is None else replace(row, limit=Limit(1e3 * limit_um, at_most=True))
@@ -187,7 +188,7 @@ def _settling_ms(error: Real, limit_um: float, rate_hz: float) -> float:
 
 
 def _frequency_curves(run: RecordedRun, amplitude_um: float) -> dict[str, Any]:
-    """Return model and limit over frequency, for the picture: {hz (n,), model_nm (n,), asked_nm, asked_hz}.
+    """Return model and limit over frequency, for the picture: arrays hz, model_nm (n,), numbers asked_nm, asked_hz.
 
     `model_nm` is None without a model, `asked_nm` without a limit, which applies up to `asked_hz`.
     """

@@ -76,7 +76,7 @@ class HarmonicOptions(Options):
 
 
 def runs(options: HarmonicOptions, setting: Setting) -> list[Run]:
-    """Plan one run: all three MODES in turn, each with sines from high to low frequencies."""
+    """Plan one run: raw, feedforward, closed loop in turn, each a rest and then sines from high to low frequencies."""
     timeline = setting.timeline()
     for mode in MODES:
         timeline.add("rest", mode, hold(0.0), REST_S)
@@ -170,7 +170,7 @@ def hysteresis_db(actuator: PlayModel, inverse: PlayModel, um_per_v: float, ampl
 
 
 def _db(ratio: float) -> float:
-    """Return a ratio in dB; −inf for 0."""
+    """Return a ratio in dB; −inf for 0 and below."""
     return 20 * math.log10(ratio) if ratio > 0 else -math.inf
 
 
@@ -192,7 +192,7 @@ def _sweep(run: RecordedRun, mode: str) -> Real:
 
 
 def _raw_gain(run: RecordedRun) -> float:
-    """Gain in µm/V by which the drive's responses are divided."""
+    """Gain in µm/V by which the drive's responses are divided, as stored with the first sine of the recording."""
     return next(segment.values["gain"] for segment in run.segments_labelled("sine"))
 
 
@@ -266,7 +266,10 @@ def _draw_column(panels: Any, curves: Mapping[str, Any], ink: Palette) -> None:
 
 
 def unwrap_phases(degrees: Real, mask: Real) -> Real:
-    """Return phases in ° without jumps of a turn; `mask` is 1 for trusted points, NaN for others, which become NaN."""
+    """Return phases in ° without jumps of a turn from one trusted point to the next.
+
+    `mask` is 1 for trusted points, NaN for others, whose phases become NaN.
+    """
     phases, is_trusted = degrees * mask, mask == 1.0
     phases[is_trusted] = np.degrees(np.unwrap(np.radians(degrees[is_trusted])))
     return phases

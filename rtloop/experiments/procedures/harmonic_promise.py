@@ -58,7 +58,7 @@ class HarmonicPromise:
     def closed_low_db(self) -> float | None:
         """Response of the model's closed loop at the lowest measured frequency, in dB.
 
-        None without a model, and for an unstable loop.
+        None without a model, and for one without a stable loop.
         """
         tracking = self._model.tracking(self._measured_hz[0]) if self._model else None
         return None if tracking is None else float(20 * np.log10(abs(tracking[0])))
@@ -67,7 +67,7 @@ class HarmonicPromise:
     def bandwidth_hz(self) -> float | None:
         """Frequency in Hz at which the model's closed loop is first 3 dB below its response at the lowest frequency.
 
-        None if it never is, without a model, and for an unstable loop.
+        None if it never is, without a model, and for one without a stable loop.
         """
         if self._closed_db is None:
             return None
@@ -77,7 +77,7 @@ class HarmonicPromise:
     def closed_db_beyond(self, hz: float) -> float | None:
         """Largest response in dB of the model's closed loop at the measured frequencies from `hz` on.
 
-        None without such a frequency, without a model, and for an unstable loop.
+        None without such a frequency, without a model, and for one without a stable loop.
         """
         high = self._measured_hz[self._measured_hz >= hz]
         tracking = self._model.tracking(high) if self._model and high.size else None

@@ -115,7 +115,10 @@ def settling_range(outcomes: Sequence[Outcome]) -> tuple[float, float]:
 
 
 def range_about_zero(is_good: Mapping[float, bool]) -> tuple[float, float]:
-    """Return the least and the greatest good shift with no bad one between it and 0; (NaN, NaN) without any."""
+    """Return the least and the greatest good shift with no bad one from 0 to it; (NaN, NaN) without any.
+
+    A bad shift 0 leaves none.
+    """
     good_shifts, bad_shifts = ([s for s, value in is_good.items() if value is expected] for expected in (True, False))
     lowest_bad, highest_bad = (
         min((s for s in bad_shifts if s >= 0), default=np.inf),

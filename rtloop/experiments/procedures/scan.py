@@ -84,7 +84,11 @@ def plan_next_run(run_records: Sequence[RecordedRun], options: ScanOptions, sett
 
 
 def _plan_run(cycle: int, options: ScanOptions, setting: Setting, tables: Sequence[Real]) -> Run:
-    """Return the run of one cycle that plays these tables (period, 2), one for each frequency."""
+    """Return the run of one cycle that plays these tables (period, 2), one for each frequency.
+
+    A table has the reference, about 0, to which the middle of the motion is added here, and the addition to the
+    command, both in µm.
+    """
     timeline, named_tables = setting.timeline("closed_loop"), {}
     for hz, table in zip(options.frequencies_hz, tables, strict=True):
         name, period_s = f"scan-{cycle}-{hz:g}Hz.npy", len(table) / setting.rate_hz
@@ -125,7 +129,10 @@ def _learning_gains(setting: Setting, options: ScanOptions, period_ticks: int) -
 
 
 def _measured_slice(run: RecordedRun, number: int) -> tuple[slice, int]:
-    """Return the evaluated ticks of scan `number`, from 0, and the number of ticks in its period."""
+    """Return the evaluated ticks of scan `number`, from 0, and the number of ticks in its period.
+
+    They are whole periods, at the end of the scan.
+    """
     segment = run.segments_labelled("scan")[number]
     ticks = segment.values["period_ticks"]
     return segment.tail_slice(ticks * segment.values["periods"]), ticks

@@ -36,7 +36,10 @@ class SinesOptions(Options):
 
 
 def runs(options: SinesOptions, setting: Setting) -> list[Run]:
-    """Plan one run: a sine at each frequency in turn, in whole cycles, of which the first one is to settle."""
+    """Plan one run in closed loop: a sine at each frequency in turn, in whole cycles.
+
+    The first cycle of each is to settle.
+    """
     timeline = setting.timeline("closed_loop")
     for hz in options.frequencies_hz:
         cycles = max(options.cycles, round(MIN_DURATION_S * hz))

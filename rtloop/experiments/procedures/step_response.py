@@ -62,7 +62,7 @@ class ModelResponse(NamedTuple):
 
 
 def runs(options: StepResponseOptions, setting: Setting) -> list[Run]:
-    """Plan one run: rest, then a step of the drive without control."""
+    """Plan one run in mode raw: rest, then a step of the drive without control."""
     timeline = setting.timeline("raw", uses_whole_drive=True)
     timeline.add("step", "raw", hold(options.part_of_drive * setting.axis.limits.drive_v), options.duration_s)
     return [Run("", timeline)]
@@ -134,8 +134,8 @@ def ringing_window(model: LinearModel | None) -> tuple[float, float]:
 def fit_ringing(height: Real, rate_hz: float, window_s: tuple[float, float] = RINGING_S) -> Ringing:
     """Return the ringing of the position `height` (n,) since a step, in µm, within the window.
 
-    It is the fit of c + Re(a e^{(−σ + jω)t}), c being the level. Raises UnsuitableData for fewer than 50 ticks in the
-    window, or no motion faster than MIN_PERIODS in it.
+    Its frequency (Hz), damping ratio and level c come from the fit of c + Re(a e^{(−σ + jω)t}). Raises UnsuitableData
+    for fewer than 50 ticks in the window, or no motion faster than MIN_PERIODS in it.
     """
     from scipy.optimize import least_squares  # a quarter of a second of import, for one experiment of many
 

@@ -131,7 +131,10 @@ def _evaluate_steps(run: RecordedRun, reference: Real, position: Real, command: 
 
 
 def _scaled_steps(run: RecordedRun, position: Real, ticks: int) -> list[Real]:
-    """Return (position − level before)/height, without unit, in the first `ticks` of every step, (ticks,) each."""
+    """Return (position − level before)/height, without unit, in the first `ticks` of every step, (ticks,) each.
+
+    `ticks` must not exceed the shortest level, as the next level would follow in its place.
+    """
     return [
         (position[segment.start_tick : segment.start_tick + ticks] - previous_um) / (level - previous_um)
         for segment, previous_um, level in _level_changes(run)

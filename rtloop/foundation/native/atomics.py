@@ -80,7 +80,7 @@ def compare_exchange(compiler: Any, array: Any, index: Any, expected: Any, repla
 
 @intrinsic
 def fence_acquire(compiler: Any) -> Any:
-    """Keep every later load and store behind all earlier loads."""
+    """Keep every later load and store behind all earlier loads. Compiled kernels only."""
 
     def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         """Emit the LLVM code of the fence and return numba's None; numba defines the parameters."""
@@ -92,7 +92,7 @@ def fence_acquire(compiler: Any) -> Any:
 
 @intrinsic
 def fence_release(compiler: Any) -> Any:
-    """Keep every earlier load and store in front of all later stores."""
+    """Keep every earlier load and store in front of all later stores. Compiled kernels only."""
 
     def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         """Emit the LLVM code of the fence and return numba's None; numba defines the parameters."""

@@ -36,7 +36,7 @@ class ExportedKernel:
 
     @property
     def address(self) -> int:
-        """Address of the machine code, loaded from the cache or compiled."""
+        """Address of the machine code, loaded from the cache or compiled. Raises numba's errors if that fails."""
         if self._machine_code is None:
             self._machine_code = machine_code.load(self._name) or self._compile()
         return self._machine_code
@@ -83,7 +83,10 @@ class CFunction(ExportedKernel):
         """A C function that calls the Python function, and its address; an exception becomes the result FAILED."""
 
         def call_python(*arguments: int) -> Any:
-            """Run the Python function, uncompiled, for a call from C. Returns its result, FAILED after an exception."""
+            """Run the Python function, uncompiled, for a call from C, and return its result.
+
+            An exception is dropped, and FAILED returned.
+            """
             try:
                 with allow_uncompiled(), np.errstate(all="ignore"):
                     return self._function(*arguments)

@@ -68,7 +68,10 @@ def cpu_identity() -> str:
 
 
 def _make_private_folder(path: Path) -> bool:
-    """Make the folder `path` if needed; return whether this user can write to it and no other user can."""
+    """Make the folder `path` if needed; return whether this user can write to it and no other user can.
+
+    False, too, if it cannot be made.
+    """
     try:
         close_descriptor(open_folder(path, 0o700))
     except OSError:
@@ -79,7 +82,7 @@ def _make_private_folder(path: Path) -> bool:
 def _cache_folder() -> tuple[Path, bool]:
     """Return the cache's folder, made if needed, and whether its files survive a restart of the machine.
 
-    It is in the user's cache folder, else in /tmp, else a new folder for this process alone.
+    It is in the user's cache folder, whose files survive, else in /tmp, else a new folder for this process alone.
     """
     if not HAS_OWNERS:  # A folder that others cannot change is not known to be one.
         return Path(tempfile.mkdtemp(prefix="rtloop-")), False

@@ -57,7 +57,7 @@ def read(path: Path) -> bytes | None:
 
 
 def damaged_files(folder: Path) -> list[Path]:
-    """Return the damaged files in or below `folder` that are not renamed.
+    """Return the damaged files in or below `folder` that are not renamed; [] for a missing folder.
 
     Raises OSError for one that cannot be read.
     """
@@ -85,7 +85,10 @@ def _is_whole(data: bytes) -> bool:
 
 
 def _quarantine(path: Path) -> None:
-    """Rename a damaged file to make room for a new one; the first one in a process causes a warning on stderr."""
+    """Rename a damaged file to make room for a new one; the first one in a process causes a warning on stderr.
+
+    An error of renaming is ignored.
+    """
     with contextlib.suppress(OSError):
         os.replace(path, f"{path}{DAMAGED}")
     if not _quarantined:

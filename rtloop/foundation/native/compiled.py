@@ -43,7 +43,10 @@ class Kernel:
         return (self.py_func if is_uncompiled_allowed() else self._dispatcher)(*arguments)
 
     def __getattr__(self, name: str) -> Any:
-        """Return an attribute of numba's dispatcher, which imports numba. Raises AttributeError for a name with __."""
+        """Return an attribute of numba's dispatcher, which imports numba.
+
+        Raises AttributeError for a name that begins with "__".
+        """
         if name.startswith("__"):  # Python looks for such names on any object; the compiler need not be imported.
             raise AttributeError(name)
         return getattr(self._dispatcher, name)

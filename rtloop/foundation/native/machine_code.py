@@ -21,7 +21,10 @@ def store(name: str, machine_code: bytes) -> None:
 
 
 def load(name: str) -> int | None:
-    """Load stored machine code and return the address of its symbol `name`; None if it is missing or damaged."""
+    """Load stored machine code and return the address of its symbol `name`, valid until exit; None without stored code.
+
+    A damaged file counts as missing.
+    """
     try:
         machine_code = stored.read(_path(name))
     except OSError:  # there is no folder for a cache

@@ -25,14 +25,17 @@ class CheckedCacheFile(IndexDataCacheFile):
         return super()._load_index() if stored.read(Path(self._index_path)) is not None else {}
 
     def _load_data(self, name: str) -> Any:
-        """Return the code in file `name`. Raises FileNotFoundError for a damaged file: numba compiles again."""
+        """Return the code in file `name`. Raises FileNotFoundError if damaged or missing: numba compiles again."""
         if stored.read(Path(self._data_path(name))) is None:
             raise FileNotFoundError(errno.ENOENT, "damaged, or not there", name)
         return super()._load_data(name)
 
     @contextmanager
     def _open_for_write(self, filepath: str) -> Iterator[Any]:
-        """Yield a buffer whose contents are stored atomically on exit. numba ignores the digest that follows them."""
+        """Yield a buffer whose contents are stored atomically on exit, but not after an exception.
+
+        numba ignores the digest that follows them.
+        """
         buffer = io.BytesIO()
         yield buffer
         stored.write(Path(filepath), buffer.getvalue())

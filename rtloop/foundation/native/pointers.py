@@ -77,7 +77,10 @@ def address_pointer(compiler: Any, address: Any) -> Any:
 
 @intrinsic_like(uncompiled.load_word)
 def load_word(compiler: Any, address: Any) -> Any:
-    """Load the eight bytes at an address as uint64, in the processor's byte order; the address need not be aligned."""
+    """Load the eight bytes at an address as uint64, in the processor's byte order, and not as one atomic operation.
+
+    The address need not be aligned.
+    """
     types, ir = compiler.types, compiler.ir
 
     def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:

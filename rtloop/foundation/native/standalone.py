@@ -32,7 +32,7 @@ status."""
 def kernel_object_code(library: Any, symbol: str, name: str, raises: bool) -> bytes | None:
     """Return the object code of a compiled kernel, with `name` for its symbol; None if it needs numba at run time.
 
-    With `raises`, the code may contain descriptions of exceptions.
+    With `raises`, the code may contain descriptions of exceptions; without it, None for a kernel that may raise.
     """
     module = llvm.parse_bitcode(library._final_module.as_bitcode())
     module.get_function(symbol).name = name
@@ -69,7 +69,10 @@ def _emit_object_code(module: Any, name: str, machine: Any, raises: bool) -> byt
 
 
 def _wrapper_text(module: Any, numba_name: str, name: str) -> str:
-    """Return the assembly text of a C function `name` with the signature of numba's C function `numba_name`."""
+    """Return the assembly text of a C function `name` with the signature of numba's C function `numba_name`.
+
+    It calls the same kernel, and ignores the kernel's status.
+    """
     kernel, function = module.get_function(numba_name.removeprefix("cfunc.")), module.get_function(numba_name)
     return WRAPPER_TEMPLATE.format(
         layout=module.data_layout,

@@ -94,7 +94,7 @@ def call(function: int, context: int, values: int) -> Any:
 def call_law(function: int, result: int, raised_address: int, coefficients: int, state: int, law_input: Any) -> int:
     """Call a registered function of a law, like `pointers.call_law`; return OK or RAISED.
 
-    A result other than None is written to the float64 at `result`; an exception goes to `raised_exceptions`, and
+    A result other than None is written to the float64 at `result`; an exception is appended to `raised_exceptions`, and
     `raised_address` is not used.
     """
     try:
@@ -108,10 +108,10 @@ def call_law(function: int, result: int, raised_address: int, coefficients: int,
 
 
 def load_acquire(array: Any, index: int) -> Any:
-    """Return word `index` of an array, like `atomics.load_acquire`."""
+    """Return word `index` of a uint64 array, ordered as by `atomics.load_acquire`."""
     return np.uint64(words.load_acquire(array.ctypes.data + int(index) * array.itemsize))
 
 
 def store_release(array: Any, index: int, value: int) -> None:
-    """Set word `index` of an array, like `atomics.store_release`."""
+    """Set word `index` of a uint64 array, ordered as by `atomics.store_release`."""
     words.store_release(array.ctypes.data + int(index) * array.itemsize, int(value))

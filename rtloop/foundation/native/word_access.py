@@ -41,15 +41,18 @@ def _assembled_function(name: str, result: Any, count: int) -> Any:
 
 
 def load_acquire(address: int) -> int:
-    """Return the uint64 at an address, loaded before every later load and store."""
+    """Return the uint64 at an address, a multiple of 8, loaded before every later load and store."""
     return _assembled_function("load_acquire", _WORD, 1)(address)
 
 
 def store_release(address: int, value: int) -> None:
-    """Set the uint64 at an address, after every earlier load and store."""
+    """Set the uint64 at an address, a multiple of 8, after every earlier load and store."""
     _assembled_function("store_release", None, 2)(address, value)
 
 
 def compare_exchange(address: int, expected: int, replacement: int) -> int:
-    """Replace the uint64 at an address if it equals `expected`, as one atomic operation; return 1 if it did, else 0."""
+    """Replace the uint64 at an address, a multiple of 8, if it equals `expected`, as one atomic operation.
+
+    Returns 1 if it did, else 0.
+    """
     return _assembled_function("exchanged", ctypes.c_int32, 3)(address, expected, replacement)

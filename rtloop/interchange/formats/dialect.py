@@ -90,7 +90,10 @@ def detect_dialect(path: Path) -> CsvDialect:
 
 
 def split_fields(line: str, delimiter: str | None) -> list[str]:
-    """Return the fields of a line, without blanks and quotes around them; [] if it cannot be split."""
+    """Return the fields of a line, without blanks and quotes around them; [] if it cannot be split.
+
+    A `delimiter` of None is any number of blanks; quotes then stay.
+    """
     if delimiter is None:
         return line.split()
     try:

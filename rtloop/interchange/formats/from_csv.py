@@ -79,6 +79,7 @@ class _NumberLines(io.TextIOBase):
         return text
 
     def __iter__(self) -> Any:
+        """Return an iterator over the lines, with their ends; it checks nothing, unlike `read`."""
         return iter(self._file)
 
     def close(self) -> None:
@@ -182,9 +183,9 @@ def _column_numbers(path: Path, dialect: CsvDialect, values: Any) -> np.ndarray[
 
 
 def _dates_ns(path: Path, dialect: CsvDialect, values: Any) -> np.ndarray[Any, Any]:
-    """Return the dates of a column, a series of texts or, without any, of NaN, as ns since 1970, int64.
+    """Return the dates of a column, a series of pandas, as ns since 1970 in UTC, int64.
 
-    Raises UnreadableData at the first field without a date.
+    Raises UnreadableData at the first field without a date, such as NaN.
     """
     import pandas
 

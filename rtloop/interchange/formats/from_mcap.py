@@ -58,7 +58,7 @@ def read_mcap(path: Path | str, topic: str | None = None) -> Table:
 
 
 def _count_messages(source: McapSource) -> McapContents:
-    """Count the messages and bytes of every topic, up to the first damage."""
+    """Count the messages and bytes of every topic, up to the first damage, which is noted in `problems`."""
     contents = McapContents(Counter(), Counter(), [])
     for schema, channel, message in _messages_until_damage(source, contents.problems):
         contents.counts[channel.topic, encoding(channel, schema)] += 1
@@ -138,7 +138,7 @@ class _TopicReader:
         return Table({LOG_TIME: elapsed_ns * 1e-9} | columns, {LOG_TIME: "s"}, LOG_TIME, about)
 
     def _add_message(self, item: Item, row: int) -> None:
-        """Store log time and numbers of a message in row `row`.
+        """Store log time and numbers of a message in row `row`; a field that is new gets a column.
 
         Raises UnreadableData if it cannot be decoded or its fields exceed the memory limit; MissingExtra.
         """

@@ -38,7 +38,7 @@ def read_npz(path: Path, group: str | None = None) -> Table:
 
 
 def _add_array(columns: FileColumns, name: str, arrays: np.lib.npyio.NpzFile) -> None:
-    """Add the array `name`, or the fields of an array of records, to `columns`; pickled objects are left out."""
+    """Add the array `name`, or the fields of an array of records, to `columns`; list pickled objects as left out."""
     try:
         array = arrays[name]
     except ValueError:

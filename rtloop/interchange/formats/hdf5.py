@@ -113,7 +113,7 @@ def _resolve_member(columns: FileColumns, group: Any, key: str, name: str) -> An
 def _resolve_path(group: Any, path: str, links: int) -> Any:
     """Return the object at a path, reached by hard links and at most `links` soft ones within each other.
 
-    Raises _OtherFileLink where the path leaves the file, KeyError where its target does not exist.
+    Raises _OtherFileLink where the path leaves the file, KeyError without a target, and for more links.
     """
     import h5py
 
@@ -180,7 +180,7 @@ def _visit(member: Any, visited: set[Any]) -> bool:
 
 
 def _as_text(value: Any) -> str:
-    """Return text, also from bytes in UTF-8."""
+    """Return a value as text: bytes are decoded as UTF-8, invalid ones replaced, any other value is passed to `str`."""
     return value.decode("utf-8", "replace") if isinstance(value, bytes) else str(value)
 
 

@@ -19,7 +19,7 @@ def write_frame(pipe: IO[bytes], data: bytes) -> None:
 
 
 def read_frame(pipe: IO[bytes]) -> bytes | None:
-    """Return the next message; None at the end of the pipe.
+    """Return the next message; None at the end of the pipe, also if it cuts off a length.
 
     A message that the pipe's end cuts off is returned short.
     """

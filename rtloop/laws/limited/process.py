@@ -79,8 +79,9 @@ class LimitedProcess:
         With `compiles`, the compiler is loaded first; this time does not count for the limit.
         Raises the function's ConfigError, DriverError and RtloopError, of a subclass as these three; ConfigError also
         if a law's code raises another error or leaves a thread or process, and for an ArithmeticError without a law;
-        AbandonedJob if the function does not return, prints too much or ends the process. After AbandonedJob and after
-        a leftover, the process has been killed, and the next job starts another.
+        AbandonedJob if the function does not return, prints too much or ends the process; OSError if the system refuses
+        the process. After AbandonedJob and after a leftover, the process has been killed, and the next job starts
+        another.
         """
         with self._lock:
             self._law = None
@@ -214,7 +215,7 @@ class LimitedProcess:
             self._add_output(part)
 
     def _show_output(self) -> None:
-        """Write the collected output of the job to stderr."""
+        """Write the collected output of the job to stderr; it stays collected until the next job."""
         sys.stderr.write(self._printed.decode(errors="replace"))
 
     def _add_output(self, part: bytes) -> None:
@@ -249,7 +250,10 @@ class _Clock:
 
     @property
     def remaining_s(self) -> float:
-        """Time until the limit, in s, if the process does not wait for a processor again."""
+        """Time until the limit, in s, if the process does not wait for a processor again; 0 or less after it.
+
+        The time waited extends the limit, up to MAX_WAIT_FACTOR times.
+        """
         passed_s, waited_s = time.monotonic() - self._begin_s, self._waited_s - self._waited_before_s
         return min(self.limit_s + waited_s, MAX_WAIT_FACTOR * self.limit_s) - passed_s
 

@@ -69,7 +69,7 @@ class Worker:
             self._answer(*outcome)
 
     def _prepare(self, preparation: Preparation) -> Callable[..., Any]:
-        """Load a job's function and all that it needs, acknowledge, and return the function."""
+        """Set folder and module path, load a job's function and all that it needs, acknowledge; return the function."""
         os.chdir(preparation.folder)
         sys.path[:] = preparation.module_folders
         function = pickle.loads(preparation.function)

@@ -175,5 +175,8 @@ class Coupled(CoupledController):
         }
 
     def linear(self) -> SampledCoupledSystem:
-        """Return the transfer from errors to commands, with the decoupling."""
+        """Return the transfer from errors to commands, with the decoupling.
+
+        Raises ValueError for options that cannot be discretised.
+        """
         return self._controller_and_tracking[0]

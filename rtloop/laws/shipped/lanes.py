@@ -13,6 +13,6 @@ BLOCK = 2 * LANES
 
 @jit
 def sum_lanes(sums, first, second, third, fourth):
-    """Return the sum of four partial sums, stored side by side in `sums`: they are one vector to the compiler."""
+    """Return (first + second) + (third + fourth), after storing the four in `sums`: one vector to the compiler."""
     sums[0], sums[1], sums[2], sums[3] = first, second, third, fourth
     return (first + second) + (third + fourth)

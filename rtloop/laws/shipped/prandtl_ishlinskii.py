@@ -70,8 +70,8 @@ def four_plays(value, thresholds, last, i):
 def plays_sum(value, thresholds, weights, plays, count, sums):
     """Return Σ w_i F_i[value]: the outputs of the first `count` plays for `value`, times `weights`. No play moves.
 
-    `plays` are the states of the plays. Four partial sums, stored in `sums`: s[i mod 4] += w_i F_i[value] for
-    i = 0 … count − 1, then (s0 + s1) + (s2 + s3).
+    `plays` are the states of the plays, `count` is a multiple of LANES. Four partial sums, stored in `sums`: s[i mod 4]
+    += w_i F_i[value] for i = 0 … count − 1, then (s0 + s1) + (s2 + s3).
     """
     first, second, third, fourth = 0.0, 0.0, 0.0, 0.0
     for block in range(count // LANES):
@@ -101,7 +101,7 @@ def move_and_sum_plays(value, thresholds, weights, plays, count, sums):
 
 @jit
 def move_plays(value, thresholds, plays, count):
-    """Move the first `count` plays, with the states `plays`, to `value`."""
+    """Move the first `count` plays, a multiple of LANES, with the states `plays`, to `value`."""
     for block in range(count // LANES):
         i = block * LANES
         plays[i], plays[i + 1], plays[i + 2], plays[i + 3] = four_plays(value, thresholds, plays, i)

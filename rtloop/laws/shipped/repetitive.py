@@ -93,7 +93,7 @@ class Repetitive(Controller):
     def _require_contraction(self, weights: np.ndarray[Any, Any]) -> None:
         """Raise ValueError if an error grows from one period to the next at some frequency, on the axis's model.
 
-        `weights` are the g q_j of the sum, in the order of j.
+        The law must have a model. `weights` are the g q_j of the sum, in the order of j.
         """
         from rtloop.linear.discretise import zero_order_hold
 

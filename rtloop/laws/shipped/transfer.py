@@ -185,7 +185,7 @@ class TransferController(Controller):
         }
 
     def linear(self) -> DiscreteController:
-        """Return the transfer from error to command."""
+        """Return the transfer from error to command. Raises ValueError for a C(s) that cannot be discretised."""
         return self.discrete
 
 

@@ -69,8 +69,8 @@ class Events:
     def append(self, messages: Any, loop: Description, run: int) -> None:
         """Add messages (n,) of MESSAGE, n ≥ 0, of the run `run` of a loop as rows, at most the last MAX_ROWS of them.
 
-        Messages about late ticks may extend a row. The service is asked for the operators; rows without answer get
-        theirs at a later call.
+        Messages about late ticks may extend a row. The service is asked for the operators, for QUERY_TIMEOUT_S at most
+        each, up to the first question that it does not answer; the rows without answer get theirs at a later call.
         """
         is_answering = self._complete_pending()
         if run != self._run:
@@ -131,7 +131,7 @@ class Events:
         self._renew(late_row[0], add_text(summary, event_text(summary)))
 
     def _renew(self, row: EventRow, event: Event) -> None:
-        """Store an event in a row under the next number; a row with the number 0 is new and is added."""
+        """Store an event in a row under the next number; a row with the number 0 is new, and is added at the end."""
         with self._lock:
             self.newest += 1
             if row.number == 0:

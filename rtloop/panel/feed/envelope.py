@@ -26,8 +26,8 @@ class Envelope(NamedTuple):
 def envelope(values: Real, pixels: int) -> Envelope:
     """Return the envelope of evenly spaced samples (…, n), NaN for missing ones, on a screen of `pixels` pixels.
 
-    Sample i lies on pixel ⌊i·pixels/n⌋. Up to `pixels` samples are a point each; `low` and `high` are then `values`
-    itself, not a copy. Raises ValueError for pixels < 1.
+    Sample i lies on pixel ⌊i·pixels/n⌋; a pixel whose samples are all missing has NaN. Up to `pixels` samples are a
+    point each; `low` and `high` are then `values` itself, not a copy. Raises ValueError for pixels < 1.
     """
     if pixels < 1:
         raise ValueError(f"screen: {pixels} pixels; allowed: at least 1")

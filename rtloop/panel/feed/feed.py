@@ -108,7 +108,10 @@ class Feed:
             self._viewers.remove(viewer)
 
     def _read_until_ended(self) -> None:
-        """Read ticks until `stop`; the reason why they cannot be read is logged once and stored in `fault`."""
+        """Read ticks until `stop`. The reason why they cannot be read is logged once and stored in `fault`.
+
+        `fault` is None again once they can be read.
+        """
         while not self._end_event.wait(self._pause_s()):
             try:
                 self._read_all()

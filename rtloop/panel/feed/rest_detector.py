@@ -13,12 +13,12 @@ MODE = "mode"
 
 
 def find_axis(signal: str, axes: Iterable[str]) -> str | None:
-    """Return the axis with the longest name that begins the name of the signal; None if no axis does."""
+    """Return the longest axis name that, with an underscore behind it, begins the signal's name; None without one."""
     return max((axis for axis in axes if signal.startswith(f"{axis}_")), key=len, default=None)
 
 
 def reference_signal(axis: str) -> str:
-    """Return the name of the signal with the reference of the axis of this name."""
+    """Return the name of the signal with an axis's reference: x_reference_um for x."""
     return f"{axis}_reference_um"
 
 

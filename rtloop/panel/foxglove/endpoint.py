@@ -54,6 +54,7 @@ class Foxglove:
     """The endpoint for viewers whose address contains `token`, made by `viewers_token`; `name` is the server's name."""
 
     def __init__(self, feed: Feed, token: str, name: str = "rtloop") -> None:
+        """Store the feed, the viewers' token, which is not the panel's, and the name of the server."""
         self._feed, self._name, self._token = feed, name, token
         self._viewers = 0
 
@@ -63,7 +64,7 @@ class Foxglove:
         return WebSocketRoute(PATH, self.serve)
 
     def admits(self, scope: Scope) -> bool:
-        """Return whether a request is a WebSocket to PATH with the token in its address, whatever its origin."""
+        """Return whether a request is a WebSocket to PATH with the viewers' token in its address, from any origin."""
         if scope["type"] != "websocket" or scope["path"] != PATH:
             return False
         tokens = parse_qs(scope["query_string"].decode("latin-1"), max_num_fields=8).get("token", [""])
@@ -148,7 +149,10 @@ class _Viewer:
             await asyncio.sleep(due_s - self._clock())
 
     def _take_digest(self) -> tuple[tuple[str, ...], int, SignalDigest | None]:
-        """Return signal names, generation and the digest of all ticks since the last call (None without ticks)."""
+        """Return signal names, generation and the digest of all ticks since the last call (None without ticks).
+
+        The feed's lock is held meanwhile.
+        """
         with self._feed.lock:
             return self._digest.names, self._digest.generation, self._digest.take()
 
@@ -172,7 +176,7 @@ class _Viewer:
         await self._advertise(live)
 
     async def _advertise(self, channel: Channel) -> None:
-        """Announce a channel to the viewer, which may then subscribe to it."""
+        """Announce a channel to the viewer, which may then subscribe to it. Raises TimeoutError like `_send_json`."""
         self._subscriptions.channel_ids.add(channel.id)
         await self._send_json({"op": "advertise", "channels": [channel._asdict()]})
 

@@ -30,7 +30,10 @@ class Subscriptions:
         return [number for number, subscribed_channel in self._channels.items() if subscribed_channel == channel]
 
     def withdraw(self, channel: int) -> None:
-        """Remove the channel with the id `channel`, which is no longer advertised, and all subscriptions to it."""
+        """Remove the channel with the id `channel`, which is no longer advertised, and all subscriptions to it.
+
+        Raises KeyError for a channel that was not advertised.
+        """
         self.channel_ids.remove(channel)
         for number in self.numbers_for_channel(channel):
             del self._channels[number]
@@ -58,7 +61,8 @@ class Subscriptions:
     def _subscribe(self, requests: list[tuple[int, int]]) -> str | None:
         """Add subscriptions, (number, channel id) each, up to the first invalid one.
 
-        Returns the fault of that one, None if all are valid.
+        A subscription is invalid if its channel is not advertised or has one already, or if its number is in use or has
+        more than 32 bits. Returns the fault of the first invalid one, None if all are valid.
         """
         for number, channel in requests:
             if channel not in self.channel_ids:

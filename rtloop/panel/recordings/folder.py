@@ -52,7 +52,7 @@ class RecordingFolder:
         Keys: file (`shown_name`), bytes (size), captured (whether a capture made it), complete, ticks and trips
         (numbers), duration_s, created_unix_s, begins_unix_s (time of the first tick), cut ({first, end, files} that a
         cut was made for, else None), around (whether only ticks around events are in it). A value is None if it is
-        unknown, or not read yet.
+        unknown, or not read yet: a call reads new files for BUDGET_S, the others wait for a later call.
         """
         with self._lock:
             files = sorted(self._recording_files(), key=lambda file: file.modified_ns, reverse=True)[:MAX_LISTED]

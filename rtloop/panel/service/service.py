@@ -42,7 +42,7 @@ class Description:
         return self.columns[column_index(name, self.names)].unit
 
     def has_signals_of(self, loop: Description) -> bool:
-        """Return whether another loop has the same signals at the same rate."""
+        """Return whether another loop has signals of the same names, in the same order, at the same rate."""
         return (self.names, self.rate_hz) == (loop.names, loop.rate_hz)
 
 

@@ -58,8 +58,9 @@ class Density(NamedTuple):
     """Contribution of each stage to the total power."""
 
     def rms(self, low_hz: float, high_hz: float) -> float:
-        """Return the rms between two frequencies, in `unit`; frequencies outside the density contribute 0.
+        """Return the rms between two frequencies, in `unit`; 0 unless `low_hz` is below `high_hz`.
 
+        Frequencies outside the density contribute 0.
         Where two stages overlap, one is blended into the other over an octave; else a line at a change of the band
         width would count too much or too little.
         """
@@ -137,9 +138,9 @@ class Spectrum:
         return Density(*columns, unit=self._unit, powers=tuple(powers))
 
     def _feed_stages(self, samples: Real) -> None:
-        """Feed evenly spaced samples (n,) to the first stage, and what each stage decimates to the next one.
+        """Feed evenly spaced samples (n,) to the first stage, and each stage's samples, decimated, to the next one.
 
-        Adds stages as needed.
+        The rate falls by DECIMATION from stage to stage. Adds stages as needed.
         """
         number = 0
         while samples.size:
@@ -189,7 +190,7 @@ class _Stage:
         return decimated
 
     def _average(self, samples: Real) -> None:
-        """Add the periodograms of all complete segments of samples to the averages; the rest waits for more samples."""
+        """Add the periodograms of all complete segments, which overlap by half, to the averages; the rest waits."""
         step, segment = self._segment // 2, self._segment
         pending = np.concatenate([self._pending, samples])
         count = 1 + (pending.size - segment) // step

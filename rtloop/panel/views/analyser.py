@@ -37,7 +37,7 @@ class Analyser:
         return True
 
     def reset(self) -> None:
-        """Discard all averages and collected ticks."""
+        """Discard all averages and collected ticks; `at_rest` is judged anew."""
         self._batch.take()
         self._spectrum.reset()
         self._rest.reset()

@@ -72,7 +72,7 @@ class Scope:
             self._trigger.arm()
 
     def force(self) -> None:
-        """Begin a sweep at the next tick, or at the end of the open sweep; no effect in mode roll."""
+        """Begin a sweep at the next tick, or at the end of the open sweep, armed or not; no effect in mode roll."""
         if self._trigger is not None:
             self._trigger.force()
 
@@ -144,7 +144,8 @@ class Scope:
         """Return the binary message "sweep": arrays NAME:low and NAME:high, the extremes of each signal at each point
         of the screen, and `offset`, each point's first tick, counted from the trigger (below 0 before it).
 
-        `is_complete` is False for a sweep that still grows.
+        The header has the fields of `sweep` (`cause` is "roll" in mode roll), `mode`, `number` (of sweeps that ended),
+        `complete`, `rate_hz` and `signals`. `is_complete` is False for a sweep that still grows.
         """
         signals = self.subscription.signals
         points = past.points(signals, sweep.first, sweep.end, self.subscription.pixels)

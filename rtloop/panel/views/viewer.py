@@ -70,7 +70,9 @@ class Viewer:
                 self._refuse(name, str(error))
 
     def feed(self, stretch: Stretch, commands: Sequence[int]) -> None:
-        """Take the next ticks; `commands` are the ticks at which commands took effect."""
+        """Pass the next ticks to scope and analyser; `commands`, the ticks at which commands took effect, can trigger
+        the scope.
+        """
         if self._scope is not None:
             self._scope.feed(stretch, commands)
         if self._analyser is not None:
@@ -86,7 +88,8 @@ class Viewer:
     def handle_message(self, text: str) -> None:
         """Carry out a JSON message of the client, field by field.
 
-        An invalid field keeps its old value, and a message "refused" is queued for it.
+        An invalid field keeps its old value, and a message "refused" is queued for it. A text that is not a JSON object
+        changes nothing, and one "refused" with the field "message" is queued.
         """
         try:
             fields = read_message(text)
@@ -104,7 +107,7 @@ class Viewer:
     def due_frames(self) -> list[bytes]:
         """Return the binary messages that are due now, the queued refusals first; [] if there are none.
 
-        Removes the refusals from the queue, and sets the time from which each kind of message is due again.
+        Removes the refusals from the queue. A returned kind of message is due again after its period, PERIODS_S.
         """
         now_s = time.monotonic()
         frames, self._refusals = self._refusals, []
@@ -166,8 +169,8 @@ class Viewer:
 
     def _state_frame(self) -> bytes:
         """Return the binary message "state": the keys of `StateListener.status`, and of the feed `unix_s` (now),
-        `age_s` (time since the newest tick, s; None if unknown), `lost` (ticks), `run`, `fault` (None if there is none)
-        and `references` (those that play).
+        `age_s` (time since the newest tick, s; None if unknown), `lost` (ticks, in all runs), `run`, `fault` (None if
+        there is none) and `references` (those that play).
         """
         feed = self._feed
         feed_fields = {"age_s": feed.age_s, "lost": feed.lost_ticks, "run": feed.run, "fault": feed.fault}
@@ -175,7 +178,9 @@ class Viewer:
         return pack_frame("state", self._state.status | {"unix_s": time.time()} | feed_fields)
 
     def _sweep_frame(self) -> bytes | None:
-        """Return the binary message "sweep"; None without a new sweep, and while the client holds the screen."""
+        """Return the scope's binary message "sweep"; None without a scope or a new sweep, and while the client holds
+        the screen.
+        """
         past = self._feed.past
         return None if self._scope is None or self._is_held or past is None else self._scope.frame(past)
 

@@ -85,8 +85,8 @@ class XyPlot:
     def _earlier_drive(self, past: TickHistory, first: int) -> Real:
         """Return the drive before tick `first`, V (m,), oldest first, over at most four times the shown duration.
 
-        It has the extremes of whole blocks, then the ticks after the last block, without lost ticks; empty before
-        tick 1.
+        It has the extremes of whole blocks, then the ticks after the last block, without lost ticks; empty if
+        `first` ≤ 0.
         """
         if first <= 0:
             return np.zeros(0)
@@ -98,7 +98,9 @@ class XyPlot:
 
 
 def order_extremes(low: Real, high: Real) -> Real:
-    """Return the extremes (points,) of a signal in the order in which it reached them, (2·points,), without NaN."""
+    """Return the extremes (points,) of a signal as (2·points,): at each point low and high in the order that the
+    slope between points suggests; points with NaN are left out.
+    """
     valid = np.isfinite(low) & np.isfinite(high)
     low, high = low[valid], high[valid]
     if low.size < 2:
@@ -131,7 +133,7 @@ def bin_means(signal: Real, bins: int) -> Real:
 
 def extreme_indices(signals: list[Real], bins: int) -> np.ndarray[Any, np.dtype[np.intp]]:
     """Return the indices, ascending, of the smallest and largest sample of each signal (n,) in each of `bins` time
-    bins; all indices if they are not more than that.
+    bins; all n indices if n ≤ 2·signals·bins.
     """
     count = signals[0].size
     if count <= 2 * len(signals) * bins:

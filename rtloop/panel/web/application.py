@@ -74,7 +74,10 @@ def application(service: Service, sessions: Sessions, viewers_token: str | None 
 
     @with_error_responses
     async def session(request: Request) -> Response:
-        """Exchange the token for the cookie of a new session; 401 for a wrong token, 429 after too many tries."""
+        """Exchange the `token` in the JSON body for the cookie of a new session, with status 204.
+
+        401 for a wrong or missing token, 429 after too many tries of a client.
+        """
         if not login_rates.allows(identify_client(request.scope)):
             raise RequestRefused(429, f"too many attempts to log in; allowed: {login_rates}; try again later")
         try:

@@ -30,7 +30,7 @@ class Stream(WebSocketsSansIOProtocol):
     """A WebSocket that is aborted CLOSE_S after it was closed, even if its client has not read all of it."""
 
     async def run_asgi(self) -> None:
-        """Serve the WebSocket, then schedule its abort."""
+        """Serve the WebSocket, then schedule its abort CLOSE_S later."""
         await super().run_asgi()
         self.loop.call_later(CLOSE_S, self.cut)
 
@@ -82,7 +82,7 @@ class Live:
         tasks.cancel()
 
     async def _listen(self, socket: WebSocket, viewer: Viewer) -> None:
-        """Pass the client's messages to `viewer`, one each 1/MESSAGES_PER_S, until the client disconnects.
+        """Pass the client's messages to `viewer`, one each 1/MESSAGES_PER_S; return when the client disconnects.
 
         Messages that come faster wait unread.
         """

@@ -59,8 +59,8 @@ class Proxy:
     async def _command(self, entry: ApiRequest, request: Request) -> Response:
         """Forward a command and return its response.
 
-        Raises RequestRefused beyond the limits of rate (429; not for a stop or a reset) and size (413), and the errors
-        of `_forward`.
+        Raises RequestRefused beyond the limits of rate, of all clients together (429; not for a stop or a reset), and
+        size (413), and the errors of `_forward`.
         """
         lane = entry.lane or Lane.ORDINARY
         if lane is not Lane.SAFETY and not self._rate.allows():

@@ -29,6 +29,7 @@ class RateLimit:
         self._allowance, self._updated_s = float(burst), now_s()
 
     def __str__(self) -> str:
+        """The average rate for a message: "50 a second"."""
         return f"{self._per_s:g} a second"
 
     def allows(self) -> bool:
@@ -53,6 +54,7 @@ class ClientRateLimits:
         return len(self._rates)
 
     def __str__(self) -> str:
+        """The average rate of one client for a message: "5 a second"."""
         return str(self._make_limit())
 
     def allows(self, client: Hashable) -> bool:

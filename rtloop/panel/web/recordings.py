@@ -63,9 +63,10 @@ class Recordings:
 
     @with_error_responses
     async def download(self, request: Request) -> Response:
-        """Respond with the recording in the address, of a file that still grows with its present content.
+        """Respond with the recording in the address; with the present content of a file that still grows.
 
-        404 for a file that is not in the folder of recordings, or was removed meanwhile.
+        A request may name ranges of bytes of a finished file (.mcap). 404 for a file that is not in the folder of
+        recordings, or was removed meanwhile.
         """
         path = await self._recording_path(request)
         name = shown_name(path.name)
@@ -81,7 +82,10 @@ class Recordings:
 
     @with_error_responses
     async def info(self, request: Request) -> Response:
-        """Respond with the JSON of `rtloop info --json` for the recording in the address, or 422 with its error."""
+        """Respond with the JSON of `rtloop info --json` for the recording in the address, or 422 with its error.
+
+        404 for a file that is not in the folder of recordings.
+        """
         return PlainJSONResponse(
             await self._processes.run("rtloop", "info", await self._recording_path(request), "--json")
         )
@@ -90,7 +94,8 @@ class Recordings:
     async def plot(self, request: Request) -> Response:
         """Respond with the PNG of `rtloop plot` for the recording in the address, or 422 with its error.
 
-        The query may give `from` and `until`, in s since the start of the run.
+        The query may give `from` and `until`, in s since the start of the run. 404 for a file that is not in the folder
+        of recordings.
         """
         path = await self._recording_path(request)
         span_request = validate_request(Span, dict(request.query_params))
@@ -107,7 +112,8 @@ class Recordings:
     async def sweep(self, request: Request) -> Response:
         """Respond with a sweep from the recording in the address, as the scope's binary message "sweep".
 
-        The query has the fields of SweepRequest, with commas between the signals.
+        The query has the fields of SweepRequest, with commas between the signals. 422 for an invalid query, and for
+        ticks or signals that the file does not have; 404 for a file that is not in the folder of recordings.
         """
         path, query = await self._recording_path(request), dict(request.query_params)
         sweep_request = validate_request(SweepRequest, query | {"signals": tuple(query.get("signals", "").split(","))})
@@ -117,10 +123,10 @@ class Recordings:
 
     @with_error_responses
     async def capture(self, request: Request) -> Response:
-        """Save ticks of the running loop as a recording, replay it, and respond with {file (name), first, end, ticks
-        (number), gaps, problems, replay (verdict)}.
+        """Save ticks `first` … `end` − 1 of the running loop as a recording, once the last is written, and replay it.
 
-        The body is a CaptureBody. 410 if the loop was started again since the run that it names.
+        The body is a CaptureBody. Responds with {file (name), first, end, ticks (number), gaps, problems, replay
+        (verdict)}; 410 if the loop was started again since the run in the body.
         """
         body = validate_request(CaptureBody, await limited_body(request, MAX_BODY_BYTES))
         if body.run not in (None, self._current_run()):

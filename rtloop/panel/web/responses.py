@@ -75,7 +75,10 @@ async def limited_body(request: Request, max_bytes: int) -> bytes:
 
 
 def decode_json(data: bytes) -> object:
-    """Return the value in JSON bytes. Raises ValueError for invalid or too deeply nested JSON."""
+    """Return the value in JSON bytes, in which NaN and Infinity are allowed.
+
+    Raises ValueError for invalid or too deeply nested JSON.
+    """
     try:
         return json.loads(data)
     except RecursionError:

@@ -75,7 +75,7 @@ class Retuning:
         return await self._respond(request, RetuneBody, ends_with_page=True)
 
     async def _swap(self, request: Request) -> Response:
-        """Swap in the taps of a proposal, also if the page disconnects meanwhile."""
+        """Swap in the taps of a proposal, also if the page disconnects meanwhile; respond with the command's JSON."""
         return await self._respond(request, SwapBody, ends_with_page=False)
 
     @with_error_responses

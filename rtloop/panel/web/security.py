@@ -68,7 +68,8 @@ class Sessions:
 class Guard:
     """Middleware that admits requests from the panel's own pages on this host with a session; pages need no session.
 
-    `is_admitted` returns True for a request that is admitted on other grounds, whatever its origin.
+    `is_admitted` returns True for a request that is admitted without a session, whatever its origin; its Host header
+    must still name this host.
     """
 
     def __init__(
@@ -103,7 +104,8 @@ class Guard:
     def _refusal(self, scope: Scope) -> tuple[int, str] | None:
         """Return HTTP status and reason of a refusal; None to admit.
 
-        403 for a host that is not this one or an origin that is not the panel's page, 401 without a session.
+        403 for a Host header that does not name this host. Unless `is_admitted`: 403 for an origin that is not the
+        panel's page, 401 without a session on a path that is not public.
         """
         headers, path = Headers(scope=scope), scope["path"]
         host, origin = headers.get("host", ""), headers.get("origin")

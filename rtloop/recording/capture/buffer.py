@@ -88,7 +88,7 @@ class TickBuffer:
         return copied + lost
 
     def first_rows(self, count: int) -> Real:
-        """Return the first `count` rows (count, columns): a view, valid until the next `drop`."""
+        """Return the first `count` rows, at most `len()`, as (count, columns): a view, valid until the next `drop`."""
         return self._rows[:count]
 
     def count_before(self, tick: int) -> int:
@@ -96,7 +96,7 @@ class TickBuffer:
         return int(np.searchsorted(self._rows[: self._row_count, TICK], tick))
 
     def drop(self, count: int) -> None:
-        """Discard the first `count` rows; `tick_time` still extrapolates from the last of them."""
+        """Discard the first `count` rows, at most `len()`; `tick_time` still extrapolates from the last of them."""
         if count:
             self._anchor = (self._rows[count - 1, TICK], self._rows[count - 1, DEADLINE])
         remaining = self._row_count - count

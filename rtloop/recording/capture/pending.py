@@ -53,7 +53,7 @@ class PendingMessages:
         )
 
     def add_snapshot(self, data: bytes) -> None:
-        """Append a snapshot of the law, preceded by its SHA-256; `data` begins with the snapshot's tick."""
+        """Append one message for a snapshot of the law: SHA-256 of `data`, then `data`, which begins with its tick."""
         tick = snapshot_tick(data)
         message = Message(format.LAW, self.log_time(tick), hashlib.sha256(data).digest() + data)
         self._entries.append(PendingEntry(tick, message, from_loop=False))
@@ -96,5 +96,5 @@ def count_pending(entries: Iterable[PendingEntry], channel: int) -> int:
 
 
 def snapshot_tick(snapshot: bytes) -> int:
-    """Tick at which the law's snapshot was taken: its first eight bytes."""
+    """Tick at which the law's snapshot was taken: its first eight bytes, little-endian and unsigned."""
     return int.from_bytes(snapshot[:8], "little")

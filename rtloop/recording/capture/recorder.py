@@ -115,8 +115,9 @@ def record_run(fd: int, names: RequesterNames | None = None) -> int:
     """Record one run from the shared block at descriptor `fd`, as a line on stdin orders; print the totals as JSON.
 
     Waits for the block and the order, and stores RECORDER_STATE in the block. Returns the exit code: 0, also if the
-    supervisor ended before there was a block (without a print), or 1 after an RtloopError, which the totals name. Other
-    errors, such as those of a damaged block or a malformed order, are raised without a print.
+    supervisor ended before there was a block (without a print), or 1 if the totals name an error: an RtloopError, or a
+    failed write, even if recording resumed. Other errors, such as those of a damaged block or a malformed order, are
+    raised without a print.
     """
     try:
         block = SharedBlock.attach(fd, _is_supervisor_gone)

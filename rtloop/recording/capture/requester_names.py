@@ -40,9 +40,9 @@ class RequesterNames:
         close_descriptor(self.fd)
 
     def store(self, identity: int, name: str) -> None:
-        """Store `name` as the requester of command `identity` (1 or more).
+        """Store `name`, at most MAX_NAME characters, as the requester of command `identity` (1 or more).
 
-        It overwrites the name for command `identity` − EVENT_SLOTS.
+        The name for command `identity` − EVENT_SLOTS is overwritten.
         """
         store_release(self._identity_address(identity), 0)
         self._slots[identity % EVENT_SLOTS]["name"] = name.encode()

@@ -36,7 +36,10 @@ def numbered_path(path: Path, sequence: int) -> Path:
 
 
 def predecessor_file(path: Path, sequence: int) -> Path | None:
-    """Path of the unfinished file (.part) of a dead recorder, before file number `sequence`; None if there is none."""
+    """Path of the unfinished file (.part) with number `sequence` − 1, of a dead recorder; None if there is none.
+
+    File number 1 may also have the name `path` without a number.
+    """
     paths = [numbered_path(path, sequence - 1), *([path] if sequence == 2 else [])]
     parts = [name.with_name(f"{name.name}.part") for name in paths]
     return next((part for part in parts if part.exists()), None)
@@ -71,12 +74,12 @@ class RunFiles:
 
     @property
     def paths(self) -> list[Path]:
-        """Paths of the finished files that exist."""
+        """Paths of the finished files that exist, oldest first."""
         return [path for path in self._opened_paths if path.exists()]
 
     @property
     def ticks_logged(self) -> int:
-        """Number of ticks in files, those of earlier recorders of the run included."""
+        """Number of ticks in files, the present file and those of earlier recorders of the run included."""
         return self._closed_ticks + (self.writer.ticks if self.writer else 0)
 
     @property
@@ -112,7 +115,7 @@ class RunFiles:
         return writer
 
     def switch(self, writer: Writer) -> None:
-        """Make `writer` the present file; it accounts for the ticks from `end_place` on."""
+        """Make `writer` the present file, for the ticks from `end_place` on; the former file must be finished."""
         self.writer, self.file_begin = writer, self.end_place
 
     def write(

@@ -67,7 +67,7 @@ class SegmentBuffer:
     """Segments from tick `begin` on; the buffer retains all ticks up to `retain_until`, with or without an event."""
 
     def __init__(self, window: EventWindow, columns: list[str], rate_hz: float, begin: int, retain_until: int) -> None:
-        """Begin with a segment at tick `begin`, which is retained, as are all ticks up to `retain_until` (−1: none).
+        """Begin with a segment at tick `begin`, which is retained, as are all ticks ≤ `retain_until` (−1: none).
 
         `window` has the conditions and the times to retain, `columns` the names of the signals. Raises ValueError for a
         condition that does not fit `columns`.
@@ -111,7 +111,7 @@ class SegmentBuffer:
         return new_hits
 
     def add(self, entries: list[PendingEntry], rows: Real) -> None:
-        """Append messages and ticks to the present segment."""
+        """Append messages and ticks to the present segment, without a copy of `entries` and `rows`."""
         self._segments[-1].batches.append(DrainedBatch(entries, rows))
         if len(rows):
             self._newest_tick = int(rows[-1, TICK])

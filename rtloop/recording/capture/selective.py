@@ -83,7 +83,7 @@ class SelectiveSession(Session):
     def _write_remaining(self, result: str) -> None:
         """Write all waiting ticks and messages.
 
-        If `result` is "finished", overviews replace ticks far from events.
+        If `result` is "finished", overviews replace ticks far from events; after any other end all are retained.
         """
         super()._write_remaining(result)
         self._write(0, self._pending.take_entries())
@@ -125,7 +125,7 @@ class SelectiveSession(Session):
         return self._segments.first_waiting_tick
 
     def _finish_file(self, kind: str, result: str, end_tick: int, event_tick: int) -> None:
-        """Finish the file as `Session` does, with its last event at `end_tick` at the latest.
+        """Finish the file as `Session` does, with its last event at `event_tick`, but not after `end_tick`.
 
         Ticks that still wait, from `end_tick` on, go into the next file.
         """

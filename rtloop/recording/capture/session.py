@@ -149,8 +149,8 @@ class Session:
 
         `result`: how the loop ended, as `Recorder.record` returns it. Returns {path, paths, ticks_logged, ticks_lost,
         events_lost, bytes, complete, error}: `paths` are the finished files of this session that exist, `path` is the
-        last of them or, without one, the path of the run, `bytes` the size of all files, `error` the first failure or
-        None.
+        last of them or, without one, the path of the run, `bytes` the size of the files that this session finished,
+        `error` the first failure or None. The counts of ticks include those of earlier recorders of the run.
         """
         self._write_remaining(result)
         self._pending.count_dropped(self._pending.take_entries())
@@ -304,13 +304,14 @@ class Session:
         return tick
 
     def _write_all(self) -> None:
-        """Write all drained ticks and waiting messages."""
+        """Write all drained ticks and waiting messages; a failed write sets `failure`, as in `_write`."""
         self._write(len(self._buffer), self._pending.take_entries())
 
     def _write(self, count: int, entries: list[PendingEntry]) -> None:
         """Write `entries`, then the first `count` rows, and drop these rows from the buffer.
 
-        While no file can be written, rows and snapshots are lost and events wait.
+        A failed write sets `failure` and does not raise. While no file can be written, rows and snapshots are lost and
+        events wait.
         """
         self._last_write_s = time.monotonic()
         if self.failure is None:

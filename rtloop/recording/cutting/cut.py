@@ -146,7 +146,7 @@ def cut_path(path: Path, tick: int, kind: str = "cut") -> Path:
 def _requested_range(
     source: RunSource, first: int | None, end: int | None, from_s: float | None, until_s: float | None
 ) -> TickRange:
-    """Return the range of ticks that the arguments of `cut` request; times replace ticks.
+    """Return the range of ticks that the arguments of `cut` request; a time that is not None replaces its tick.
 
     Raises RecordingError for an empty range, or one that is not wholly in the recording.
     """

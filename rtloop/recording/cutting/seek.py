@@ -81,7 +81,9 @@ class ChunkSeeker:
         return int(due_rows[0, TICK]) if len(due_rows) else None
 
     def rows(self, place: int, first: int, end: int) -> Rows:
-        """Rows (n, columns) of the ticks [first, end) in chunk number `place`; shape (0, 0) without any."""
+        """Rows (n, columns) of the ticks [first, end) in chunk number `place`; shape (0, 0) without any, also for a
+        damaged chunk and `end`.
+        """
         span = self.span(place) if place < self.end else None
         if span is None or span.last < first or span.first >= end:
             return np.empty((0, 0))

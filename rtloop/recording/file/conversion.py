@@ -43,7 +43,7 @@ _lock = threading.Lock()
 def open_converted_copy(source: McapSource) -> McapSource:
     """Open the copy of a file in rtloop's own layout; the first call for a file makes the copy.
 
-    The caller closes the returned source; the copy itself stays until `forget_copies`.
+    The caller closes the returned source; `source` stays open, and the copy itself stays until `forget_copies`.
     Raises RecordingError if the file holds no recording or several, is damaged, or if there is no room for the copy.
     """
     with _lock:

@@ -26,7 +26,7 @@ class EventWindow(NamedTuple):
 
     @classmethod
     def from_header(cls, header: Mapping[str, Any]) -> Self | None:
-        """Settings of a header; None for a recording of every tick."""
+        """Settings `around` of a valid header; None for a recording of every tick."""
         fields = header.get("around")
         return fields and cls(fields["before_s"], fields["after_s"], tuple(fields["on"]), fields["every_s"])
 

@@ -90,7 +90,7 @@ class Reader:
         self.close()
 
     def close(self) -> None:
-        """Close the file; a closed reader cannot read."""
+        """Close the file; a closed reader cannot read, nor be closed again."""
         self._source.close()
 
     def restrict_begin(self, tick: int) -> None:
@@ -145,7 +145,10 @@ class Reader:
         return [entry for entry in self.entries if may_hold(entry, format.TICKS)]
 
     def chunks_between(self, start_s: float, end_s: float) -> list[ChunkEntry] | None:
-        """The chunks that may hold ticks due between two times, in s since the start; None stands for all of them."""
+        """The chunks that may hold ticks due from `start_s` to `end_s` since the start, both included.
+
+        None stands for all of them.
+        """
         if start_s <= 0.0 and math.isinf(end_s):
             return None
         start_ns, end_ns = start_s * 1e9 + self.start_unix_ns, end_s * 1e9 + self.start_unix_ns
@@ -213,9 +216,10 @@ class Reader:
 
     @property
     def events(self) -> list[Event]:
-        """Events {tick, time_ns, kind, who, axis, what} in the order of the file.
+        """Events {tick, time_ns (since the start of the run), kind, who, axis, what} in the order of the file.
 
-        Events of the loop that are read from another file of the run are left out.
+        Events of the loop that are read from another file of the run are left out. Damage is listed in `problems`, or
+        raises RecordingError unless the reader is tolerant.
         """
         return [event for event in self._events if event["who"] == RECORDER or self.owns(event["tick"])]
 
@@ -388,7 +392,7 @@ def snapshot_tick(snapshot: Message) -> int:
 
 
 def _require_digest(snapshot: Message) -> None:
-    """Raise MalformedText unless a message of `/law` agrees with its SHA-256 and has a possible tick."""
+    """Raise MalformedText unless a message of `/law` agrees with its SHA-256 and has a tick, at most LARGEST."""
     digest, data = snapshot.payload[:DIGEST_BYTES], snapshot.payload[DIGEST_BYTES:]
     if hashlib.sha256(data).digest() != digest or len(data) < 8 or snapshot_tick(snapshot) > LARGEST:
         raise MalformedText("a snapshot of the law is damaged")

@@ -113,12 +113,13 @@ def recover(
     progress: ReportTicks | None = None,
     opener: Opener = open_user_file,
 ) -> dict[str, Any]:
-    """Write a finished recording of the readable data in `path`, opened by `opener`; `progress` receives tick counts.
+    """Write a finished recording of the readable data in `path`, which stays unchanged.
 
-    `output` is `recovered_path` if None; an unfinished output of an earlier attempt is removed. Returns {recording,
-    output, ticks, gaps [(first tick, count)], problems, complete}: `complete` is True for a finished run without a
-    loss. Raises RecordingError if a recorder is writing `path` or it cannot be read, OutputError if the output exists,
-    another process is writing it or it cannot be written completely; an incomplete output is removed.
+    `opener` opens `path`, `progress` receives the number of ticks so far. `output` is `recovered_path` if None; an
+    unfinished output of an earlier attempt is removed. Returns {recording, output, ticks, gaps [(first tick, count)],
+    problems, complete}: `complete` is True for a finished run without a loss. Raises RecordingError if a recorder is
+    writing `path` or it cannot be read, OutputError if the output exists, another process is writing it or it cannot be
+    written completely; an incomplete output is removed.
     """
     path = Path(path)
     output = recovered_path(path) if output is None else Path(output)

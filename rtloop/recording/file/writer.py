@@ -136,8 +136,8 @@ class Writer:
 
         If the disk is full, the last chunks are dropped to make room, their ticks are subtracted from `ticks` and
         `ticks_skipped`, and `final_message` is called again; with `require_all`, OutputError is raised instead. Raises
-        OutputError for any other failure, NotOnDisk if the file may not be on the disk; it then keeps the name of an
-        unfinished file.
+        OutputError for any other failure, NotOnDisk if the file may not be on the disk. After an error the file keeps
+        the name of an unfinished one, and the caller calls `close` or `discard`.
         """
         max_chunks = len(self.file)
         while not self._try_write_end(final_message, require_all):
@@ -151,7 +151,7 @@ class Writer:
         self.file.close()
 
     def discard(self) -> None:
-        """Give up the file and remove it."""
+        """Close the unfinished file and remove it; one that cannot be removed stays, without an error."""
         self.file.discard()
 
     def _count_skipped(self, messages: Sequence[Message]) -> None:

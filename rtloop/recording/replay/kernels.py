@@ -28,7 +28,10 @@ class Strided(NamedTuple):
 
     @classmethod
     def of(cls, rows: Real) -> Strided:
-        """Return the address and the steps of `rows`. Raises ValueError for items that are not doubles."""
+        """Return the address of `rows`, valid as long as `rows` exists, and the steps in items of eight bytes.
+
+        Raises ValueError for items that are not doubles.
+        """
         if rows.dtype != np.float64 or any(step % ITEM_BYTES or step < 0 for step in rows.strides):
             raise ValueError(
                 f"rows: values of type {rows.dtype}, {' and '.join(map(str, rows.strides))} bytes apart; allowed: "

@@ -120,8 +120,8 @@ class Replay:
     ) -> None:
         """Prepare a replay from the first of `snapshots`, which are in order; no tick is executed yet.
 
-        `laws` are those of the recorded loop, in its order. `progress` receives the number of compared ticks. A command
-        that is recorded twice or out of order is reported as unverified.
+        Without any snapshot, `run` raises. `laws` are those of the recorded loop, in its order. `progress` receives the
+        number of compared ticks. A command that is recorded twice or out of order is reported as unverified.
         """
         self._laws = laws
         self._recording, self._snapshots, self._progress = recording, snapshots, progress
@@ -185,7 +185,8 @@ class Replay:
     def _account_gap(self, expected: int, first: int) -> None:
         """Report the missing ticks from `expected` to before `first`, and end the rerun if there are any.
 
-        Ticks omitted by intention count as skipped; ticks without a gap event count as unverified.
+        Ticks omitted by intention count as skipped; all others are added to the `gaps` of the report, and those without
+        a gap event also count as unverified.
         """
         if first == expected:
             return

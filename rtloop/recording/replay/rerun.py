@@ -67,7 +67,7 @@ class RecordedInputs:
         return self._playback.pointers()
 
     def load(self, rows: Rows) -> None:
-        """Load at most SLICE_TICKS rows (n, columns) into the playback driver, in its layout."""
+        """Load at most SLICE_TICKS rows (n, columns) into the playback driver, in place of the former ones."""
         fill_tape(rows, self._pairs, self._tape, self._refused_writes)
         self._playback.load(self._tape[: len(rows)], self._refused_writes[: len(rows)])
 
@@ -86,7 +86,7 @@ class SimulatedInputs:
         self.facts, self.wiring, self._driver = driver.facts, driver.wiring, driver
 
     def pointers(self) -> Pointers:
-        """Open the driver. Returns its pointers. Raises DriverError if it cannot be opened."""
+        """Open the driver, which the caller closes. Returns its pointers. Raises DriverError if it cannot be opened."""
         return self._driver.open()
 
     def load(self, rows: Rows) -> None:

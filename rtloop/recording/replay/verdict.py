@@ -33,12 +33,12 @@ class ReplayReport:
 
     @property
     def identical(self) -> bool:
-        """Whether every recorded tick was executed and compared, in order, once, and none differed."""
+        """Whether all recorded ticks, at least one, were compared once, in order, and no tick or snapshot differed."""
         return self.ticks > 0 and self.first_difference is None and not self.not_verified
 
     @property
     def unverified(self) -> int:
-        """Number of recorded ticks that were not compared, as far as it is known."""
+        """Number of recorded ticks that were not compared; a range of unknown length counts as 0."""
         return sum(entry["count"] or 0 for entry in self.not_verified)
 
     def add_unverified(self, first_tick: int | None, count: int | None, reason: str) -> None:
@@ -75,7 +75,10 @@ class ReplayReport:
 
 
 def unjudged_contents(header: Mapping[str, Any]) -> list[str]:
-    """Descriptions of recorded contents that no replay can judge, since no output of the law depends on them."""
+    """Texts, one for each kind of recorded contents that no replay can judge: no output of the law depends on these.
+
+    The texts are the same for every recording but for the names of its observed signals.
+    """
     measured_names = ", ".join(signals.COMMON_SIGNALS[column].name for column in signals.MEASURED_COLUMNS)
     return [
         f"measured times: {measured_names}, flag OVERRUN, rate_hz, host",

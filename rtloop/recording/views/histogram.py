@@ -66,9 +66,9 @@ class TimeHistogram:
         return [float(values[np.searchsorted(cumulative, rank)]) / NS_PER_US for rank in ranks]
 
     def class_counts(self) -> list[dict[str, Any]]:
-        """Counts by class as {below_us, count}, each from the bound of the class before; [] without values.
+        """Counts of all classes, also empty ones, as {below_us, count}; [] without values.
 
-        `below_us` is None for the last class.
+        A class holds times from the bound of the class before up to, not including, `below_us` (None for the last one).
         """
         edges_ns = [round(edge * NS_PER_US) for edge in CLASSES_US]
         small = [int(part.sum()) for part in np.split(self._counts, edges_ns)]

@@ -81,10 +81,10 @@ def measure_steps(
 def measure_step(
     position_um: npt.NDArray[np.float64], level_um: float, height_um: float, rate_hz: float
 ) -> tuple[float, float, float]:
-    """Return overshoot %, settling time ms and static error % of one step by `height_um` to `level_um`.
+    """Return overshoot %, settling time ms and static error % of one step of the reference to `level_um`.
 
-    The first of `position_um` (n,) is the position before the step. Definitions and infinite or missing figures are
-    the same as in `measure_steps`.
+    `height_um`, not 0, is the change of the reference, negative for a step down. The first of `position_um` (n,) is the
+    position before the step. Definitions and infinite or missing figures are the same as in `measure_steps`.
     """
     before_um, position_um = position_um[0], position_um[1:]
     final_um = float(np.mean(position_um[-max(1, position_um.size // 5) :]))

@@ -121,7 +121,7 @@ class Summary:
     bytes_per_tick: float | None
 
     def as_dict(self) -> dict[str, Any]:
-        """Summary as a dict for JSON, keys as the fields."""
+        """Summary as a dict, keys as the fields; axes, ranges and trips are dicts. NaN and infinity stay floats."""
         return asdict(self)
 
 
@@ -135,9 +135,9 @@ class AxisTotals:
         self._motion = Motion()
 
     def add(self, column: dict[str, Real], is_closed_loop: npt.NDArray[np.bool_] | None) -> None:
-        """Add a block, arrays (n,) by column name; mask `is_closed_loop` (n,) is None without a column of modes.
+        """Add a block, arrays (n,) by column name; imported signals may lack error or drive.
 
-        Imported signals may lack error or drive.
+        Mask `is_closed_loop` (n,) is None without a column of modes: then only the drive counts.
         """
         error_um, drive_v = column.get(f"{self.name}_error_um"), column.get(f"{self.name}_drive_v")
         if error_um is not None and is_closed_loop is not None:

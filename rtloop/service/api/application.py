@@ -71,7 +71,10 @@ def application(service: Service) -> Starlette:
                 await asyncio.sleep(1 / WATCH_HZ)
 
     async def setpoints(socket: WebSocket) -> None:
-        """Receive setpoints as JSON texts, and send for each one the response to `/setpoint`: its tick or an error."""
+        """Receive setpoints as JSON texts, and send for each one the response to `/setpoint`: its tick or an error.
+
+        The WebSocket stays open after an error.
+        """
         setpoint = _REQUESTS["POST", "/setpoint"]
         async with stream(socket) as accepted:
             while accepted:

@@ -127,7 +127,7 @@ class WaveformBody(Body):
 
     @property
     def columns(self) -> npt.NDArray[np.float64]:
-        """Samples (n, 1) in µm (V in raw mode), or (n, 2) with `command_um` as the second column."""
+        """Samples (n, 1) in µm (V in raw mode), or (n, 2) with `command_um`, always in µm, as the second column."""
         return np.array([self.samples, self.command_um] if self.command_um else [self.samples], float).T
 
 

@@ -28,7 +28,7 @@ class BoundedConnection(H11Protocol):
     _timer: asyncio.TimerHandle | None = None
 
     def connection_made(self, transport: Any) -> None:
-        """Count the connection, abort the oldest idle one if there are too many, and wait for a request."""
+        """Count the connection and wait for a request; with too many, abort the oldest idle one, or else this one."""
         super().connection_made(transport)
         self._open_connections[self] = None
         if len(self._open_connections) > self.max_connections:
@@ -84,7 +84,9 @@ class BoundedConnection(H11Protocol):
 
 
 def server_settings(application: Any) -> uvicorn.Config:
-    """Return uvicorn's configuration for a control socket."""
+    """Return uvicorn's configuration that serves `application` over BoundedConnections, on a socket that is open
+    already.
+    """
     return uvicorn.Config(
         application,
         http=BoundedConnection,

@@ -15,8 +15,8 @@ from rtloop.service.desk import UnconfirmedCommand
 def error_response(error: Exception) -> Response:
     """Return {error: message} as a response, with the status of the error's class.
 
-    422 for an invalid request, 503 for a full lane or UnavailableError, 504 for UnconfirmedCommand, 409 for any other
-    RtloopError or DriverError. Raises any other `error` itself.
+    422 for ValidationError and ConfigError, 503 for a full lane (TooManyRequests) and UnavailableError, 504 for
+    UnconfirmedCommand, 409 for any other RtloopError and DriverError. Raises any other `error` itself.
     """
     match error:
         case ValidationError():

@@ -124,7 +124,7 @@ class QualityCollector(Collector):
         self._quality = quality
 
     def collect(self) -> Iterator[Metric]:
-        """Yield the metrics, from sums of one moment."""
+        """Yield the metrics, all from sums of one moment, also while no loop runs."""
         with self._quality.lock:
             yield from [*self._loop_metrics(), *self._axis_metrics()]
 
@@ -152,8 +152,8 @@ class QualityCollector(Collector):
         yield lateness
 
     def _axis_metrics(self) -> Iterator[Metric]:
-        """Yield the sums of each axis as counters, and its largest |error| and its ends of the drive in the last minute
-        as gauges.
+        """Yield the sums of each axis as counters, and as gauges its largest |error| (µm) and its lowest and highest
+        drive (V) of the last minute.
         """
         axes = self._quality.axes
         for name, text, field in (

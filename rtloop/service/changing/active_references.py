@@ -56,7 +56,10 @@ class ActiveReferences:
     """References of the axes in the loop of `staging`, which began with `plan`. Thread-safe."""
 
     def __init__(self, plan: Plan, staging: Staging) -> None:
-        """Begin with mode and references of `plan`; no event is read before `follow` or `newest`."""
+        """Begin with mode and references of `plan`; no event is read before `follow` or `newest`.
+
+        `staging` gives access to the loop's events and its newest record.
+        """
         self._staging, self._period_s = staging, 1.0 / plan.pacing.rate_hz
         self._lock = threading.Lock()
         self._cursor = 0
@@ -115,7 +118,7 @@ class ActiveReferences:
         return (float(Generator.HOLD), float(record[signals.axis_column(number, signals.REFERENCE)])), in_volts
 
     def newest(self, number: int) -> ActiveReference:
-        """Return the reference of axis `number` in the newest tick that the loop executed.
+        """Return the reference of axis `number` in the newest tick that the loop executed; `kind` None: unknown.
 
         First waits until the loop has executed the tick in which this axis's last change takes effect. Raises Refusal
         if it has not after ANSWER_TIMEOUT_S and some periods.

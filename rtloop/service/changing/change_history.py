@@ -34,7 +34,7 @@ class ChangeHistory:
         return next((change for change in reversed(self._changes) if change.number in axis_numbers), None)
 
     def remove(self, change: Change | None = None) -> None:
-        """Remove `change`, an object in the history, after its undo; None removes all changes."""
+        """Remove `change`, which must be an object of the history, after its undo; None removes all changes."""
         if change is None:
             self._changes.clear()
         else:

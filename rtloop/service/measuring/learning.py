@@ -114,7 +114,8 @@ def learn(
 
 
 def _set_final_reference(player: Player, trials: _Trials, keep: bool) -> None:
-    """Play the best table if `keep` is true, one was judged and the client is connected; else return to the setpoint.
+    """Play the best table endlessly if `keep` is true, one was judged and the client is connected; else return to the
+    setpoint.
 
     Raises as `Player.play` and `Player.hold`.
     """

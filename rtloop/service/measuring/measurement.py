@@ -67,7 +67,7 @@ class MeasurementHistory:
 
     def for_json(self) -> dict[str, Any]:
         """Return the newest figures, and `resonance_trend`: [[time (s since 1970), Hz, its standard deviation], …] of
-        the stored measurements that found a resonance. There must be a measurement.
+        the stored measurements that found a resonance, oldest first. There must be a measurement.
         """
         resonances = [
             (figures["unix_time_s"], figures["resonance"]) for figures in self._figures if figures["resonance"]

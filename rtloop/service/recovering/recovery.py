@@ -240,7 +240,11 @@ class Recovery:
             return True
 
     def end(self) -> None:
-        """End a recovery that is under way, because a client takes over; the recovery sends no command afterwards."""
+        """End a recovery that is under way, because a client takes over; the recovery sends no command afterwards.
+
+        The state becomes READY if the return has begun, else LATCHED: no return before `reset`. No effect without a
+        recovery under way.
+        """
         with self._guard:
             if self._former is not None:
                 is_returning = self._state is RecoveryState.RETURNING
@@ -274,7 +278,8 @@ class Recovery:
         """Return whether the policy covers a loop whose driver could not be opened.
 
         If True, the return will remove `fault`, the text that the service latches for it, from the service's faults.
-        False without the cause "driver" in the policy, and before a first loop has run: that one must start.
+        False, without effect, if the policy lacks the cause "driver", and before a first loop has run: that one must
+        start.
         """
         with self._guard:
             options = self._options

@@ -61,7 +61,8 @@ class RecoveryWorker:
     def _report_steps(self, loop: RunningLoop) -> None:
         """Send the new steps through the loop, which makes them events of the recording.
 
-        A step that a loop does not acknowledge, because it ends, goes through the next loop.
+        A step that the loop does not acknowledge stays in the recovery for the next call, also with the next loop;
+        the RtloopError is ignored.
         """
         with use_requester(Requester(origin=Origin.SUPERVISOR)), contextlib.suppress(RtloopError):
             while (step := self._recovery.oldest_step) is not None and not loop.supervisor.ended:

@@ -74,7 +74,7 @@ class DynamicsFit:
 
 
 def continuous_transfer(model: Innovations) -> Transfer:
-    """Return D(s) of a sampled model, scaled to D(0) = 1; decays are limited to FASTEST_DECAY per tick."""
+    """Return D(s) of a sampled model, without delay, with D(0) = 1; decays are limited to FASTEST_DECAY per tick."""
     discrete = model.discrete()
     rates = np.concatenate([model.rates, model.rates[model.rates.imag != 0].conj()])
     rates, residues = _limit_fast_rates(rates, discrete.residues / model.static_gain, model.period_s)

@@ -105,8 +105,8 @@ def _refitted_rms_um(model: Innovations, run: Excitation) -> float:
     """Return the rms one-step-ahead error in µm after the model was fitted to the whole recording; infinite if the
     result is not stable.
 
-    For models with equally many unknowns it ranks as Akaike's criterion does. Raises ArithmeticError for an unstable
-    predictor.
+    For models with equally many unknowns it ranks as Akaike's criterion does. Raises ArithmeticError if the predictor
+    of the fitted model is unstable.
     """
     fitted = refine(model, run)
     return np.inf if fitted is None else rms_error(fitted, run)

@@ -83,7 +83,7 @@ class Innovations:
         return np.linalg.eigvals(blocks - np.outer(columns, rows)).astype(complex)
 
     def whiten(self, signals: Real, poles: Complex) -> Real:
-        """Return each of `signals` (k, samples) filtered by H⁻¹, the inverse of the noise model; unchanged if H = 1.
+        """Return each of `signals` (k, samples) filtered from rest by the inverse noise model H⁻¹; unchanged if H = 1.
 
         `poles` (n,) are the `predictor_poles`.
         """
@@ -128,7 +128,7 @@ class Innovations:
         return -self.whiten(np.array(rows), self.predictor_poles())
 
     def pack(self, *, noise: bool) -> Real:
-        """Return the unknowns: of each mode rate, residue and, if `noise`, noise gain (a real number each, for a pair
+        """Return the unknowns mode by mode: rate, residue and, if `noise`, noise gain (a real number each, for a pair
         real and imaginary part); then the offset.
         """
         values: list[float] = []

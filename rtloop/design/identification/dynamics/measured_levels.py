@@ -38,7 +38,8 @@ class CorrectedLevels(NamedTuple):
 def correct_levels(run: Excitation) -> CorrectedLevels:
     """Return the recording with the levels of its input corrected by the settled positions; the first level stays.
 
-    It is unchanged, with a correction of 0, if its input holds fewer than three levels or one for less than
+    A correction is the distance of the settled position from the line through all of them, divided by the line's slope.
+    The recording is unchanged, with a correction of 0, if its input holds fewer than three levels or one for less than
     2 · SHORTEST_TAIL samples, and if the position does not settle at each.
     """
     changes = np.flatnonzero(np.diff(run.input)) + 1

@@ -196,7 +196,7 @@ class ModelSearch:
 
 
 def preferred_models(models: list[JudgedModel]) -> list[JudgedModel]:
-    """Return the models of fewest poles that are not worse than the best, lowest total error first.
+    """Return those of `models`, one or more, of fewest poles that are not worse than the best, least total error first.
 
     If any model has settled, only settled models are considered.
     """

@@ -95,7 +95,7 @@ def _first_limited_tick(flags: Real, start: int, end: int) -> int | None:
 
 
 def _longest_closed(closed: Real) -> tuple[int, int]:
-    """Return first tick and last tick + 1 of the longest run of True in `closed`, which has at least one."""
+    """Return first tick and last tick + 1 of the first longest run of True in `closed`, which has at least one True."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], closed, [False]]).astype(np.int8))).reshape(-1, 2)
     start, end = edges[np.argmax(np.diff(edges, axis=1))]
     return int(start), int(end)

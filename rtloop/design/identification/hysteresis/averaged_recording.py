@@ -52,8 +52,8 @@ class AveragedRecording(NamedTuple):
 def average_recording(
     run: AxisRecording, runs: int, before_v: npt.ArrayLike | None = None, blocks: int = BLOCKS
 ) -> AveragedRecording:
-    """Return the recording `run` averaged over at most `blocks`/3 blocks, or `blocks`/`runs` if it is one of more than
-    three recordings; at most LEAST_BLOCKS if that is more.
+    """Return the recording `run` averaged over blocks, at most `blocks`/max(3, `runs`) or, if that is less,
+    LEAST_BLOCKS; `runs` is the number of recordings of the fit.
 
     Each drive is paired with the position of the following tick. `before_v` (k,) is the drive in V from rest to the
     first tick, [0] for a start at rest, None if unknown.

@@ -32,7 +32,8 @@ COVERED_SHARE, LEAST_OTHERS = 0.95, 2
 
 
 def cross_validate(recordings: Sequence[Equations], limits: Limits) -> list[Real]:
-    """Return errors in µm of every recording, (blocks, 2), by fits without it or without the piece that is judged.
+    """Return errors in µm of every recording, (blocks, 2), by fits without it if LEAST_OTHERS other ones cover it, else
+    by fits without the piece that is judged.
 
     Column 0: the whole model; column 1: the plays alone, as they are written, less their mean over each stretch of
     known memory. NaN where memory, the state of the plays, is not known.
@@ -50,7 +51,8 @@ def cross_validate(recordings: Sequence[Equations], limits: Limits) -> list[Real
 
 def unseen_errors(recording: Equations, common: SharedGains) -> Real:
     """Return errors in µm (blocks, 2) of a recording not used for `common`, as `cross_validate`; NaN where memory is
-    not known. Its own offsets and drift are fitted to every other piece, and judged on the pieces between.
+    not known. Its own offsets and drift are fitted to every other piece and judged on the pieces between, then the
+    reverse.
     """
     errors_um, is_odd = np.full((recording.is_known.size, 2), np.nan), piece_numbers(recording) % 2 == 1
     for fitted_blocks in (recording.is_known & is_odd, recording.is_known & ~is_odd):
@@ -74,7 +76,8 @@ def piece_numbers(recording: Equations) -> npt.NDArray[np.intp]:
 
 
 def _errors_by_piece(recordings: Sequence[Equations], limits: Limits) -> list[Real]:
-    """Return errors in µm (blocks, 2) of every recording, each piece judged by a fit without it and its fold.
+    """Return errors in µm (blocks, 2) of every recording; each fit leaves out one fold, every FOLDS-th piece of
+    each recording, and judges it.
 
     Column 0: the whole model; column 1: the plays alone, less their mean over each stretch of known memory. NaN where
     memory is unknown.
@@ -97,7 +100,7 @@ def _errors_by_piece(recordings: Sequence[Equations], limits: Limits) -> list[Re
 
 
 def _residual_columns(recording: Equations, common: SharedGains, own_gains: Real) -> Real:
-    """Return the errors in µm of the whole model and of its plays alone, (blocks, 2)."""
+    """Return measured minus modelled position in µm, (blocks, 2): of the whole model, and of its plays alone."""
     return np.column_stack(
         [model_errors(recording, common, own_gains), recording.position_um - recording.slopes @ common.slopes]
     )
@@ -115,8 +118,8 @@ def _remove_play_offsets(recording: Equations, errors_um: Real) -> Real:
 
 
 def _is_covered(recording: Equations, other_recordings: Sequence[Equations]) -> bool:
-    """Whether LEAST_OTHERS of `other_recordings` move every play by at least COVERED_SHARE of its travel in
-    `recording`.
+    """Whether each play is moved by at least COVERED_SHARE of its travel in `recording` by LEAST_OTHERS of
+    `other_recordings`, not necessarily the same ones for each play.
     """
     if len(other_recordings) < LEAST_OTHERS:
         return False
@@ -127,7 +130,10 @@ def _is_covered(recording: Equations, other_recordings: Sequence[Equations]) -> 
 
 
 def _play_travel(recording: Equations) -> Real:
-    """Return the largest range of every slope's column within one stretch of known memory, in V, (plays,)."""
+    """Return the largest range of every slope's column within one stretch of known memory, in V, (plays,).
+
+    0 without such a stretch.
+    """
     stretches = (recording.offsets.T > 0) & recording.is_known
     return np.max(
         [np.zeros(recording.slopes.shape[1]), *(np.ptp(recording.slopes[stretch], axis=0) for stretch in stretches)],

@@ -38,7 +38,9 @@ def early_errors(
     position = model_errors(recording_equations, common, own_gains) + recording_equations.slopes @ common.slopes
 
     def residual(unknown: Real) -> Real:
-        """Return the errors in µm (blocks,) for the rises d (plays,) in V, followed by an offset in µm."""
+        """Return the errors in µm of all blocks (blocks,), for `unknown`: the rises d (plays,) in V, then an offset in
+        µm.
+        """
         return position - unknown[-1] - np.clip(first_v + np.cumsum(unknown[:-1]), low, high) @ weights
 
     settled_rises = np.diff(periodic_memory(run.full_v, thresholds), prepend=first_v)

@@ -76,10 +76,10 @@ def identify_from_parts(
 ) -> PartsFit:
     """Identify one model from all `runs`; judge it on each of them held out, and on `other_runs`, which are not fitted.
 
-    `before_v` has for each run the drive in V from rest to its first tick, None if unknown; `weights` are as in
-    `identify_hysteresis`. Raises UnsuitableData for a wrong sign, for too short a stroke of known memory, for
-    thresholds that it does not show, and if no model explains the runs; ValueError for thresholds that do not ascend
-    and a wrong `count` or `placement`.
+    `before_v` has for each run the drive in V from rest to its first tick, None if unknown; `count`, `placement`,
+    `thresholds_v` and `weights` are as in `identify_hysteresis`. Raises UnsuitableData for a wrong sign, for too short
+    a stroke of known memory, for thresholds that it does not show, and if no model explains the runs; ValueError for
+    thresholds that do not ascend and a wrong `count` or `placement`.
     """
     for run in runs:
         require_rising(run)
@@ -100,9 +100,10 @@ def identify_from_parts(
 
 
 def _trial_of_user_thresholds(thresholds: Real, stroke_v: float, hint: str) -> Trial:
-    """Return the trial of the user's thresholds (V).
+    """Return the trial of the user's thresholds (V), without drift and creep.
 
-    Raises ValueError if they do not ascend, UnsuitableData for a threshold of half of `stroke_v` or more.
+    Raises ValueError if they do not ascend, UnsuitableData, with `hint` at its end, for a threshold of half of
+    `stroke_v` or more.
     """
     require_ascending(thresholds)
     too_large = thresholds[thresholds >= 0.5 * stroke_v]
@@ -118,7 +119,7 @@ def _trial_of_user_thresholds(thresholds: Real, stroke_v: float, hint: str) -> T
 def _require_stroke(runs: Sequence[AxisRecording], work: RecordingSet) -> tuple[float, str]:
     """Return the longest stroke of known memory in V, and a text on the drive that would show more, "" if none would.
 
-    Raises UnsuitableData if that stroke is shorter than LEAST_KNOWN_SHARE of the drive's range.
+    Raises UnsuitableData if that stroke is shorter than LEAST_KNOWN_SHARE of the largest range of drive of the runs.
     """
     stroke_v = max(run.stroke_v for run in work.runs)
     if stroke_v >= WHOLE_SHARE * work.largest_v:
@@ -140,7 +141,8 @@ def _require_stroke(runs: Sequence[AxisRecording], work: RecordingSet) -> tuple[
 
 
 def _choose_trial(work: RecordingSet, trials: Sequence[Trial]) -> tuple[Trial, dict[str, float]]:
-    """Choose placement, then drift, then creep, each if it lowers the held-out error.
+    """Choose the placement of least held-out error, then drift, then creep, each if the error falls below
+    IMPROVED_SHARE of that without it; creep also needs `_is_lag_over_time`.
 
     Returns the chosen trial and the held-out rms error in µm of every trial, by a name of placement and terms such as
     "chebyshev + drift + creep", with " by path" for creep over the drive's path.
@@ -197,6 +199,8 @@ def _candidate_terms(work: RecordingSet) -> tuple[Term, ...]:
 
 
 def _mean_squares(work: RecordingSet, trial: Trial) -> Real:
-    """Return the mean square in µm² of the held-out errors of each recording that has any, in the order of the runs."""
+    """Return the mean square in µm² of the whole model's held-out errors, of each recording that has any, in the order
+    of the runs.
+    """
     errors_um = cross_validate([work.equations(run, trial) for run in work.runs], work.limits)
     return np.array([float(np.nanmean(error_um[:, 0] ** 2)) for error_um in errors_um if np.any(np.isfinite(error_um))])

@@ -51,8 +51,8 @@ def identify_hysteresis(
     thresholds_v: Sequence[float] | None = None,
     weights: Weights = "invertible",
 ) -> HysteresisFit:
-    """Fit one model to all `runs`, each from rest at 0 V, with `count` plays placed by `placement`, or at
-    `thresholds_v`.
+    """Fit one model to all `runs`, each from rest at 0 V, with plays at `thresholds_v` in V; None: `count` plays placed
+    by `placement`.
 
     "auto": with a dead band ("chebyshev") or without ("chebyshev-from-0"), whichever has the smaller rms error.
     "invertible" `weights` have an inverse: no partial sum is below LEAST_SLOPE of the mean slope. "free" ones may have

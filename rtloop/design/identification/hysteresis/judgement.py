@@ -111,9 +111,9 @@ class CombinedError(NamedTuple):
 
 
 def combine_errors(rms_um: Sequence[float]) -> CombinedError:
-    """Return the combined rms error of several recordings; NaN entries are ignored, and all NaN gives NaN.
+    """Return the root of the mean square of several recordings' rms errors; NaN entries are ignored.
 
-    Its `std_um` is None for fewer than two finite entries.
+    `rms_um` is NaN without a finite entry, `std_um` None with fewer than two.
     """
     squares = np.square([value for value in rms_um if np.isfinite(value)])
     rms = float(np.sqrt(squares.mean())) if squares.size else np.nan
@@ -127,8 +127,8 @@ def evaluate_from_rest(
 ) -> tuple[tuple[Judgement, ...], tuple[Judgement, ...]]:
     """Judge `runs`, each from rest and held out of the fit in turn, and `other_runs`, whose memory is unknown.
 
-    Only thresholds and kind of weights come from `shape`; the weights are fitted anew. Return the judgements of `runs`
-    and the judgements of `other_runs`.
+    Only thresholds and kind of weights come from `shape`; the weights are fitted anew. `runs` are not checked: they are
+    those of `identify_hysteresis`. Return the judgements of `runs` and the judgements of `other_runs`.
     """
     recordings = prepare_recordings(runs, shape.weights, [np.zeros(1)] * len(runs))
     trial = Trial(shape.model.thresholds, shape.placement, ())

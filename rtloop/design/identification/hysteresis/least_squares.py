@@ -122,7 +122,7 @@ def fit_own_gains(recording: Equations, common: SharedGains) -> Real:
 
 
 def model_errors(recording: Equations, common: SharedGains, own_gains: Real) -> Real:
-    """Return measured minus modelled position in µm (blocks,)."""
+    """Return measured minus modelled position in µm of all blocks, of known memory or not, (blocks,)."""
     return (
         recording.position_um
         - recording.slopes @ common.slopes

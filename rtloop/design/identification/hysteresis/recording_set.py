@@ -137,8 +137,8 @@ def prepare_recordings(
     before_v: Sequence[npt.ArrayLike | None] | None,
     blocks: int = BLOCKS,
 ) -> RecordingSet:
-    """Return the recordings averaged over blocks of equal length, each as by `average_recording` to its share of
-    `blocks`.
+    """Return the recordings, each averaged over at most `blocks`/3 blocks, or `blocks` divided by their number if there
+    are more than three (`average_recording`); the length of a block differs between recordings.
 
     `before_v` has for each recording the drive in V from rest to its first tick, [0] for a start at rest, None if
     unknown; None instead of a list: unknown for all.

@@ -41,7 +41,7 @@ def place_thresholds(count: int, largest_v: float, placement: PlacementRule) -> 
 
 
 def require_ascending(thresholds: Real) -> None:
-    """Raise ValueError unless `thresholds` in V are 1 to MAX_PLAYS finite numbers that ascend from at least 0."""
+    """Raise ValueError unless `thresholds` in V are 1 to MAX_PLAYS finite numbers from 0 on, each above the last."""
     if thresholds.ndim != 1 or not 1 <= thresholds.size <= MAX_PLAYS:
         raise ValueError(f"thresholds: {thresholds.size} numbers; allowed: 1 to {MAX_PLAYS}")
     if not np.all(np.isfinite(thresholds)) or thresholds[0] < 0 or np.any(np.diff(thresholds) <= 0):

@@ -9,7 +9,8 @@ from rtloop.errors import MissingExtra
 
 
 def slicot_gamma(plant: GeneralisedPlant, start: float) -> tuple[float, Matrices]:
-    """Return γ_opt by bisection down from `start`, and the controller there, for the plant with D22 = 0.
+    """Return γ_opt by bisection down from `start`, a γ that can be reached, and the controller there, for the plant
+    with D22 = 0.
 
     D22 does not change γ. Raises MissingExtra without slycot.
     """

@@ -160,7 +160,7 @@ class ChunkFile:
         """Make the file durable, give it its final name and close it, also after an error; never replaces a file.
 
         Raises NotOnDisk if it is not durable, OutputError if it was removed, the final name is taken or it cannot be
-        renamed; it then keeps the name of an unfinished file.
+        renamed; after each of these errors the file keeps the name of an unfinished one.
         """
         try:
             self._make_durable()

@@ -29,7 +29,10 @@ Item = tuple[Schema | None, Channel, Message]
 
 
 def read_messages(source: McapSource) -> Iterator[Item]:
-    """Yield (schema or None, channel, message) in the file's order. Raises DamagedChunk if the rest is unreadable."""
+    """Yield (schema or None, channel, message) in the file's order.
+
+    Raises DamagedChunk if the rest is unreadable, RecordingError if the system cannot read the file.
+    """
     schemas: dict[int, Schema] = {}
     channels: dict[int, Channel] = {}
     try:

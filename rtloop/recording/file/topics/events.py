@@ -106,7 +106,10 @@ def _failure_text(code: int, value: float) -> str:
 
 
 def message_from_event(event: Event, axes: Sequence[str]) -> np.ndarray[Any, Any] | None:
-    """Return the record of MESSAGE, shape (1,), that `event` was made from; None for an event of the recorder."""
+    """Return the record of MESSAGE, shape (1,), that `event` was made from; None for an event of the recorder.
+
+    Raises ValueError for an unknown kind, and for an axis that is not in `axes`.
+    """
     if event["who"] == RECORDER:
         return None
     record = np.zeros(1, MESSAGE)
@@ -182,5 +185,5 @@ def _member_value(kinds: Any, name: str) -> int:
 
 
 def json_value(value: Any) -> Any:
-    """Return a value for JSON; NaN and infinities, which JSON lacks, become "nan", "inf" and "-inf"."""
+    """Return a value for JSON: a NaN or infinity, which JSON lacks, as "nan", "inf" or "-inf", any other unchanged."""
     return repr(value) if isinstance(value, float) and not math.isfinite(value) else value

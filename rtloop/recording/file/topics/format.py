@@ -128,7 +128,7 @@ def tick_dtype(columns: Sequence[str]) -> np.dtype[Any]:
 def doubles(columns: Sequence[str]) -> list[tuple[str, str]]:
     """Fields (name, type) of a numpy dtype for a protobuf message of doubles.
 
-    Each column has its tag, a field named by its number from 1 on, and then its double.
+    Column number N, from 1 on, has two fields: its tag, named `_tag_N`, and then its double with its own name.
     """
     fields: list[tuple[str, str]] = []
     for number, name in enumerate(columns, start=1):
@@ -153,7 +153,7 @@ def fixed_bytes(template: Records, varying: Sequence[str]) -> tuple[npt.NDArray[
 
 
 def blank_ticks(columns: Sequence[str], count: int) -> Records:
-    """Make `count` records of `tick_dtype` in which all bytes are set that are the same for every tick."""
+    """Make `count` records of `tick_dtype` with all bytes that are the same for every tick; the others are 0."""
     records = np.zeros(count, tick_dtype(columns))
     records["_opcode"] = Opcode.MESSAGE
     records["_length"] = records.dtype.itemsize - PREFIX_BYTES
@@ -163,7 +163,10 @@ def blank_ticks(columns: Sequence[str], count: int) -> Records:
 
 
 def fill_ticks(records: Records, columns: Sequence[str], rows: Real, start_unix_ns: int) -> None:
-    """Write `rows` (n, columns) float64 into `records` (n,) of `blank_ticks`; log time = start + deadline, in ns."""
+    """Write `rows` (n, columns) float64 into `records` (n,) of `blank_ticks`.
+
+    Log time and publish time = `start_unix_ns` + deadline, in ns.
+    """
     short = SHORT_TAGS
     for names, values, tag_bytes in ((columns[:short], rows[:, :short], 1), (columns[short:], rows[:, short:], 2)):
         if names:  # One strided copy for all columns whose tags are equally long.

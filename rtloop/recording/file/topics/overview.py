@@ -97,7 +97,10 @@ class OverviewLayout:
     """Layout of the overview messages of a recording with `columns`."""
 
     def __init__(self, columns: Sequence[str]) -> None:
-        """Make the layout of messages with three figures for each of `columns`, at most MAX_COLUMNS of them."""
+        """Make the layout of messages with three figures for each of `columns`.
+
+        The caller must ensure that there are at most MAX_COLUMNS of them.
+        """
         self._columns, names = len(columns), _field_names(columns)
         self._dtype = np.dtype(format.doubles(names))
         self._names = names
@@ -137,7 +140,7 @@ class OverviewLayout:
 def are_plausible(intervals: Intervals) -> npt.NDArray[np.bool_]:
     """Return a mask (n,) of the valid ones of intervals (n, columns, 3: minimum, maximum, mean).
 
-    Ticks and deadlines of a valid interval are whole numbers that follow those of all earlier intervals.
+    Ticks and deadlines of a valid interval are whole numbers that follow those of all earlier intervals, valid or not.
     """
     is_plausible = np.ones(len(intervals), bool)
     for column in (TICK, DEADLINE):

@@ -295,7 +295,10 @@ def require_columns(header: dict[str, Any]) -> None:
 
 
 def header_extras(header: Mapping[str, Any]) -> Extras:
-    """Return the recorded inputs (names) and outputs besides sensors and drives; both are empty if there were none."""
+    """Return the recorded inputs (names) and outputs (ExtraOutput) besides sensors and drives.
+
+    Both are empty if there were none.
+    """
     entries = header.get("extras", {})
     outputs = [
         ExtraOutput(**{field: output[field] for field in ExtraOutput._fields if field in output})
