@@ -72,9 +72,8 @@ class PythonDriver(Driver):
                 row = (*self.read(), self.sample_age_us, *self.observe())
                 if len(row) != value_count:
                     raise ValueError(
-                        f"driver {self.kind!r}: read and observe gave {len(row)} numbers, the sample's age included; "
-                        f"allowed: {value_count}, one for each input and observed signal of the driver's facts, and "
-                        "the age"
+                        f"driver {self.kind!r}: the methods `read` and `observe` together returned {len(row) - 1} "
+                        f"numbers; allowed: {value_count - 1}, one for each input and each observed signal in `facts`"
                     )
                 for i, value in enumerate(row):
                     values[i] = value

@@ -64,13 +64,15 @@ def positions_between_ticks(
     modes, parts, points = factors.shape
     if axes != len(coefficients) or missed.shape != (ticks,) or not 0 <= axis < axes:
         raise ValueError(
-            f"motion: {axes} axes, {missed.size} counts of missed periods, axis number {axis}; allowed: "
-            f"{len(coefficients)} axes, {ticks} counts, axis numbers below {len(coefficients)}"
+            f"recorded motion: the displacements have {axes} axes and {ticks} ticks, the missed periods have "
+            f"{missed.size} counts, and the axis number is {axis}; allowed: {len(coefficients)} axes, {ticks} counts, "
+            f"axis numbers from 0 to {len(coefficients) - 1}"
         )
     if (modes, parts) != (coefficients["mode_count"][axis], PARTS) or not factors.flags.c_contiguous:
         raise ValueError(
-            f"factors: an array of {modes} × {parts} × {points}; allowed: a contiguous array of "
-            f"{coefficients['mode_count'][axis]} × {PARTS} × any number"
+            f"factors: the array has the shape {modes} × {parts} × {points}; allowed: "
+            f"{coefficients['mode_count'][axis]} × {PARTS} × any number, stored row by row, as fractions_of_period "
+            "returns it for this axis"
         )
     own_state, positions_um = state[axis : axis + 1].copy(), np.empty((ticks, points))
     _fill_positions(

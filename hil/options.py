@@ -167,7 +167,7 @@ class SensorOptions(Options):
     def _check_scale(cls, um_per_v: float) -> float:
         """Require a scale other than 0: a sensor of 0 µm/V has no output."""
         if um_per_v == 0:
-            raise ValueError("value is 0, a sensor without output; allowed: numbers other than 0")
+            raise ValueError("value is 0, and a sensor with a scale of 0 has no reading; allowed: numbers other than 0")
         return um_per_v
 
 

@@ -144,8 +144,8 @@ def choose_exchange(frames: dict[str, Frame], channels: int, options: BusOptions
     if not pairs:
         kind = "CAN FD" if options.fd else "classic CAN"
         raise ValueError(
-            f"channels: {channels} axes; the DBC file has no {kind} frames DriveNAME and SampleNAME with room for "
-            f"{channels} axes; add both frames, or set another dbc"
+            f"channels: {channels} axes; the DBC file has no {kind} frames Drive… and Sample… with the same ending "
+            f"(such as Drive2 and Sample2) and room for {channels} axes; add both frames, or set another dbc"
         )
     exchange = min(pairs, key=lambda pair: pair.drive.length + pair.sample.length)
     numbers = range(exchange.channel_capacity)

@@ -199,7 +199,7 @@ def open_link(options: NodeOptions) -> Link:
         return UdpLink(options)
     if isinstance(options, SerialOptions):
         return SerialLink(options)
-    raise TypeError(f"options of {type(options).__name__}; allowed: UdpOptions, SerialOptions")
+    raise TypeError(f"options: the type is {type(options).__name__}; allowed: UdpOptions, SerialOptions")
 
 
 def _wait_readable(fd: int, timeout_s: float) -> bool:

@@ -97,7 +97,8 @@ class TerminalPort(Port):
             close_descriptor(self._fd)
             close_descriptor(self._end)
             raise DriverError(
-                f"{options.label}: {error.strerror}; allowed: a path without a file, in a folder that you may write to"
+                f"{options.label}: {error.strerror}; allowed: a path at which no file exists, in a folder that you may "
+                "write to"
             ) from None
 
     def receive(self, timeout_s: float) -> tuple[bytes, Hashable] | None:
@@ -141,7 +142,7 @@ def _serial(options: NodeOptions) -> SerialOptions:
     """Return the options of a serial line. Raises TypeError for others."""
     if isinstance(options, SerialOptions):
         return options
-    raise TypeError(f"options of {type(options).__name__}; allowed: UdpOptions, SerialOptions")
+    raise TypeError(f"options: the type is {type(options).__name__}; allowed: UdpOptions, SerialOptions")
 
 
 def step(node: SimulatedNode, port: Port, start_s: float) -> None:

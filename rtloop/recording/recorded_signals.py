@@ -217,7 +217,8 @@ class RecordedSignals:
         """
         if times.step is not None:
             raise RecordingError(
-                f"{self.paths[0]}: slice: step is {times.step!r}; allowed: no step. `to_pandas` takes every nth tick"
+                f"{self.paths[0]}: slice: step is {times.step!r}; allowed: no step. To take every nth tick, use "
+                "to_pandas(every=n)"
             )
         for limit in (times.start, times.stop):
             is_number = isinstance(limit, RealNumber) and not math.isnan(limit)

@@ -159,8 +159,10 @@ class CanSupervision:
         try:
             if not frame.fits(message):
                 raise Refusal(
-                    f"a frame of {len(message.data)} bytes; allowed: a data frame of {frame.length} bytes, with the "
-                    "identifier and the format (CAN or CAN FD) of the DBC file"
+                    f"received as a {'CAN FD' if message.is_fd else 'classic CAN'} frame of {len(message.data)} bytes "
+                    f"with {'a 29' if message.is_extended_id else 'an 11'}-bit identifier; allowed: a "
+                    f"{'CAN FD' if frame.fd else 'classic CAN'} data frame of {frame.length} bytes with an 11-bit "
+                    "identifier, as in the DBC file"
                 )
             command(*frame.unpack(message.data))
         except Exception as error:  # No frame may end the thread.

@@ -126,7 +126,7 @@ class Lock:
             name_text = "operator (a client without a name)" if holder.name == OPERATOR else holder.name
             raise Refusal(
                 f"{name_text} has held the lock since {since_text}; the lock becomes free after "
-                f"{remaining_s:.0f} s without a command; stop works for everybody"
+                f"{remaining_s:.0f} s without a command; `rtloop ctl stop` works without the lock"
             )
 
     def _current_holder(self) -> _LockHolder | None:

@@ -529,7 +529,10 @@ class Service:
         finally:
             self._is_preparing = False
             if self._requested_mode is not None:
-                log.info("not started: mode %s was requested meanwhile", self._requested_mode.name.lower())
+                log.info(
+                    "the configured mode does not apply: mode %s was requested during the start",
+                    self._requested_mode.name.lower(),
+                )
 
     def _start_builder_later(self) -> None:
         """Wait BUILDER_PAUSE_S, then start the process that builds changes, unless the service ends meanwhile."""

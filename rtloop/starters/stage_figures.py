@@ -57,8 +57,8 @@ class StageFigures:
             _require("sensor-min-v", self.sensor_min_v, -10.0, 0.0, "V, as the stage rests at 0 V")
             if self.sensor_min_v > -10.0 and self.drive_min_v != 0.0:
                 raise ValueError(
-                    f"--sensor-min-v: value is {self.sensor_min_v:g}; allowed with --drive-min-v=0 only, as a stage "
-                    "that goes below 0 µm needs a sensor that shows positions below 0 µm"
+                    f"--sensor-min-v: value is {self.sensor_min_v:g}; allowed: -10, or -10 … 0 with --drive-min-v=0. A "
+                    "drive below 0 V makes the sensor's reading negative; add --drive-min-v=0"
                 )
         for name, value in (
             ("sensor-noise-um", self.sensor_noise_um),
@@ -81,7 +81,7 @@ def stage_figures(values: Mapping[str, float]) -> StageFigures:
     for option, replaced in (("gain_um_per_v", "range_um"), ("sensor_noise_mv", "sensor_noise_um")):
         if option in figures and replaced in figures:
             names = (f"--{name.replace('_', '-')}" for name in (option, replaced))
-            raise ValueError(f"{' and '.join(names)}: both set one figure; use one of them")
+            raise ValueError(f"{' and '.join(names)}: the two options set the same property of the stage; use only one")
     if (gain_um_per_v := figures.pop("gain_um_per_v", None)) is not None:
         figures["range_um"] = gain_um_per_v * figures.get("drive_v", StageFigures.drive_v)
     if (noise_mv := figures.pop("sensor_noise_mv", None)) is not None:

@@ -111,7 +111,9 @@ def read_note(path: Path) -> Hardware | None:
         raise host_refusal(error) from None
     except OSError as error:
         raise UnreadableNote(
-            f"{path}: cannot read the note of the hardware of the last run: {error.strerror or error}"
+            f"{path}: cannot read the note of the hardware, which names the board of the last run: "
+            f"{error.strerror or error}. The outputs of this board may still carry voltage; make the file readable, "
+            "then park again"
         ) from None
     except ValidationError as error:
         raise _unusable_note(path, describe(error, "note", None)[0]) from None

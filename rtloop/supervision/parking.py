@@ -176,9 +176,15 @@ def _require_known_arrays(block: SharedBlock) -> None:
     """
     words, drives_v = block["words"], block["last_drive_v"]
     if words.dtype != np.uint64 or words.ndim != 1 or words.size < len(Word):
-        raise ValueError(f"words: {words.dtype} {words.shape}; allowed: uint64, at least {len(Word)}")
+        raise ValueError(
+            f"the array words has the type {words.dtype} and the shape {words.shape}; allowed: uint64, one dimension, "
+            f"at least {len(Word)} values"
+        )
     if drives_v.dtype != np.float64 or drives_v.ndim != 1:
-        raise ValueError(f"last_drive_v: {drives_v.dtype} {drives_v.shape}; allowed: float64, one an axis")
+        raise ValueError(
+            f"the array last_drive_v has the type {drives_v.dtype} and the shape {drives_v.shape}; allowed: float64, "
+            "one dimension, one value for each axis"
+        )
 
 
 @contextmanager

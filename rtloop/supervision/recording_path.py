@@ -30,4 +30,7 @@ def new_recording_path(prepared: Prepared, chosen_folder: Path | None) -> Path:
         path = folder / (f"{stem}.mcap" if number == 1 else f"{stem}-{number}.mcap")
         if not lexists(path) and not lexists(path.with_name(f"{path.name}.part")):
             return path
-    raise OutputError(f"{folder}: {stem}.mcap and all its numbered names exist already; start again")
+    raise OutputError(
+        f"{folder}: no name is free for the recording; {stem}.mcap and {stem}-2.mcap to {stem}-999.mcap exist "
+        "already. Start again; the name then contains a later time"
+    )

@@ -106,9 +106,9 @@ class DesignResult(Result):
                 f"γ_opt by SLICOT's SB10AD: {self.slicot_gamma:.6g} ({deviation_percent:+.5f} % from the value above)"
             )
         lines.append(
-            f"‖F_l(P, C)‖∞ on the model with its delay: {hinf.achieved:.6g} with the controller of order "
-            f"{self.full_order}, made for γ = {hinf.gamma:.6g}; {self.achieved:.6g} with the written controller "
-            f"of order {self.order}"
+            f"‖F_l(P, C)‖∞ on the model with its delay is {hinf.achieved:.6g} for the full controller (order "
+            f"{self.full_order}, designed for γ = {hinf.gamma:.6g}), and {self.achieved:.6g} for the controller "
+            f"that is written (order {self.order}, after reduction)"
         )
         return lines
 

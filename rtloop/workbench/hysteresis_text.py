@@ -73,7 +73,7 @@ def _print_held_out(out: Console, report: dict[str, Any]) -> None:
         trials_text = ", ".join(f"{name} {error_um:.3g}" for name, error_um in report["tried_um"].items())
         out.print(f"held-out errors in µm rms: {trials_text}; chosen: {' + '.join(('plays', *report['terms']))}")
         missing = f"; {report['missing']}" if report["missing"] else ""
-        out.print(f"valid for strokes of up to {report['stroke_v']:.4g} V{missing}")
+        out.print(f"this model is valid for strokes of up to {report['stroke_v']:.4g} V{missing}")
 
 
 def _rms_text(error: dict[str, Any]) -> str:

@@ -54,9 +54,9 @@ def validation_comments(rows: Sequence[dict[str, Any]], extra: dict[str, Any]) -
     play_errors_um = [row["as_written_rms_um"] for row in rows if math.isfinite(row["as_written_rms_um"])]
     if extra.get("terms") and play_errors_um:
         lines.append(
-            f"the fit also modelled {' and '.join(extra['terms'])}; these plays alone leave an error of up to "
-            f"{max(play_errors_um):.3g} µm rms"
+            f"the fit also modelled {' and '.join(extra['terms'])}, which this section leaves out; the plays of this "
+            f"section alone leave an error of up to {max(play_errors_um):.3g} µm rms"
         )
     if extra.get("missing"):
-        lines.append(f"valid for strokes of up to {extra['stroke_v']:.4g} V; {extra['missing']}")
+        lines.append(f"this model is valid for strokes of up to {extra['stroke_v']:.4g} V; {extra['missing']}")
     return lines

@@ -93,9 +93,8 @@ def test_a_wrong_number_of_inputs_is_refused_with_a_message():
     driver, calls = opened(MUTANTS["ForgetsAnInput"]())
     assert calls.read()[0] == -1
     assert str(driver.error) == (
-        "driver 'loopback': read and observe gave 3 numbers, the sample's age included; allowed: 4, one for each "
-        "input and "
-        "observed signal of the driver's facts, and the age"
+        "driver 'loopback': the methods `read` and `observe` together returned 2 numbers; allowed: 3, one for each "
+        "input and each observed signal in `facts`"
     )
 
 

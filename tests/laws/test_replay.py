@@ -95,7 +95,7 @@ def test_a_law_that_is_not_here_is_said_and_not_run(recording: Path):
     for arguments in (("replay", recording), ("replay", recording, "--resimulate")):
         result = run(*arguments)
         assert result.exit_code == 66, result.output
-        assert "law 'mine': no installed version equals the recorded one" in result.output
+        assert "law 'mine': no installed law equals the law that ran" in result.output
         assert "--trust-recorded-law" in result.output
     for arguments in (
         ("info", recording),
@@ -176,7 +176,7 @@ def test_the_law_in_a_file_that_is_named(recording: Path, tmp_path: Path):
     (tmp_path / "law.py").write_text(marker(recording.parent) + "# another\n")
     result = run("replay", recording, "--law", tmp_path / "law.py")
     assert result.exit_code == 66
-    assert "no installed version equals the recorded one" in result.output
+    assert "no installed law equals the law that ran" in result.output
 
 
 def tampered(header: dict) -> None:
@@ -186,7 +186,7 @@ def tampered(header: dict) -> None:
 
 def test_a_text_that_is_not_the_one_that_ran_is_refused(tmp_path: Path):
     path = recorded(tmp_path, law_text(), tampered)
-    with pytest.raises(RecordingError, match="the recorded text differs from the law that ran"):
+    with pytest.raises(RecordingError, match="the law's text in the recording differs from the law that ran"):
         replay(rtloop.load(path), trust=TrustedLaws(recorded=True))
 
 
@@ -203,7 +203,7 @@ def test_another_law_by_the_same_records_does_not_replay_as_it(tmp_path: Path):
     """The text decides: another text has another digest than the recording."""
     path = recorded(tmp_path, law_text())
     other_laws = laws_in(law_text().replace("100.0", "99.0"), "other.py")
-    with pytest.raises(RecordingError, match="no installed version equals"):
+    with pytest.raises(RecordingError, match="no installed law equals the law that ran"):
         replay(rtloop.load(path), trust=TrustedLaws(other_laws))
     assert replay(rtloop.load(path), trust=TrustedLaws(laws_in(law_text(), "x.py"))).identical
 

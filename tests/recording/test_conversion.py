@@ -212,8 +212,8 @@ def test_a_recovered_copy_needs_no_conversion(run: Run, path: Path, tmp_path: Pa
 
 TOPICS = {
     "/events": (TICKS, "'first_difference': {'tick': 100, 'signal': 'mode'"),
-    "/law": (TICKS, "no tick follows one in this recording"),
-    "/ticks": (0, "no tick follows one in this recording"),
+    "/law": (TICKS, "the recording has no tick after a snapshot of the law"),
+    "/ticks": (0, "the recording has no tick after a snapshot of the law"),
 }
 
 

@@ -65,17 +65,17 @@ def test_arrays_that_do_not_fit_are_refused() -> None:
     for other in (rows[:2], rows[:, :5]):
         with pytest.raises(ValueError, match="at least 3 rows of 21 values"):
             first_unequal(rows, other)
-    with pytest.raises(ValueError, match="allowed: float64, a multiple of 8 bytes apart"):
+    with pytest.raises(ValueError, match="allowed: float64, steps of 0, 8, 16, … bytes"):
         first_unequal(rows, rows.astype(np.float32))  # type: ignore[arg-type]
-    with pytest.raises(ValueError, match="allowed: float64, a multiple of 8 bytes apart"):
+    with pytest.raises(ValueError, match="allowed: float64, steps of 0, 8, 16, … bytes"):
         first_unequal(rows[::-1], rows)
     pairs, tape, refused = np.array([[4, 9]]), np.zeros((3, 6)), np.zeros(3, np.bool_)
     for wrong in (np.array([[6, 9]]), np.array([[4, COLUMNS]]), np.array([[-1, 9]])):
         with pytest.raises(ValueError, match="pairs of existing columns"):
             fill_tape(rows, wrong, tape, refused)
-    with pytest.raises(ValueError, match="a row for each tick"):
+    with pytest.raises(ValueError, match="a row and a flag for each tick"):
         fill_tape(rows, pairs, tape[:2], refused)
-    with pytest.raises(ValueError, match="a row for each tick"):
+    with pytest.raises(ValueError, match="a row and a flag for each tick"):
         fill_tape(rows, pairs, tape, refused[:2])
 
 

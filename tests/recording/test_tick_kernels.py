@@ -102,7 +102,7 @@ def test_offsets_and_contents_beyond_the_records_are_refused() -> None:
         with pytest.raises(ValueError, match="allowed: whole records of 10 bytes"):
             layout.take_out(content, np.array([0, offset]))
     for size, marks in ((7, 7), (10, 9)):
-        with pytest.raises(ValueError, match="allowed: 8 bytes or more, and a flag for each byte"):
+        with pytest.raises(ValueError, match="allowed: at least 8 bytes, and one flag for each byte"):
             RecordLayout(np.zeros(size, np.uint8), np.ones(marks, bool))
 
 

@@ -95,5 +95,8 @@ def test_a_command_that_was_killed_while_it_printed_does_not_end_the_schedule(ca
 def test_an_answer_of_another_version_does_not_end_the_schedule(caplog: pytest.LogCaptureFixture):
     desk = Desk(answer={"better": True, "tick": 5})
     assert desk.looks(0.0, 60.0, 120.0) == 2
-    expected = "axis x: the answer of `rtloop ctl retune` is not as in this version: KeyError('resonance')"
+    expected = (
+        "axis x: the result of `rtloop ctl retune` cannot be read (KeyError('resonance')), because another version of "
+        "rtloop printed it; restart the service"
+    )
     assert [record.getMessage() for record in caplog.records] == [expected] * 2

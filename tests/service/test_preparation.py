@@ -76,7 +76,8 @@ def test_while_the_actuator_is_depolarised_setpoints_move_nothing_and_no_start_u
         with pytest.raises(RtloopError, match="mode closed_loop: the actuator is being depolarised or tared; send"):
             bench.client.post("/start")
         bench.client.post("/stop")
-        wait_for(lambda: "not started: mode off was requested meanwhile" in bench.log(), "the end of the preparation")
+        message = "the configured mode does not apply: mode off was requested during the start"
+        wait_for(lambda: message in bench.log(), "the end of the preparation")
         ticks = bench.ticks
         wait_for(lambda: bench.ticks > ticks + 1000, "ticks")
         assert (bench.status()["mode"], bench.seen().last_v) == ("off", 0.0)

@@ -171,9 +171,9 @@ def test_gain_and_noise_of_a_data_sheet_give_the_same_stage() -> None:
     values = {"gain_um_per_v": 12.0, "drive_v": 7.5, "sensor_um_per_v": 10.0, "sensor_noise_mv": 1.0}
     assert stage_figures(values) == expected
     assert stage_figures({"gain_um_per_v": 2.0, "sensor_noise_mv": 2.0}) == StageFigures(sensor_noise_um=0.01)
-    with pytest.raises(ValueError, match="--gain-um-per-v and --range-um: both set one figure; use one of them"):
+    with pytest.raises(ValueError, match="--gain-um-per-v and --range-um: the two options set the same property"):
         stage_figures({"gain_um_per_v": 2.0, "range_um": 20.0})
-    with pytest.raises(ValueError, match="--sensor-noise-mv and --sensor-noise-um: both"):
+    with pytest.raises(ValueError, match="--sensor-noise-mv and --sensor-noise-um: the two options"):
         stage_figures({"sensor_noise_mv": 2.0, "sensor_noise_um": 0.01})
 
 
@@ -191,5 +191,5 @@ def test_the_interlock_of_the_sensor_lies_below_the_noise_at_rest(lowest_v, nois
 
 
 def test_a_sensor_from_0_v_on_needs_a_drive_from_0_v_on() -> None:
-    with pytest.raises(ValueError, match="--sensor-min-v: value is 0; allowed with --drive-min-v=0 only"):
+    with pytest.raises(ValueError, match="--sensor-min-v: value is 0; allowed: -10, or -10 … 0 with --drive-min-v=0"):
         StageFigures(sensor_min_v=0.0)

@@ -35,7 +35,8 @@ class TickAccount:
             )
         if ticks.last >= self._end:
             raise DamagedChunk(
-                f"ticks out of order: the chunk ends with tick {ticks.last}, but the run ended before tick {self._end}"
+                f"too many ticks: the chunk ends with tick {ticks.last}; allowed: up to tick {self._end - 1}, the last "
+                "tick of the run"
             )
         self._next_tick = ticks.last + 1
         self._tick_count += len(chunk.rows)

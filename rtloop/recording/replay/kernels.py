@@ -34,8 +34,8 @@ class Strided(NamedTuple):
         """
         if rows.dtype != np.float64 or any(step % ITEM_BYTES or step < 0 for step in rows.strides):
             raise ValueError(
-                f"rows: values of type {rows.dtype}, {' and '.join(map(str, rows.strides))} bytes apart; allowed: "
-                "float64, a multiple of 8 bytes apart"
+                f"array of ticks: values of type {rows.dtype}, steps of {rows.strides[0]} bytes between rows and "
+                f"{rows.strides[1]} bytes between columns; allowed: float64, steps of 0, 8, 16, … bytes"
             )
         row_step, column_step = (step // ITEM_BYTES for step in rows.strides)
         return cls(rows.ctypes.data, row_step, column_step)
@@ -70,8 +70,10 @@ def fill_tape(rows: Real, pairs: npt.NDArray[np.int64], tape: Real, refused: npt
     is_within = np.all(pairs >= 0) and np.all(pairs[:, 0] < tape.shape[1]) and np.all(pairs[:, 1] < columns)
     if not is_within or tape.shape[0] < count or refused.size < count or tape.shape[1] < 4 or columns <= FLAGS:
         raise ValueError(
-            f"playback tape: {tape.shape[0]} rows of {tape.shape[1]} columns for {count} recorded ticks of "
-            f"{columns} columns; allowed: a row for each tick, at least 4 columns, pairs of existing columns"
+            f"tape of recorded inputs: the tape has {tape.shape[0]} rows, {tape.shape[1]} columns and {refused.size} "
+            f"flags of refused writes, the recording has {count} ticks and {columns} columns; allowed: a row and a "
+            "flag for each tick, at least 4 columns of the tape, pairs of existing columns (one of the tape, one of "
+            "the recording)"
         )
     if count:
         _fill_tape(

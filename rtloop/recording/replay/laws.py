@@ -102,13 +102,15 @@ def _find_law(entry: Mapping[str, Any], recording: Recording, trust: TrustedLaws
     except ValueError as error:
         if not trust.recorded:
             raise RecordingError(
-                f"{location}: no installed version equals the recorded one (sha256 {str(digest)[:12]}…), and {error}; "
-                "use --law FILE, or --trust-recorded-law to run the recorded text"
+                f"{location}: no installed law equals the law that ran (sha256 {str(digest)[:12]}…), and its file "
+                f"cannot be used ({error}). Use --law FILE with the law that ran, or --trust-recorded-law to run the "
+                "law's text in the recording"
             ) from None
     if law.sha256 != digest:
         raise RecordingError(
-            f"{location}: the recorded text differs from the law that ran: sha256 {str(law.sha256)[:12]}…, recorded "
-            f"{str(digest)[:12]}…; the recording was altered. Use --law FILE with the law that ran"
+            f"{location}: the law's text in the recording differs from the law that ran (sha256 of the text "
+            f"{str(law.sha256)[:12]}…, of the law that ran {str(digest)[:12]}…); the recording was altered. Use "
+            "--law FILE with the law that ran"
         )
     try_limited(law.file, law_class, law)
     try:

@@ -158,8 +158,8 @@ class Replay:
         if not self.report.ticks:
             path = self._recording.paths[0]
             raise RecordingError(
-                f"{path}: a replay starts at a snapshot of the law, and no tick follows one in this recording; use a "
-                "longer recording"
+                f"{path}: the recording has no tick after a snapshot of the law, where a replay starts; use a longer "
+                "recording"
             )
         self._check_totals(expected)
         return self.report

@@ -26,13 +26,18 @@ def _require_bounded(settings: dict[str, Any]) -> dict[str, Any]:
     """
     for count, (depth, value) in enumerate(_walk_values(settings, 1), start=1):
         if count > MAX_VALUES:
-            raise ValueError(f"more than {MAX_VALUES} keys and values; allowed: at most {MAX_VALUES}")
+            raise ValueError(f"the table has too many keys and values; allowed: at most {MAX_VALUES}")
         if depth > MAX_DEPTH:
-            raise ValueError(f"nested too deeply; allowed: at most {MAX_DEPTH} levels of tables, lists and values")
+            raise ValueError(
+                f"the table is nested too deeply; allowed: at most {MAX_DEPTH} levels of tables, lists and values"
+            )
         if isinstance(value, str) and len(value) > MAX_CHARACTERS:
-            raise ValueError(f"a text of {len(value)} characters; allowed: at most {MAX_CHARACTERS}")
+            raise ValueError(
+                f"the table has a key or a text of {len(value)} characters, which begins with {value[:20]!r}; allowed: "
+                f"at most {MAX_CHARACTERS} characters"
+            )
         if isinstance(value, int) and abs(value) > LARGEST_INTEGER:
-            raise ValueError(f"an integer beyond ±{LARGEST_INTEGER}; allowed: integers within these limits")
+            raise ValueError(f"the table has an integer out of range; allowed: {-LARGEST_INTEGER} to {LARGEST_INTEGER}")
     return settings
 
 

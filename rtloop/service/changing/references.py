@@ -94,7 +94,9 @@ class LiveReferences:
         """
         if samples.size == 0 or not np.all(np.abs(samples) < USABLE_MAGNITUDE):
             raise invalid_request(
-                f"waveform: {len(samples)} samples; allowed: at least one, each within ±{USABLE_MAGNITUDE:g}"
+                f"waveform: {len(samples)} samples, with {np.sum(~(np.abs(samples) < USABLE_MAGNITUDE))} values out of "
+                f"range; allowed: at least one sample, values between {-USABLE_MAGNITUDE:g} and {USABLE_MAGNITUDE:g} "
+                "µm (V in mode raw)"
             )
         table = TableOfSamples()
         values = list(table_values(samples, hold_ticks, repeat, table))

@@ -97,7 +97,12 @@ class RetuneSchedule:
             try:
                 log.info("axis %s %s", axis, _outcome_text(report))
             except (LookupError, TypeError) as error:  # Another version of rtloop may have been installed meanwhile.
-                log.warning("axis %s: the answer of `rtloop ctl retune` is not as in this version: %r", axis, error)
+                log.warning(
+                    "axis %s: the result of `rtloop ctl retune` cannot be read (%r), because another version of rtloop "
+                    "printed it; restart the service",
+                    axis,
+                    error,
+                )
         else:
             log.warning("axis %s is not retuned: %s", axis, process.stderr.strip().removeprefix("rtloop: "))
 

@@ -213,8 +213,9 @@ def _mean_error_um(player: Player, reference_um: Real, table: Real, settle_perio
     recorded_table = np.column_stack([player.column(rows, REFERENCE), player.column(rows, FEED)])
     if not np.array_equal(recorded_table, np.tile(table, (judged_periods, 1))):
         raise Refusal(
-            "learn: the recorded reference differs from the table that was sent, because a hold input or "
-            "another client changed the reference; learn again while neither does"
+            "learn: the recorded reference differs from the table that was sent, because loop.hold_input held the "
+            "reference or another client changed the reference; learn again while the hold input is inactive and no "
+            "other client changes the reference"
         )
     return reference_um - player.column(rows, POSITION).reshape(judged_periods, ticks).mean(axis=0)
 

@@ -116,8 +116,9 @@ class Player:
         rows = self.read(self.play(samples[:, np.newaxis]), samples.size, check_position)
         if not np.array_equal(self.column(rows, signals.REFERENCE), samples):
             raise Refusal(
-                f"{self._activity}: the recorded reference differs from the one that was sent, because a hold input "
-                "or another client changed the reference; try again while neither does"
+                f"{self._activity}: the recorded reference differs from the reference that was sent, because "
+                "loop.hold_input held the reference or another client changed the reference; try again while the hold "
+                "input is inactive and no other client changes the reference"
             )
         return rows
 

@@ -23,8 +23,8 @@ class RecordLayout:
         self.size = len(template)
         if self.size < WORD_BYTES or len(is_fixed) != self.size:
             raise ValueError(
-                f"template of {self.size} bytes with {len(is_fixed)} flags; allowed: {WORD_BYTES} bytes or more, "
-                "and a flag for each byte"
+                f"layout of a record: the template has {self.size} bytes and {len(is_fixed)} flags of fixed bytes; "
+                f"allowed: at least {WORD_BYTES} bytes, and one flag for each byte"
             )
         starts = np.minimum(np.arange(0, self.size, WORD_BYTES), self.size - WORD_BYTES)
         self._starts = starts.astype(np.int64)
@@ -43,8 +43,9 @@ class RecordLayout:
         count, excess = divmod(len(content), self.size)
         if excess or not np.all((offsets >= 0) & (offsets <= self.size - WORD_BYTES)):
             raise ValueError(
-                f"content: {len(content)} bytes, read at the offsets {offsets.tolist()}; allowed: whole records of "
-                f"{self.size} bytes, offsets up to {self.size - WORD_BYTES}"
+                f"records: the content has {len(content)} bytes, the offsets of the values in a record are "
+                f"{offsets.tolist()}; allowed: whole records of {self.size} bytes, offsets from 0 to "
+                f"{self.size - WORD_BYTES}"
             )
         words = np.empty((len(offsets), count), np.uint64)
         places = np.ascontiguousarray(offsets, np.int64)
@@ -69,9 +70,10 @@ def first_fault(
     columns, count = numbers.shape
     if columns < 2 or bounds.shape != (columns, 2) or log_times_ns.shape != (2, count) or not count:
         raise ValueError(
-            f"numbers of {columns} columns and {count} ticks, bounds {' × '.join(map(str, bounds.shape))}, times "
-            f"{' × '.join(map(str, log_times_ns.shape))}; allowed: at least 2 columns and 1 tick, 2 bounds for each "
-            "column, 2 times for each tick"
+            f"arrays of ticks: numbers has {columns} columns and {count} ticks, bounds has the shape "
+            f"{' × '.join(map(str, bounds.shape))}, log_times_ns has the shape "
+            f"{' × '.join(map(str, log_times_ns.shape))}; allowed: at least 2 columns and 1 tick, bounds of "
+            f"{columns} × 2, log_times_ns of 2 × {count}"
         )
     arrays = [np.ascontiguousarray(numbers, np.float64), np.ascontiguousarray(bounds, np.float64)]
     times = np.ascontiguousarray(log_times_ns, np.int64)

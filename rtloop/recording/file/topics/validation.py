@@ -331,7 +331,10 @@ def parse_event(payload: bytes, axes: Sequence[str]) -> Event:
         return event
     if not is_kind_name(kind):
         names = ", ".join((*Kind.__members__, *Note.__members__)).lower()
-        raise MalformedText(f"kind: {_shorten(kind)}; allowed: {names} or a number")
+        raise MalformedText(
+            f"the field kind of the event is {_shorten(kind)}; allowed: {names}, or a whole number of 1 to 9 digits "
+            "for a kind that this version does not know"
+        )
     if not is_member_name(Origin, event["who"]) and (fault := name_problem(event["who"])):
         raise MalformedText(f"event {kind}: its field who: {fault}")
     _validate(_MessageDetails, details, "what.")
@@ -379,7 +382,7 @@ def _command_value(value: Any) -> float:
         except OverflowError:
             pass
     raise MalformedText(
-        f"one of the command's numbers (what.values) is {_shorten(value)}; allowed: a number, 'nan', 'inf', '-inf'"
+        f"the field what.values of the event contains {_shorten(value)}; allowed: numbers, 'nan', 'inf', '-inf'"
     )
 
 
@@ -390,7 +393,7 @@ def _parse_object(payload: bytes) -> dict[str, Any]:
     except ValueError:
         raise MalformedText("not JSON") from None
     if not isinstance(value, dict):
-        raise MalformedText(f"{_shorten(value)}; allowed: a JSON object")
+        raise MalformedText(f"the content is {_shorten(value)}; allowed: a JSON object")
     return value
 
 
