@@ -61,7 +61,9 @@ def _expand(pattern: Path) -> Iterator[str]:
     elif os.path.isdir(pattern):
         paths = list(_files_below(pattern))
         if not paths:
-            raise RecordingError(f"{pattern}: no recording below this folder; allowed: a folder with *.mcap files")
+            raise RecordingError(
+                f"{pattern}: no recording in or below this folder; allowed: a folder with *.mcap files"
+            )
         yield from paths
     else:
         try:

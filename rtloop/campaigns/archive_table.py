@@ -55,7 +55,7 @@ class VerdictTable:
         except BlockingIOError:
             self.close()
             raise UnavailableError(
-                f"{folder}: another process stores verdicts in this folder; wait for that process, or choose "
+                f"{folder}: another `rtloop archive` writes its results to this folder; wait until it ends, or choose "
                 "another folder with --out"
             ) from None
         try:

@@ -153,7 +153,10 @@ class CaseRunner:
         values = {key: option_value(loop.configuration, driver.options, key) for key in drawn}
         for key, value in drawn.items():
             if values[key] != value:
-                raise RuntimeError(f"{key}: {value!r} was drawn, but the rig that runs has {values[key]!r}")
+                raise RuntimeError(
+                    f"{key}: the campaign set {value!r}, but the rig that runs has {values[key]!r}; this is a fault of "
+                    "rtloop, report it with the campaign's files"
+                )
         axis = self._builder.axis
         seed = int(option_value(loop.configuration, driver.options, SEED_KEY))
         plan, ticks = experiment_plan(loop.plan, axis, experiment, seed)
@@ -247,8 +250,10 @@ def _require_equal(computed_um: Real, recorded_um: Real) -> None:
     """
     if not np.array_equal(computed_um, recorded_um, equal_nan=True):
         raise ValueError(
-            "the actuator moved in periods without a tick, so that its true position there is unknown; "
-            "set driver.latency_ticks to 0, and leave out creep and a loss of drive, or make the ticks less late"
+            "the actuator moved in periods that the loop missed, and its true position there is unknown; remove "
+            "lateness from the campaign, or set it to a recording whose ticks are all less than a period late. Missed "
+            "periods are allowed only for a rig with driver.latency_ticks = 0, without creep and without the fault "
+            "drive_lost"
         )
 
 

@@ -213,9 +213,9 @@ def histogram_title(curves: FigureValues) -> str:
     finite, infinite = (int(np.count_nonzero(test(curves.values))) for test in (np.isfinite, np.isposinf))
     parts = [count_text(finite, "rig")]
     if infinite:
-        parts.append(f"{infinite:,} more {'has' if infinite == 1 else 'have'} an infinite value")
+        parts.append(f"{count_text(infinite, 'more rig')} {'has' if infinite == 1 else 'have'} an infinite value")
     if np.isposinf(curves.nominal):
-        parts.append("this figure is infinite for the nominal rig")
+        parts.append("the nominal rig has an infinite value")
     return "; ".join(parts)
 
 

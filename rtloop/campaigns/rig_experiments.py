@@ -101,7 +101,10 @@ class StepsExperiment(ExperimentOptions):
     def _check(self) -> Self:
         """Require levels of which each differs from the one before it, from 0 on."""
         if any(a == b for a, b in zip((0.0, *self.levels_um), self.levels_um, strict=False)):
-            raise ValueError(f"levels_um: {list(self.levels_um)}; allowed: no level twice in a row, and not 0 first")
+            raise ValueError(
+                f"levels_um: {list(self.levels_um)}; allowed: each level different from the one before it, and the "
+                "first from 0"
+            )
         return self
 
     @property

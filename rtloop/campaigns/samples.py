@@ -40,7 +40,9 @@ def unit_samples(sampling: Sampling, keys: Sequence[str], first: int, count: int
     for more keys than Sobol's sequence has dimensions.
     """
     if first < 0 or first + count > total:
-        raise ValueError(f"sample numbers {first} … {first + count - 1}; allowed: 0 … {total - 1}")
+        raise ValueError(
+            f"samples of rigs {first + 1} … {first + count}; allowed in a campaign of {total} rigs: 1 … {total}"
+        )
     if sampling == "sobol":
         return _sobol(keys, first, count, seed)
     if sampling == "saltelli":

@@ -83,8 +83,8 @@ class UncertainOptions(Options):
         low, high = map(distribution.cdf, self.limits)
         if not high > low:
             raise ValueError(
-                f"limits: {list(self.limits)}; allowed: an interval that contains values of normal = "
-                f"{[mean, deviation]}"
+                f"limits: {list(self.limits)}; normal = {[mean, deviation]} has practically no values between these "
+                "limits; use limits nearer to the mean"
             )
         inside = min(max(low + share * (high - low), 1e-300), 1 - 1e-16)
         return min(max(distribution.inv_cdf(inside), self.limits[0]), self.limits[1])

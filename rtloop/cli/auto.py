@@ -73,12 +73,12 @@ def auto(
         )
     click.echo(f"{out} is written. Identified: {stage.describe()}; {figures}", err=True)
     reference = describe_reference(reference_values(stage, axis))
-    click.echo(f"[axis.reference] of {out}: {reference}, in place of the recorded excitation", err=True)
+    click.echo(f"[axis.reference] of {out}: {reference}; they replace the excitation of the recordings", err=True)
     code = verify_configuration(out, None, None, as_json)
     if code and synthesised_norm > 1:
         click.echo(
-            f"‖F_l(P, C)‖∞ is {synthesised_norm:.4g}, above 1: the design meets each requirement only if relaxed by "
-            "this factor. Make [weights.tracking] stricter than needed, as in deploy/own-stage-spec.toml, or use "
+            f"‖F_l(P, C)‖∞ is {synthesised_norm:.4g}, above 1: the loop may miss each requirement by up to this "
+            "factor. Make [weights.tracking] stricter than the requirement, as in deploy/own-stage-spec.toml, or use "
             "--robust",
             err=True,
         )
@@ -135,8 +135,8 @@ def write_robust_design(
     except NoTaps as error:
         _check_and_write(error.text, out)
         raise NoDesign(
-            f"{specs}: {error}. {out} is written with the controller that was found, without taps: its steps are not "
-            f"shaped. To judge it: rtloop design verify {out}"
+            f"{specs}: {error}. {out} is written with the controller that was found, but without taps, so that steps "
+            f"of the reference are not shaped. To judge the loop: rtloop design verify {out}"
         ) from None
     except NoDesign as error:
         raise NoDesign(f"{specs}: {error}") from None

@@ -55,7 +55,11 @@ def synthesise(spec: Path, model: Path | None, out: Path | None, axis: str, cros
     else:
         click.echo(f"{spec}: {result.verdict}")
         if result.actuator is None:
-            click.echo(f"[axis.feedforward] of {out} is a placeholder; --model FILE takes an identified one", err=True)
+            click.echo(
+                f"[axis.feedforward] of {out} is a placeholder; use --model FILE, where FILE contains an identified "
+                "[axis.feedforward]",
+                err=True,
+            )
         click.echo(
             f"{out} is written. To judge it: rtloop check {out}. To swap it into a running loop: "
             f"rtloop ctl controller {axis} {out}"

@@ -88,7 +88,10 @@ def import_command(
     from rtloop.interchange.columns import ColumnSelection, extend_selection
 
     if len(files) > 1 and (out is not None or as_json):
-        raise click.UsageError(f"--out and --json: {len(files)} files are given; allowed: only one FILE")
+        raise click.UsageError(
+            f"--out or --json with {len(files)} input files; allowed: one input file. "
+            "Run the command once for each file"
+        )
     if time is not None and rate_hz is not None:
         raise click.UsageError("--time and --rate: both are given; allowed: one of them")
     options = ColumnSelection(all=everything, time=time, rate_hz=rate_hz, group=group, position_first=position_first)

@@ -36,7 +36,10 @@ def recover(files: tuple[Path, ...], out: Path | None, as_json: bool) -> None:
 
     paths = find_files(files)
     if len(paths) > 1 and (out is not None or as_json):
-        raise click.UsageError(f"--out and --json: {len(paths)} files are given; allowed: only one FILE")
+        raise click.UsageError(
+            f"--out or --json with {len(paths)} input files; allowed: one input file. "
+            "Run the command once for each file"
+        )
     for path in paths:
         with Counter("ticks recovered", sys.stderr) as counter:
             report = recover_recording(path, out, counter.show)

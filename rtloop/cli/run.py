@@ -55,7 +55,9 @@ def run(
     """
     require_readable(config)
     if out is not None and out.suffix == ".mcap":
-        raise click.UsageError(f"--out: {out} is a recording's name; allowed: a folder, in which names have the time")
+        raise click.UsageError(
+            f"--out: {out} is a recording's name; allowed: a folder. rtloop names the recording in it by date and time"
+        )
     if panel:
         if unpaced or out is not None or as_json:
             raise click.UsageError("--panel: not allowed with --unpaced, --out or --json")

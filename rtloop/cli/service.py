@@ -140,7 +140,9 @@ def _serve_node(configuration: Configuration, line: str, axes: list[str], is_sto
     if configuration.driver_kind != line:
         raise ConfigError(source, [f"driver.kind: {configuration.driver_kind!r}; allowed with --{line}: {line!r}"])
     if not isinstance(options, CanOptions | NodeOptions):
-        raise TypeError(f"driver.kind {line!r} has options of {type(options).__name__}")
+        raise TypeError(
+            f"driver.kind: {line!r} has options of class {type(options).__name__}; allowed: CanOptions or NodeOptions"
+        )
     prepare_realtime(Pacing(configuration.loop.rate_hz, priority=BOARD_PRIORITY))
 
     def announce() -> None:

@@ -64,8 +64,8 @@ def _open_connection(path: Path) -> socket.socket:
         owner = path.lstat().st_uid
         if server_user not in trusted_users or owner != server_user:
             raise HostRefusal(
-                f"{path}: the socket belongs to user {owner} and is served by user {server_user}; allowed: one user "
-                "for both, who must be you, root or the owner of the folder"
+                f"{path}: user {owner} owns the socket and user {server_user} serves it; allowed: the same user as "
+                "owner and server, and only you, root or the owner of the folder"
             )
         return connection
     except BaseException:

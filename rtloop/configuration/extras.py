@@ -92,7 +92,10 @@ def build_extras(
     for name in (*inputs, *outputs):
         if f"{name}_v" in columns:
             section = "inputs" if name in inputs else "outputs"
-            raise ValueError(f"{section}.{name}: a recording already has a column {name}_v; use another name")
+            raise ValueError(
+                f"{section}.{name}: its column {name}_v would have the name of a signal that rtloop records itself; "
+                "use another name"
+            )
     channel_users = {axis_wiring.output: f"the drive of axis {axis}" for axis, axis_wiring in wiring.items()}
     extra_outputs = []
     for name, options in outputs.items():

@@ -57,7 +57,8 @@ class Library:
         if len(matches) > 1:
             choices = ", ".join(law.kind for law in matches)
             raise ValueError(
-                f"kind: missing; {file or default!r} has several laws in the running loop; set kind to one of {choices}"
+                f"kind: missing; {file or default!r} matches several laws that are loaded in the running loop; set "
+                f"kind to one of {choices}"
             )
         return matches[0]
 

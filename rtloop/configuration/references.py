@@ -139,7 +139,10 @@ def read_samples(path: Path, folder: Path | None = None) -> npt.NDArray[np.float
             "two columns of at least one number"
         )
     if not np.all(np.abs(samples) < USABLE_MAGNITUDE):
-        raise ValueError(f"file: {path} contains numbers that are not finite or beyond ±{USABLE_MAGNITUDE:g}")
+        raise ValueError(
+            f"file: {path} contains NaN, infinity or too large numbers; allowed: finite numbers within "
+            f"±{USABLE_MAGNITUDE:g}"
+        )
     return samples
 
 

@@ -41,7 +41,8 @@ class ScheduleOptions(Options):
             raise ValueError(f"{sum(changes)} changes; allowed in an entry: exactly one of mode, reference, reset_trip")
         if self.axis is not None and self.reference is None:
             raise ValueError(
-                f"axis: {self.axis!r} without a reference; mode and reset_trip act on all axes, so remove axis"
+                f"axis: {self.axis!r} is set in an entry without a reference; mode and reset_trip act on all axes. "
+                "Remove the key axis from this entry"
             )
         return self
 

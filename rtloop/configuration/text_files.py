@@ -67,7 +67,9 @@ def read_below(folder: Path, relative: Path, limit_bytes: int) -> bytes:
     Raises OSError for a path out of the folder, a link, another kind of file, a larger one, and an unreadable one.
     """
     if relative.is_absolute() or ".." in relative.parts or not relative.parts:
-        raise OSError(errno.EACCES, "outside the configuration's folder; allowed: files in or below that folder")
+        raise OSError(
+            errno.EACCES, "the file is outside the configuration's folder; allowed: files in or below that folder"
+        )
     fd = os.open(folder, os.O_PATH | os.O_DIRECTORY | os.O_CLOEXEC)
     try:
         for part in relative.parts[:-1]:
@@ -103,6 +105,8 @@ def parse_toml(text: str) -> dict[str, Any]:
     except tomllib.TOMLDecodeError as error:
         raise ValueError(f"not valid TOML: {_QUOTED.sub('…', str(error))}") from None
     except ValueError:  # the interpreter's own limit, whose message is about the interpreter
-        raise ValueError("not valid TOML: an integer has too many digits") from None
+        raise ValueError("not valid TOML: an integer has too many digits (thousands); shorten it") from None
     except RecursionError:
-        raise ValueError("not valid TOML: lists or tables are nested too deeply") from None
+        raise ValueError(
+            "not valid TOML: lists or tables are nested too deeply (hundreds of levels); use fewer levels"
+        ) from None

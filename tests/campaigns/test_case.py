@@ -125,7 +125,7 @@ def test_a_value_that_is_not_applied_is_found(runner, monkeypatch):
         return replace(tables, {key: value for key, value in values.items() if "damping" not in key})
 
     monkeypatch.setattr("rtloop.campaigns.rig_builder.replace_values", drop_one)
-    with pytest.raises(RuntimeError, match=r"damping_factor: \S+ was drawn, but the rig that runs has 1.0"):
+    with pytest.raises(RuntimeError, match=r"damping_factor: the campaign set \S+, but the rig that runs has 1.0"):
         runner.run(4)
 
 
@@ -186,7 +186,10 @@ def test_a_key_without_effect_or_sense_is_an_error(tmp_path, uncertain, named):
         ({"keys": 'axis = "y"'}, "axis: 'y' is unknown; allowed: x"),
         ({"keys": "rigs = 0"}, "rigs"),
         ({"experiments": STEPS + STEPS}, "two experiments have the name 'steps'"),
-        ({"experiments": STEPS.replace("[10.0]", "[0.0]")}, "no level twice in a row"),
+        (
+            {"experiments": STEPS.replace("[10.0]", "[0.0]")},
+            "each level different from the one before it, and the first from 0",
+        ),
         ({"limits": '"steps.settling" = 3.0'}, "steps.settling; allowed: steps.overshoot_percent, steps.settling_ms"),
         ({"uncertain": ""}, "uncertain"),
         ({"configuration": ROOT / "deploy/board.toml"}, "a campaign needs the simulated rig"),

@@ -116,7 +116,7 @@ def test_rigs_whose_motion_in_missed_periods_is_unknown_are_refused(tmp_path, ke
     configuration.write_text(paper.replace("[driver.plant.sensor]", f"{CREEP}[driver.plant.sensor]", 1))
     changes: dict[str, Any] = {"uncertain": key} if key else {"configuration": configuration}
     case = CaseRunner(make_campaign(tmp_path, (0.0, 250.0), **changes)).run(1)
-    assert "set driver.latency_ticks to 0, and leave out creep and a loss of drive" in case.refusal
+    assert "a rig with driver.latency_ticks = 0, without creep and without the fault drive_lost" in case.refusal
     assert not CaseRunner(make_campaign(tmp_path, (0.0, 90.0), **changes)).run(1).refusal
 
 

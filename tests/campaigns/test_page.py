@@ -383,7 +383,7 @@ def require_pictures(values, limit):
 
 def test_infinite_values_are_counted_in_words():
     values = np.array([1.0, math.inf, 2.0, math.inf, math.nan])
-    assert histogram_title(FigureValues("a", values, 1.0, 1.0)) == "2 rigs; 2 more have an infinite value"
+    assert histogram_title(FigureValues("a", values, 1.0, 1.0)) == "2 rigs; 2 more rigs have an infinite value"
     assert histogram_title(FigureValues("a", values[:2], 1.0, math.inf)) == (
-        "1 rig; 1 more has an infinite value; this figure is infinite for the nominal rig"
+        "1 rig; 1 more rig has an infinite value; the nominal rig has an infinite value"
     )

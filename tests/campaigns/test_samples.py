@@ -58,7 +58,7 @@ def test_sobol_fills_squares_more_evenly_than_chance():
 
 
 def test_samples_beyond_the_last_are_refused():
-    with pytest.raises(ValueError, match=r"sample numbers 99 … 100; allowed: 0 … 99"):
+    with pytest.raises(ValueError, match=r"samples of rigs 100 … 101; allowed in a campaign of 100 rigs: 1 … 100"):
         unit_samples("random", KEYS, 99, 2, 100, 3)
 
 

@@ -189,7 +189,10 @@ def test_a_wrong_sign_and_a_position_that_does_not_follow_are_named() -> None:
     for wrong, says in (
         (run_of(drive, -run.position_um), r"the sign is wrong: .* falls by [34]\.\d+ µm per volt of drive"),
         (run_of(-drive, run.position_um), r"the sign is wrong: .* falls by [34]\.\d+ µm per volt of drive"),
-        (run_of(drive, other_axis_um), r"no sum of plays explains .* has an error of \d+ % of the range .* up to 15 %"),
+        (
+            run_of(drive, other_axis_um),
+            r"no sum of play operators .* error of \d+ % of the position's range; .* up to 15 %",
+        ),
     ):
         for identify in (identify_hysteresis, identify_from_parts):
             with pytest.raises(UnsuitableData, match=says):

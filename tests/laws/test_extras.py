@@ -216,8 +216,8 @@ class Mine(CoupledController):
             "law 'mine' needs the input 'back' in .inputs.; available for this law: spare, black",
         ),
         ("[outputs.count]", "[outputs.spare]", "outputs.spare: an input has the same name"),
-        ("[inputs.spare]", "[inputs.enable]", "inputs.enable: a recording already has a column enable_v"),
-        ("[inputs.spare]", "[inputs.x_drive]", "inputs.x_drive: a recording already has a column x_drive_v"),
+        ("[inputs.spare]", "[inputs.enable]", "inputs.enable: its column enable_v would have the name of a signal"),
+        ("[inputs.spare]", "[inputs.x_drive]", "inputs.x_drive: its column x_drive_v would have the name of a signal"),
         ("rate_hz = 10000\n", 'rate_hz = 10000\nhold_input = "gate"\n', "hold_input: 'gate' is not among"),
     ],
 )  # fmt: skip

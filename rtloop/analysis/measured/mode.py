@@ -68,8 +68,9 @@ def fit_light_mode(measured: MeasuredResponse, rate_hz: float, near_hz: float, b
     in_band = np.abs(measured.hz / near_hz - 1) <= band
     if (lines := int(in_band.sum())) < MIN_LINES:
         raise ValueError(
-            f"only {lines} frequencies of the multisine lie within ±{100 * band:g} % of {near_hz:g} Hz; needs at least "
-            f"{MIN_LINES} frequencies. Use a multisine of longer period, or with more frequencies in this band"
+            f"only {lines} frequencies of the multisine lie within ±{100 * band:g} % of {near_hz:g} Hz; allowed: at "
+            f"least {MIN_LINES}, to identify a mode there. Use a multisine with a longer period, or with more "
+            "frequencies in this band"
         )
     hz, plant = measured.hz[in_band], measured.plant[in_band]
     fit = _ModeFit(hz, plant, np.abs(plant) * measured.spread[in_band], rate_hz)

@@ -68,8 +68,7 @@ def make_grid(
     samples = round(period_s * rate_hz)
     if not 0 < from_hz < to_hz <= HIGHEST_PART * rate_hz:
         raise ValueError(
-            f"from_hz = {from_hz:g} and to_hz = {to_hz:g}; allowed: rising frequencies above 0, up to "
-            f"{HIGHEST_PART * rate_hz:g} Hz"
+            f"from_hz = {from_hz:g} and to_hz = {to_hz:g}; allowed: 0 < from_hz < to_hz ≤ {HIGHEST_PART * rate_hz:g} Hz"
         )
     first, last = (hz * samples / rate_hz for hz in (from_hz, to_hz))
     odd = np.arange(2 * int(np.ceil((first - 1) / 2)) + 1, np.floor(last) + 1, 2, dtype=np.int64)

@@ -64,7 +64,9 @@ def measure_response(grid: LineGrid, signals: PeriodSignals) -> MeasuredResponse
     """
     periods = len(signals.position)
     if periods < 2:
-        raise ValueError(f"{periods} complete periods of the multisine; needs at least 2. Record longer")
+        raise ValueError(
+            f"complete periods of the multisine in the recording: {periods}; allowed: at least 2. Record longer"
+        )
     x, v, e = (grid.amplitudes(signal) for signal in (signals.position, signals.command, signals.error))
     direct = 0.0 if signals.direct is None else grid.amplitudes(signals.direct)
     mean_x, mean_v, mean_e = (signal.mean(axis=0) for signal in (x, v, e))

@@ -178,8 +178,9 @@ def require_usable(name: str, drive_v: Real, position_um: Real, adc_v: Real | No
         )
     if span < LEAST_SPAN_TO_NOISE * noise or span == 0:
         raise UnsuitableData(
-            f"{name}: too little excitation: the position moves by {span:.3g} µm with noise of {noise:.2g} µm; "
-            f"needs at least {LEAST_SPAN_TO_NOISE * noise:.2g} µm. Use a larger drive"
+            f"{name}: too little excitation: the position moves by {span:.3g} µm; allowed: at least "
+            f"{LEAST_SPAN_TO_NOISE * noise:.2g} µm, {LEAST_SPAN_TO_NOISE:g} times its noise of {noise:.2g} µm. "
+            "Use a larger drive"
         )
     signal, values, unit = ("reading", adc_v, "V") if adc_v is not None else ("recorded position", position_um, "µm")
     if (tick := _first_clipped_tick(drive_v, values)) is not None:
@@ -213,7 +214,7 @@ def excitation_warnings(runs: Sequence[AxisRecording]) -> list[str]:
             sentences.append(f"{run.name}: {cause}. {effect}. {remedy}")
         elif jumps(run):
             cause = "the drive has steps, after which the stage rings"
-            sentences.append(f"{run.name}: {cause}. The ringing counts as hysteresis here. {remedy}")
+            sentences.append(f"{run.name}: {cause}. Identification takes this ringing for hysteresis. {remedy}")
     return sentences
 
 
@@ -277,8 +278,8 @@ def _require_untripped(path: Path, flags: Real) -> None:
     first = int(np.argmax(np.isin(flags, np.unique(flags)[is_tripped])))
     causes = trip_causes(flags[first])
     raise UnsuitableData(
-        f"{path}: the run tripped at tick {first} ({', '.join(causes)}); needs a run without trip. "
-        f"{trip_remedy(causes)}"
+        f"{path}: the run tripped at tick {first} ({', '.join(causes)}); identification needs a recording "
+        f"without a trip. {trip_remedy(causes)}"
     )
 
 

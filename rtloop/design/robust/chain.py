@@ -165,8 +165,9 @@ def _require_play_model(stage: Stage, design: DesignOptions) -> None:
         why = CREEP_TEXT if is_creep_likely(stage.slow) else OTHER_SIZES_TEXT
         raise NoDesign(
             f"{stage.slow.name}: the actuator is not a sum of plays: any number of plays leaves an error of "
-            f"{left_um:.3g} µm rms{why}. Set simulation.residual_percent to the hysteresis that the inverse may leave; "
-            "the design then continues and is verified with this hysteresis"
+            f"{left_um:.3g} µm rms{why}. Set simulation.residual_percent to the hysteresis (% of the position's range) "
+            "that remains with the feedforward, as `rtloop experiment run compensation` measures it; the design "
+            "then continues, and is verified with this hysteresis"
         )
 
 

@@ -59,7 +59,11 @@ def find_robust_controller(design: DesignOptions, progress: Progress = lambda _:
     """
     plant = design.sensor.add_sensor_lag(design.required_plant.transfer())
     if not plant.is_strictly_proper or plant.dc_gain <= 0 or not plant.is_stable:
-        raise ValueError("plant: needs a stable model with more poles than zeros and a gain at 0 Hz above 0")
+        raise ValueError(
+            f"plant: with its sensor it is {'stable' if plant.is_stable else 'not stable'} and has {plant.zeros.size} "
+            f"zeros, {plant.order} poles and a gain at 0 Hz of {plant.dc_gain:g}; allowed: stable, fewer zeros than "
+            "poles, a gain at 0 Hz above 0"
+        )
     options, period_s = design.robust, 1 / design.controller.rate_hz
     family = Family(plant, design.required_plant.delay_ticks, design.scenarios, period_s)
     walls = search_walls = design_walls(design)

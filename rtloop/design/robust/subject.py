@@ -57,8 +57,8 @@ def missing_requirements(specification: SpecificationOptions) -> list[str]:
         )
     if specification.command is None:
         faults.append(
-            "specification.command.reference_um: missing; set the largest step of the reference, at which v must stay "
-            "within its limits"
+            "specification.command.reference_um: missing; set the height of the reference's largest step in µm. The "
+            "command stays within its limits in steps up to this height"
         )
     return faults
 
@@ -112,9 +112,9 @@ def step_bounds(axis: AxisOptions, model: ModelOptions, design: DesignOptions) -
         limits = axis.limits
         raise ValueError(
             f"specification.command.reference_um: value is {step_um:g} µm; allowed: up to "
-            f"{largest_um / static:.4g} µm, because limits.drive_min_v = {limits.lowest_v:g}, "
-            f"limits.drive_v = {limits.drive_v:g} and limits.command_um = {limits.command_um:g} allow a command of "
-            f"{low_um:.4g} … {high_um:.4g} µm; a smaller value allows faster steps"
+            f"{largest_um / static:.4g} µm, for a command of {low_um:.4g} … {high_um:.4g} µm (limits.drive_min_v = "
+            f"{limits.lowest_v:g}, limits.drive_v = {limits.drive_v:g}, limits.command_um = {limits.command_um:g}). "
+            "Set a smaller reference_um; smaller steps can also be faster"
         )
     has_equal_sides = math.isclose(-low_um, high_um, rel_tol=1e-6) and step_um * static <= -low_um
     if has_equal_sides or max(command.command_um, step_um * static) <= min(-low_um, high_um):

@@ -110,7 +110,7 @@ def _split_stable(transfer: Transfer) -> tuple[ModalSystem | System, ModalSystem
     if not transfer.is_stable:
         raise ValueError(
             "the full controller has unstable poles and repeated poles; its order cannot be reduced. Change the "
-            "specification slightly, so that its poles differ"
+            "specification slightly, so that no two poles of the controller are equal"
         )
     points = imaginary_axis_points(np.concatenate([transfer.zeros, transfer.poles]))
     return scale_states(cascade(transfer.zeros, transfer.poles, transfer.gain), points), None

@@ -109,8 +109,8 @@ def _trial_of_user_thresholds(thresholds: Real, stroke_v: float, hint: str) -> T
     too_large = thresholds[thresholds >= 0.5 * stroke_v]
     if too_large.size:
         raise UnsuitableData(
-            f"thresholds from {too_large[0]:g} V on cannot be identified: the longest stroke with known memory has "
-            f"{stroke_v:.4g} V, and shows thresholds below half of that, {0.5 * stroke_v:.4g} V"
+            f"thresholds from {too_large[0]:g} V on cannot be identified; allowed: below {0.5 * stroke_v:.4g} V, half "
+            f"of {stroke_v:.4g} V, the longest stroke of the drive over which the actuator's memory is known"
             f"{f'; {hint}' if hint else ''}"
         )
     return Trial(thresholds, "given", ())
@@ -132,10 +132,10 @@ def _require_stroke(runs: Sequence[AxisRecording], work: RecordingSet) -> tuple[
     )
     if stroke_v < LEAST_KNOWN_SHARE * work.largest_v:
         raise UnsuitableData(
-            f"{', '.join(run.name for run in runs)}: too little excitation. The actuator's memory at the start is not "
-            f"known. The longest stroke with known memory has {stroke_v:.4g} V; allowed: at least "
-            f"{LEAST_KNOWN_SHARE * work.largest_v:.4g} V, {100 * LEAST_KNOWN_SHARE:g} % of the {work.largest_v:.4g} V "
-            f"that the drive covers; {hint}"
+            f"{', '.join(run.name for run in runs)}: too little excitation: the longest stroke of the drive over which "
+            f"the actuator's memory is known has {stroke_v:.4g} V; allowed: at least "
+            f"{LEAST_KNOWN_SHARE * work.largest_v:.4g} V ({100 * LEAST_KNOWN_SHARE:g} % of the drive's range); {hint}. "
+            "Record this stroke"
         )
     return stroke_v, hint
 

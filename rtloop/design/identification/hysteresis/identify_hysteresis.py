@@ -95,8 +95,8 @@ def _fit_trial(recordings: RecordingSet, trial: Trial) -> HysteresisFit:
     singular_values = np.linalg.svd(columns / np.linalg.norm(columns, axis=0), compute_uv=False)
     if singular_values[-1] < LEAST_DIRECTION * singular_values[0]:
         raise UnsuitableData(
-            f"too little excitation: these drives do not determine {trial.thresholds_v.size} weights. Use fewer "
-            "operators, or drives with loops of several sizes"
+            f"too little excitation: these drives do not determine {trial.thresholds_v.size} weights, one for "
+            "each play operator. Use fewer operators, or drives that turn back at several voltages"
         )
     common, own_gains = fit_gains(equations, recordings.limits._replace(drive_v=0.0))
     residuals_um = [model_errors(part, common, gains) for part, gains in zip(equations, own_gains, strict=True)]
