@@ -90,7 +90,7 @@ class Reader:
         self.close()
 
     def close(self) -> None:
-        """Close the file; a closed reader cannot read, nor be closed again."""
+        """Close the file; a closed reader cannot read."""
         self._source.close()
 
     def restrict_begin(self, tick: int) -> None:

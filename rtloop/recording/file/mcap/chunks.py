@@ -94,7 +94,7 @@ class McapSource:
             raise RecordingError(f"{self.path}: {error.strerror}") from None
 
     def close(self) -> None:
-        """Close the descriptor of the file, if it was opened; only one call is allowed."""
+        """Close the descriptor of the file, if it is open."""
         if self._fd >= 0:
             close_descriptor(self._fd)
             self._fd = -1
