@@ -83,11 +83,11 @@ def examine(
         )
     except subprocess.TimeoutExpired:
         raise RtloopError(
-            f"measuring how late this computer wakes the loop did not end within {timeout_s:.0f} s"
+            f"the measurement of the loop's lateness on this computer did not end within {timeout_s:.0f} s"
         ) from None
     if process.returncode != 0:
         lines = process.stderr.decode(errors="replace").strip().splitlines() or [f"exit code {process.returncode}"]
-        raise RtloopError(f"measuring how late this computer wakes the loop failed: {lines[-1]}")
+        raise RtloopError(f"the measurement of the loop's lateness on this computer failed: {lines[-1]}")
     grants, lateness_us, missed = latency.decode_results(process.stdout)
     host = Host(grants, root)
     measurement = Latency(pacing, lateness_us, missed, host.stolen_s() - before_s)

@@ -110,7 +110,9 @@ def run_ticks(loop_address, until_tick):
     try:
         if not all_coefficients_fit(law_record(loop)):
             # The text reaches nobody: the supervisor words the outcome LAW_FAILED (OUTCOME_MESSAGES).
-            raise IndexError("a count in the coefficients exceeds its array, or an axis has not one controller")
+            raise IndexError(
+                "a count in the coefficients is larger than its array, or an axis has no controller or several"
+            )
         outcome = _run_ticks(loop, until_tick)
         if outcome != DONE:
             _end_late_episode(loop)
@@ -413,7 +415,7 @@ def _publish_snapshot(loop):
         (law.loop, LOOP_STATE_BYTES),
     ):
         if offset + count > loop.snapshot_bytes:
-            raise IndexError("the coefficients and states of the laws have more bytes than a snapshot")
+            raise IndexError("the coefficients and states of the laws have more bytes than the space for a snapshot")
         copy_bytes(loop.snapshots_slots + slot * loop.snapshot_bytes + offset, address, count)
         offset += count
     publish(ring, position)

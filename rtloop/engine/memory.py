@@ -159,7 +159,8 @@ class SharedBlock:
         header = json.dumps(directory).encode()
         if len(header) > DIRECTORY_BYTES:
             raise ValueError(
-                f"shared block: the list of its arrays has {len(header)} bytes; allowed: at most {DIRECTORY_BYTES}"
+                f"memory shared by the loop's processes: the list of its arrays has {len(header)} bytes; allowed: at "
+                f"most {DIRECTORY_BYTES}"
             )
         fd = cls.reserve() if fd is None else fd
         os.ftruncate(fd, offset)

@@ -66,8 +66,8 @@ def drain(ring: Ring, cursor: int, out: npt.NDArray[Any]) -> tuple[int, int, int
     slots, first = ring.slots, np.array([cursor], np.uint64)
     if out.dtype != slots.dtype or out.shape[1:] != slots.shape[1:] or not out.flags.c_contiguous:
         raise ValueError(
-            f"out: slots of {' × '.join(map(str, out.shape[1:]))} {out.dtype} values; allowed: a contiguous array, "
-            f"slots of {' × '.join(map(str, slots.shape[1:]))} {slots.dtype} values"
+            f"the array `out`, one row for each slot, has rows of shape {out.shape[1:]} and type {out.dtype}; allowed: "
+            f"a contiguous array with rows of shape {slots.shape[1:]} and type {slots.dtype}"
         )
     copied = _drain(
         ring.head.ctypes.data, ring.marks.ctypes.data, slots.ctypes.data, len(slots), slots.strides[0],

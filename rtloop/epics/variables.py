@@ -81,7 +81,7 @@ def _command(suffix: str, send: Callable[[Connection], object]) -> Variable:
     def request(loop: Connection, value: str) -> object:
         """Send the command. Raises RtloopError for any value but EXECUTE."""
         if value != EXECUTE:
-            raise RtloopError(f"value is {value}; allowed: {EXECUTE} (1)")
+            raise RtloopError(f"the written value is {value}; allowed: {EXECUTE} (1)")
         return send(loop)
 
     return Variable(suffix, lambda _: IDLE, request, (IDLE, EXECUTE))

@@ -46,7 +46,7 @@ def tone(signal: Real, hz: float, rate_hz: float) -> Tone:
     if signal.size * hz < MIN_CYCLES * rate_hz or signal.size < 3:
         raise ValueError(
             f"{signal.size} samples at {rate_hz:g} Hz cover {signal.size * hz / rate_hz:.2g} cycles of {hz:g} Hz; "
-            f"allowed: at least {MIN_CYCLES} cycles, of 3 samples or more in all. Use a longer recording"
+            f"allowed: at least {MIN_CYCLES} cycles, and at least 3 samples. Use a longer recording"
         )
     gram, rhs = np.zeros((3, 3)), np.zeros(3)
     for block, columns in _blocks(signal, hz / rate_hz):

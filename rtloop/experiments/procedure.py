@@ -104,16 +104,16 @@ class Experiment:
                 continue
             magnitude, limit, place = exceeding[0]
             if key in options.model_fields_set:
-                allowed = f"allowed: up to {limit:.4g}{unit}, by {place}"
+                allowed = f"allowed: up to {limit:.4g}{unit}, limited by {place}"
                 faults.append(f"{self.name}.{key}: {magnitude:g}{unit}; {allowed}")
                 continue
             if limit < LEAST_SHARE * magnitude:
                 raise UnsuitableLoop(
-                    f"{self.name}.{key}: {magnitude:g}{unit}; allowed: up to {limit:.2g}{unit}, by {place}"
+                    f"{self.name}.{key}: {magnitude:g}{unit}; allowed: up to {limit:.2g}{unit}, limited by {place}"
                 )
             changes[key] = _scale_down(value, [bound[0] for bound in bounds])
             old_text, new_text = _value_text(value), _value_text(changes[key])
-            reductions.append(f"{self.name}.{key}: {new_text}{unit} instead of {old_text}{unit}, by {place}")
+            reductions.append(f"{self.name}.{key}: {new_text}{unit} (default: {old_text}{unit}), limited by {place}")
         if faults:
             raise ConfigError("parameters of the experiments", faults)
         return options.model_copy(update=changes), reductions

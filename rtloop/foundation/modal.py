@@ -87,11 +87,11 @@ def conjugate_pairs(roots: npt.ArrayLike) -> Complex:
     for root in upper[np.lexsort((upper.imag, upper.real))]:
         nearest = min(lower, key=lambda candidate, root=root: abs(candidate - np.conj(root)), default=None)
         if nearest is None or abs(nearest - np.conj(root)) > 1e-9 * abs(root):
-            raise ValueError(f"{root:.6g} is listed without its complex conjugate, {np.conj(root):.6g}")
+            raise ValueError(f"the root {root:.6g} is listed without its complex conjugate, {np.conj(root):.6g}")
         lower.remove(nearest)
         pairs += [complex(root), complex(np.conj(root))]
     if lower:
-        raise ValueError(f"{lower[0]:.6g} is listed without its complex conjugate, {np.conj(lower[0]):.6g}")
+        raise ValueError(f"the root {lower[0]:.6g} is listed without its complex conjugate, {np.conj(lower[0]):.6g}")
     return np.concatenate([real.astype(complex), np.asarray(pairs, dtype=complex)])
 
 

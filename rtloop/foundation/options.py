@@ -50,9 +50,11 @@ class Options(BaseModel):
         for number in _nested_numbers(value):
             if isinstance(number, int):
                 if abs(number) > LARGEST_INTEGER:
-                    raise ValueError(f"allowed: integers within ±{LARGEST_INTEGER}")
+                    raise ValueError(f"an integer is out of range; allowed: integers within ±{LARGEST_INTEGER}")
             elif abs(number) > LARGEST or 0 < abs(number) < SMALLEST:
-                raise ValueError(f"{number:g}; allowed: 0, and magnitudes from {SMALLEST:g} to {LARGEST:g}")
+                raise ValueError(
+                    f"number {number:g} is out of range; allowed: 0, and magnitudes from {SMALLEST:g} to {LARGEST:g}"
+                )
         return value
 
     @classmethod

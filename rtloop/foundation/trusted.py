@@ -59,7 +59,9 @@ def open_folder(path: Path, mode: int | None = None, *, shared: bool = False) ->
     fd, _, is_shared = _walk_path(path, mode)
     if is_shared and not shared:
         close_descriptor(fd)
-        raise UntrustedPath(path, "every user may write to this folder; use a folder to which only this user may write")
+        raise UntrustedPath(
+            path, "every user may write to this folder; use a folder to which only the user who runs rtloop may write"
+        )
     return fd
 
 
@@ -131,7 +133,7 @@ def open_device(path: Path | str) -> int:
     fd = os.open(path, os.O_RDWR | _NONBLOCK | getattr(os, "O_NOCTTY", 0) | _CLOEXEC)
     if not stat.S_ISCHR(os.fstat(fd).st_mode):
         close_descriptor(fd)
-        raise UntrustedPath(path, "neither a serial port nor another character device")
+        raise UntrustedPath(path, "not a serial port or other character device")
     return fd
 
 
@@ -190,7 +192,7 @@ def replace_file(path: Path, mode: int = 0o666) -> int:
         if not _is_own(status):
             raise UntrustedPath(path, f"{_foreign_owner_text(status)}; remove the file")
         if not stat.S_ISREG(status.st_mode):
-            raise UntrustedPath(path, "not a regular file; remove this entry")
+            raise UntrustedPath(path, "not a regular file; remove it, or use another path")
         abandoned = os.open(path.name, _READ | _NOFOLLOW, dir_fd=folder)
         try:
             fcntl.flock(abandoned, fcntl.LOCK_EX | fcntl.LOCK_NB)

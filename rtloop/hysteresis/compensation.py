@@ -90,8 +90,8 @@ def residual_operator(actuator: PlayModel, inverse: PlayModel, command_um: float
     slopes = loading_slopes(inverse)
     if inverse.thresholds[0] != 0 or not np.all(slopes > 0):
         raise ValueError(
-            f"compensator: the loading curve has the slopes {np.array2string(slopes, precision=4)} from the first "
-            f"threshold, {inverse.thresholds[0]:g} µm, on; allowed: slopes above 0, and a first threshold of 0"
+            f"compensator: the first threshold is {inverse.thresholds[0]:g} µm, and the loading curve has the slopes "
+            f"{np.array2string(slopes, precision=4)}; allowed: a first threshold of 0 µm, and slopes above 0"
         )
     if not (np.isfinite(command_um) and command_um > 0):
         raise ValueError(f"command_um: {command_um} µm; allowed: a finite number above 0")

@@ -164,8 +164,8 @@ def _regularity(deadlines: Real) -> tuple[float, list[str]]:
     if deviation.size and deviation.max() > max(JITTER_TOLERANCE * period, ROUNDED_NS):
         rms = float(np.sqrt(np.mean(deviation**2)))
         notes.append(
-            f"sample times jitter by {rms / 1e3:.3g} µs rms, {deviation.max() / 1e3:.3g} µs at most, about a "
-            f"period of {period / 1e3:.6g} µs; the import keeps the times as recorded"
+            f"sample times jitter: the periods deviate by {rms / 1e3:.3g} µs rms, {deviation.max() / 1e3:.3g} µs at "
+            f"most, from the median of {period / 1e3:.6g} µs; the import keeps the times as recorded"
         )
     gap_indices = np.flatnonzero(intervals >= GAP_PERIODS * period)
     if gap_indices.size:

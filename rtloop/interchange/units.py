@@ -75,7 +75,8 @@ def factor_between(source: str, target: str, by: str = "") -> Fraction:
     """
     source_unit, by_unit, target_unit = parse_unit(source), parse_unit(by), parse_unit(target)
     if _multiply_powers(source_unit.powers, by_unit.powers) != target_unit.powers:
-        raise UnknownUnit(f"{source or '1'}{f' · {by}' * bool(by)} cannot be converted to {target or '1'}")
+        source_text = f"{source or '1'} · {by}" if by else source or "a number without a unit"
+        raise UnknownUnit(f"{source_text} cannot be converted to {target or 'a number without a unit'}")
     return source_unit.scale * by_unit.scale / target_unit.scale
 
 

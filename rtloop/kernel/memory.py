@@ -143,7 +143,7 @@ class Layout:
             if law.axes != expected:
                 raise ValueError(
                     f"{slot}_law of {owner} is {law.name!r}, a law for {law.axes} axes; allowed: a law for {expected} "
-                    "axes (0 for a feedforward)"
+                    "axes (a feedforward counts as a law for 0 axes)"
                 )
             require_allowed(owner, slot_view(axis, slot, law.coefficients), law.allowed_coefficients)
             require_allowed(owner, slot_view(state, slot, law.state), law.allowed_state)
@@ -187,7 +187,7 @@ def _rules(record: np.dtype[Any], allowed: Rules) -> npt.NDArray[Any]:
     for rule, (name, limits) in zip(rules, allowed.items(), strict=True):
         if isinstance(limits, Bits):
             raise ValueError(
-                f"coefficient {name}: its allowed values are given as bits ({limits}); allowed: a range, as Allowed"
+                f"coefficient {name}: its rule is a set of bits ({limits}); use a range, of class Allowed, as its rule"
             )
         kind, offset, *_ = record.fields[str(name)]  # type: ignore[index]
         rule["offset"], rule["octets"], rule["count"] = offset, kind.base.itemsize, max(int(np.prod(kind.shape)), 1)
@@ -204,7 +204,9 @@ def require_owners(controller_axes: Sequence[int]) -> None:
     for number, count in enumerate(controller_axes):
         if (count == 0) != (number < owned_axes):
             owners = "no controller" if count == 0 else "two controllers"
-            raise ValueError(f"axis {number} has {owners} (controller_axes is {count}); allowed: exactly one")
+            raise ValueError(
+                f"controller_axes of axis {number}: {count}, which gives this axis {owners}; allowed: one controller"
+            )
         owned_axes = max(owned_axes, number + count)
 
 

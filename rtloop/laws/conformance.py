@@ -58,7 +58,9 @@ class LawConformance:
         frequencies beyond 0 … half of the rate, and a response that does not settle.
         """
         if self.law.count == 0:
-            raise ValueError("a feedforward has no error, and so no frequency response")
+            raise ValueError(
+                "this law is a feedforward; only a controller has a frequency response from error to command"
+            )
         return Bench(self.law, compiled=not UNCOMPILED).frequency_response(frequencies_hz, amplitude_um)
 
     @pytest.fixture

@@ -104,7 +104,8 @@ def test_the_dead_band_alone_leaves_what_the_model_of_eq_4_says() -> None:
         (
             PlayModel(np.array([0.0, 1.0]), np.array([1.0, -1.5])),
             40.0,
-            "compensator: the loading curve has the slopes .* allowed: slopes above 0",
+            "compensator: the first threshold is 0 µm, and the loading curve has the slopes .*; "
+            "allowed: a first threshold of 0 µm, and slopes above 0",
         ),
         (INVERSE, -1, "command_um: -1"),
     ],

@@ -112,7 +112,7 @@ def test_the_command_writes_a_section_that_a_configuration_reads(tmp_path) -> No
     ("old", "new", "code", "says"),
     [
         ('rule = "printed"', 'rule = "implied"', 1, "Relax the hardest, disturbance"),
-        ("command_um = 40.0", "command_um = 30.0", 1, "needs at least 39.5305 µm, or a smaller reference_um"),
+        ("command_um = 40.0", "command_um = 30.0", 1, "allowed: at least 39.5305 µm, or a smaller reference_um"),
         ("settling_ms = 3.0  ", "settling_ms = 0.003  ", 1, "tracking (ten times slower)"),
         ("order = 5 ", "order = 4 ", 78, "an unstable loop or one with max |S| above 3; use a higher order"),
         ("order = 5 ", "order = 12 ", 78, "0 modes that are not stable: 0 to 11"),

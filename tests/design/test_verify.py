@@ -356,7 +356,7 @@ def test_faults_of_the_user(tmp_path, monkeypatch) -> None:
     spec.write_text("[specification.claims]\nspeed = 'fast'\n")
     unknown = run(str(DEPLOY / "paper.toml"), "--spec", str(spec))
     assert unknown.exit_code == 78
-    assert "claims: speed; allowed: static_error_percent, " in unknown.stderr
+    assert "claims: unknown quantity speed; allowed: claims about static_error_percent, " in unknown.stderr
     monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
     missing = run(str(DEPLOY / "paper.toml"), "--out", str(tmp_path / "out"))
     assert missing.exit_code == 78

@@ -33,7 +33,7 @@ CAP_IPC_LOCK, CAP_SYS_NICE, PR_CAPBSET_DROP = 14, 23, 24
 def test_a_measurement_of_the_clock_that_does_not_end_is_a_fault_in_a_sentence(monkeypatch):
     monkeypatch.setattr(examine, "START_S", -0.6)
     with pytest.raises(
-        RtloopError, match=r"^measuring how late this computer wakes the loop did not end within \d+ s$"
+        RtloopError, match=r"^the measurement of the loop's lateness on this computer did not end within \d+ s$"
     ):
         examine.examine(Pacing(1000.0), 0.3)
 

@@ -214,7 +214,9 @@ def test_default_amplitudes_follow_the_limits(name: str) -> None:
 
 def test_values_set_beyond_the_limits_are_refused() -> None:
     steps, stage = EXPERIMENTS["steps"], Setting(RATE_HZ, SMALL, is_virgin=True)
-    with pytest.raises(ConfigError, match=r"_um: 15 µm; allowed: up to 14\.32 µm, by axis\.x\.limits\.command_um"):
+    with pytest.raises(
+        ConfigError, match=r"_um: 15 µm; allowed: up to 14\.32 µm, limited by axis\.x\.limits\.command_um"
+    ):
         steps.fit_options(steps.options(levels_um=(0.0, -15.0)), stage)
     kept = steps.options(levels_um=(0.0, -14.0))
     assert steps.fit_options(kept, stage) == kept
@@ -242,7 +244,7 @@ def test_compared_configurations_share_the_smaller_defaults(smaller: str, tmp_pa
     with pytest.raises(ConfigError) as refused:
         plan_runs(experiments, too_large, stages[0], folder, compared=stages[1])
     message = str(refused.value)
-    assert "steps.levels_um: 20 µm; allowed: up to 18.18 µm, by axis.x.limits.command_um" in message
+    assert "steps.levels_um: 20 µm; allowed: up to 18.18 µm, limited by axis.x.limits.command_um" in message
     assert ("of the configuration after --beside" in message) is (smaller == "compared")
 
 

@@ -113,7 +113,7 @@ def test_the_default_amplitude_of_compensation_is_not_clipped(tmp_path: Path) ->
     assert section["problem"] is None
     assert section["parameters"]["amplitude_um"] == pytest.approx(-curve([LOWEST_V])[0] / 1.02, rel=0.05)
     assert section["notes"][0].startswith(
-        "Reduced: compensation.amplitude_um: 6 µm instead of 40 µm, by axis.x.limits."
+        "Reduced: compensation.amplitude_um: 6 µm (default: 40 µm), limited by axis.x.limits."
     )
     assert "drive_min_v = -2" in section["notes"][0]
     assert section["reduced"]
@@ -170,13 +170,16 @@ def test_values_beyond_one_side_are_refused_with_its_limit() -> None:
     kept = steps.options(levels_um=(30.0, 0.0, -4.0))
     assert steps.fit_options(kept, setting()) == kept
     with pytest.raises(
-        ConfigError, match=r"steps\.levels_um: 6 µm; allowed: up to 4\.\d+ µm, by axis\.x\.limits\.drive_min_v = -2"
+        ConfigError,
+        match=r"steps\.levels_um: 6 µm; allowed: up to 4\.\d+ µm, limited by axis\.x\.limits\.drive_min_v = -2",
     ):
         steps.fit_options(steps.options(levels_um=(30.0, 0.0, -6.0)), setting())
 
 
 def test_a_side_without_any_room_skips_the_experiment() -> None:
-    with pytest.raises(UnsuitableLoop, match=r"steps\.levels_um: 30 µm; allowed: up to \S+ µm, by axis\.x\.limits"):
+    with pytest.raises(
+        UnsuitableLoop, match=r"steps\.levels_um: 30 µm; allowed: up to \S+ µm, limited by axis\.x\.limits"
+    ):
         EXPERIMENTS["steps"].fit_options(EXPERIMENTS["steps"].options(), setting(drive_min_v=-1e-9))
 
 

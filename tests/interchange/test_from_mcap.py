@@ -171,7 +171,7 @@ BAD: list[tuple[Any, str, Any, str]] = [
     (b"", "protobuf", ("A", "protobuf", CIRCLE), "the schema 'A' cannot be read"),
     (b"\xff\xff", "protobuf", ("lab.B", "protobuf", B), "message 0: contents do not fit the schema"),
     (b"\0\1\0\0", "cdr", RECURSIVE, "message 0: contents do not fit the schema"),
-    (b"\0\1\0\0\xff\xff\xff\xff", "cdr", EMPTY_ITEMS, "a schema with both lists and a message type without fields"),
+    (b"\0\1\0\0\xff\xff\xff\xff", "cdr", EMPTY_ITEMS, "contains lists, and also a message type without fields"),
     (b"\0\1\0\0\xff\xff\xff\xff", "cdr", ("a/msg/A", "ros2msg", b"float64[] x"), "contents do not fit the schema"),
     (b"", "cdr", ("a/msg/A", "ros2msg", b"\xff nonsense ["), "cannot be read|do not fit the schema"),
     (b"{", "json", None, "message 0: not JSON"),

@@ -130,7 +130,10 @@ def test_jitter_and_missing_samples_are_reported_and_kept(folder: Path):
     times = np.delete(TIME + random.uniform(-5e-6, 5e-6, COUNT) + 1e-5, np.arange(1000, 1004))
     savemat(folder / "scan.mat", {"time": times, "u": np.delete(VOLTS, np.arange(1000, 1004))})
     notes = answer("import", "scan.mat", "--map", "x_drive_v=u [V]", "--time", "time [s]")["notes"]
-    found = re.fullmatch(r"sample times jitter by ([\d.]+) µs rms, ([\d.]+) µs at most, about a period of .*", notes[0])
+    found = re.fullmatch(
+        r"sample times jitter: the periods deviate by ([\d.]+) µs rms, ([\d.]+) µs at most, from the median of .*",
+        notes[0],
+    )
     assert found
     assert float(found[1]) == pytest.approx(
         10 / 6**0.5, rel=0.05
@@ -228,7 +231,11 @@ def test_an_option_replaces_the_signal_of_a_mapping_file_under_its_short_name(sc
             1,
             "drive_v and x_drive_v are two mappings of the signal x_drive_v",
         ),
-        (["--all", "--time", "t + 1 ms"], 1, "time from column 't': ms cannot be converted to 1; write the unit in"),
+        (
+            ["--all", "--time", "t + 1 ms"],
+            1,
+            "time from column 't': ms cannot be converted to a number without a unit; write the unit in",
+        ),
         (["--map", "tick=t"], 1, "tick is computed from the times and cannot be mapped"),
         (["--map", "mode=T"], 1, "mode: 21; allowed: a whole number from 0 to 3"),
         (["--all", "--time", "T"], 1, "time 'T' does not grow"),

@@ -252,7 +252,7 @@ def test_a_file_of_another_program_is_named_as_such(path: Path):
 def test_merged_recordings_are_refused(run: Run, parts: list[Path], path: Path):
     for paths in (parts, [run.path, parts[0]], [run.path, run.path]):
         with pytest.raises(
-            RecordingError, match=r"holds several recordings, or several files of one run; .*before the merge"
+            RecordingError, match=r"holds several recordings, or several files of one run; .*files that were merged"
         ):
             load(write(path, merge(paths)))
 
@@ -272,8 +272,8 @@ UNREADABLE: list[tuple[Callable[[Run], list[FileMessage]], dict[str, Any], str]]
     (lambda run: run.without("/configuration"), {}, "the topic /configuration, .* has no message before /ticks"),
     (lambda run: [run.messages[0], *run.messages[:0:-1]], {}, "out of order: tick .*`mcap sort` sorts the messages"),
     (swap_blocks, {}, rf"out of order: tick 0 after {TICKS - 1}; .*`mcap sort` sorts"),
-    (encode_as_cbor, {}, "/ticks are encoded as cbor, not with the schema of the recording; allowed: protobuf"),
-    (lambda run: run.messages, {"ticks": "proto3"}, "/ticks are encoded as protobuf, not with the schema"),
+    (encode_as_cbor, {}, "/ticks are encoded as cbor, and their schema is not rtloop's; allowed: json, or protobuf"),
+    (lambda run: run.messages, {"ticks": "proto3"}, "/ticks are encoded as protobuf, and their schema is not rtloop's"),
 ]
 
 

@@ -20,7 +20,7 @@ from tests.paper_configuration import PAPER
 def test_the_nearer_end_of_the_sensors_range_limits_a_motion(hold_um: float, allowed_um: float, limit: str) -> None:
     (axis,) = load(PAPER).axes
     require_room(axis, (2.0, 40.0), hold_um, allowed_um)
-    with pytest.raises(ConfigError, match=f"allowed: up to {allowed_um:g} µm, by axis.x.interlocks.*{limit}"):
+    with pytest.raises(ConfigError, match=f"allowed: up to {allowed_um:g} µm, limited by axis.x.interlocks.*{limit}"):
         require_room(axis, (2.0, 40.0), hold_um, allowed_um + 0.01)
 
 

@@ -103,7 +103,7 @@ class SpecificationOptions(Options):
         unknown = sorted(set(self.claims) - set(QUANTITIES) - set(EXPERIMENT_QUANTITIES))
         if unknown:
             allowed = ", ".join((*QUANTITIES, *EXPERIMENT_QUANTITIES))
-            raise ValueError(f"claims: {', '.join(unknown)}; allowed: {allowed}")
+            raise ValueError(f"claims: unknown quantity {', '.join(unknown)}; allowed: claims about {allowed}")
         return self
 
     def claim_words(self, name: str) -> str:
@@ -288,7 +288,7 @@ class DesignOptions(Options):
     def required_plant(self) -> ModelOptions:
         """Model of the plant. Raises ValueError without one."""
         if self.plant is None:
-            raise ValueError("plant: missing; needs a section [plant] with the model from command v to position x")
+            raise ValueError("plant: missing; add a section [plant], the stage's model from command to position in µm")
         return self.plant
 
     @property

@@ -158,9 +158,10 @@ def _require_possible(plant: Transfer, design: DesignOptions) -> None:
         needed_um = specification.command.reference_um * (1 - specification.static_error_percent / 100) / gain
         if specification.command.command_um < needed_um:
             raise NoController(
-                f"specification.command.command_um: {specification.command.command_um:g} µm cannot hold a reference of "
-                f"{specification.command.reference_um:g} µm within {specification.static_error_percent:g} % on a "
-                f"plant of static gain {gain:.6g}; needs at least {needed_um:.6g} µm, or a smaller reference_um"
+                f"specification.command.command_um: {specification.command.command_um:g} µm cannot hold reference_um = "
+                f"{specification.command.reference_um:g} µm within {specification.static_error_percent:g} %, because "
+                f"the plant has the gain {gain:.6g} at 0 Hz; allowed: at least {needed_um:.6g} µm, or a smaller "
+                "reference_um"
             )
 
 

@@ -108,7 +108,10 @@ def _place_on_rig(
     if isinstance(configuration.driver_options, RigOptions) and configuration.driver_kind == "sim":
         return changed, configuration.driver_options
     if configuration.inputs or configuration.outputs:
-        raise ValueError("the simulated rig has no channels for [inputs] and [outputs]")
+        raise ValueError(
+            "the rig that replaces the hardware has no channels for [inputs] and [outputs]; verify a copy of the "
+            "configuration without these sections"
+        )
     board: Any = configuration.driver_options
     channels = {}
     for number, axis in enumerate(axes):

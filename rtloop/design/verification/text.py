@@ -173,7 +173,10 @@ def simulation_notes(verification: Verification) -> list[str]:
         notes.append(f"Left out: steps of {heights} µm; the command's range is {result.command_range}.")
     notes += _static_error_notes(verification)
     if result.required and not result.is_judged:
-        notes.append("These verdicts do not count for the conclusion; set [simulation] judged = true to count them.")
+        notes.append(
+            "The verdicts on the simulated steps do not count for the verdict on the loop; set [simulation] judged = "
+            "true in the specification to count them."
+        )
     return notes
 
 

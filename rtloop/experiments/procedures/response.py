@@ -109,9 +109,9 @@ def analyse(recordings: Sequence[RecordedRun], options: ResponseOptions) -> Anal
     allowed_um = options.amplitude_um + REST_MARGIN * _motion_at_rest_um(run, signals["position_um"])
     if (moved_um := measurement.response.moved_um) > allowed_um:
         raise UnsuitableData(
-            f"the position moved by {moved_um:.3g} µm; allowed: {allowed_um:.3g} µm, which is amplitude_um = "
-            f"{options.amplitude_um:g} µm plus {REST_MARGIN:g} times the motion at rest. The stage moves further than "
-            "planned; use a smaller amplitude_um, or identify the model again"
+            f"the position moved by {moved_um:.3g} µm; allowed: {allowed_um:.3g} µm, the sum of amplitude_um = "
+            f"{options.amplitude_um:g} µm and {REST_MARGIN:g} times the largest deviation of the position at rest. "
+            "Use a smaller amplitude_um, or identify the model again"
         )
     promised_margins = loop_margins(loop)._asdict() if loop else {}
     rows = [

@@ -117,9 +117,9 @@ def _learning_gains(setting: Setting, options: ScanOptions, period_ticks: int) -
     model, percent = setting.model, options.resonance_percent
     if model is None or model.loop is None:
         raise UnsuitableLoop(
-            f"axis.{setting.axis.name}.model: the model is missing, its closed loop is unstable, the controller cannot "
-            "be linearised, or other axes share the controller; a scan learns with a model that has a stable closed "
-            "loop of this axis alone"
+            f"axis.{setting.axis.name}: a scan learns with the model of a stable closed loop of this axis alone, but "
+            "there is none. Possible causes: [axis.model] is missing, the loop is unstable, the controller cannot be "
+            "linearised, or other axes share the controller"
         )
     loops = [(name, model.build_loop(plant)) for name, plant in plants_around(model.dynamics, percent)]
     try:

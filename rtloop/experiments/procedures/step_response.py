@@ -147,7 +147,7 @@ def fit_ringing(height: Real, rate_hz: float, window_s: tuple[float, float] = RI
     if ringing.size < 50 or not spectrum.any():
         raise UnsuitableData(
             f"no ringing found in {ringing.size} ticks, {1e3 * window_s[0]:.3g} to {1e3 * window_s[1]:.3g} ms after "
-            f"the step; needs at least 50 ticks, and a ringing of {MIN_PERIODS} or more periods in these ticks"
+            f"the step; allowed: at least 50 ticks that contain {MIN_PERIODS} or more periods of ringing"
         )
     start = [20.0, 2 * np.pi * hz[spectrum.argmax()]]
 

@@ -67,7 +67,7 @@ class KernelSymbol:
     def __call__(self, *arguments: Any) -> Any:
         """Call the Python equivalent and return its result. Raises NotImplementedError if there is none."""
         if self._uncompiled is None:
-            raise NotImplementedError(f"{self.__name__} runs in compiled kernels only")
+            raise NotImplementedError(f"{self.__name__} has no Python version; call it in compiled functions only")
         return self._uncompiled(*arguments)
 
     @cached_property

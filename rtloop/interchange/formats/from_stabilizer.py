@@ -37,7 +37,8 @@ def read_stabilizer(path: Path) -> Table:
         size = os.fstat(file.fileno()).st_size
         if len(head) == 0 or head[0]["format"] != ADC_DAC_FORMAT or head[0]["samples"] == 0:
             raise UnreadableData(
-                f"{path}: a stream of Stabilizer in another format; allowed: format 1, the codes of ADC and DAC"
+                f"{path}: not a stream of Stabilizer in format 1, which contains the codes of ADC and DAC; allowed: "
+                "format 1 only"
             )
         columns = FileColumns(path)
         columns.require_room("the stream", (size // 2,))

@@ -210,6 +210,6 @@ def _require_sizes(schema: Schema) -> None:
             and "[" in text
         ):
             raise DecodingError(
-                f"schema {schema.name[:SHOWN]!r}: a schema with both lists and a message type without fields cannot be "
-                "read; write the file without the empty message type"
+                f"schema {schema.name[:SHOWN]!r}: contains lists, and also a message type without fields; such a "
+                "schema cannot be read. Write the file without the empty message type"
             )

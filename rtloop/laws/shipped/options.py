@@ -62,8 +62,8 @@ class PrandtlIshlinskiiOptions(FeedforwardOptions):
         """Forward model and inverse, computed once by the check. Raises ValueError for a model without inverse."""
         if bool(self.thresholds_v) == bool(self.inverse_thresholds_um):
             raise ValueError(
-                "needs either thresholds_v with weights_um_per_v, or inverse_thresholds_um with "
-                "inverse_weights_v_per_um"
+                "the model of the hysteresis is missing or is given twice; allowed: either thresholds_v with "
+                "weights_um_per_v, or inverse_thresholds_um with inverse_weights_v_per_um"
             )
         if self.inverse_thresholds_um:
             inverse = play_model("inverse", self.inverse_thresholds_um, self.inverse_weights_v_per_um)
@@ -123,13 +123,16 @@ class CoupledOptions(ControllerOptions):
         """Require `loops`, one for each axis, or a state space whose matrices fit, and an invertible `decoupling`."""
         count = len(self.axes)
         if bool(self.loops) == bool(self.d):
-            raise ValueError("needs either loops, one for each axis, or a state space a, b, c, d")
+            raise ValueError(
+                "the controller is missing or is given twice; allowed: either loops, one for each axis, or a state "
+                "space a, b, c, d"
+            )
         if self.loops and len(self.loops) != count:
             raise ValueError(f"{len(self.loops)} loops for {count} axes; allowed: one loop for each axis")
         if self.loops and (self.a or self.b or self.c or self.prewarp_hz is not None):
             raise ValueError(
-                "a, b, c, prewarp_hz: not allowed together with loops; remove them, or use a state space a, b, c, d in "
-                "place of loops"
+                "a, b, c, prewarp_hz: not allowed together with loops; remove these keys, or remove loops and use a "
+                "state space a, b, c, d"
             )
         order = len(self.a)
         shapes = {"a": (order, order), "b": (order, count), "c": (count, order), "d": (count, count)}

@@ -24,7 +24,7 @@ def signal_figures(feed: Feed, run: int, first: int, end: int, signals: list[str
     if not 0 < len(signals) <= MAX_SIGNALS:
         raise ValueError(f"signals: {len(signals)} names; allowed: 1 to {MAX_SIGNALS}")
     if not first < end:
-        raise ValueError(f"end: {end}; allowed: above first = {first}")
+        raise ValueError(f"end: {end}; allowed: above {first}, the value of `first`")
     with feed.lock:
         past = feed.past
         if past is None or past.run != run or first < past.begin or end > past.end:

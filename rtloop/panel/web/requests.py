@@ -31,7 +31,7 @@ class CaptureBody(BaseModel):
         if (self.first is None) != (self.end is None) or (self.seconds is None) == (self.first is None):
             raise ValueError("ticks to capture: not clear; allowed: either `seconds` alone, or `first` with `end`")
         if self.first is not None and self.end is not None and self.end <= self.first:
-            raise ValueError(f"end: {self.end}; allowed: above first = {self.first}")
+            raise ValueError(f"end: {self.end}; allowed: above {self.first}, the value of `first`")
         return self
 
 

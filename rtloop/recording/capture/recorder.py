@@ -129,7 +129,10 @@ def record_run(fd: int, names: RequesterNames | None = None) -> int:
     try:
         orders = SupervisorOrders()
         if (command := orders.next(None)) is None:
-            raise RecordingError("the recorder received no order; it needs one JSON line with path and header on stdin")
+            raise RecordingError(
+                "the recorder received no instructions from the supervisor; allowed: one line of JSON with `path` and "
+                "`header` on stdin"
+            )
         header = command["header"]
         session_class = SelectiveSession if header.get("around") else Session
         session = session_class(block, Path(command["path"]), header, Options(**command.get("options", {})), names)

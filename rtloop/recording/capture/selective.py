@@ -40,7 +40,9 @@ class SelectiveSession(Session):
         super().__init__(block, path, header, options, names)
         window, rate_hz = EventWindow.from_header(header), header["rate_hz"]
         if window is None:
-            raise ValueError(f"{path}: the header has no 'around', which a recording around events needs")
+            raise ValueError(
+                f"{path}: the header of the recording has no entry 'around'; a recording around events needs this entry"
+            )
         # A dead recorder may have been retaining ticks, and its end of that is unknown.
         retain_until = -1 if options.sequence == 1 else self._predecessor_end.ticks + round(window.after_s * rate_hz)
         self._segments = SegmentBuffer(window, header["columns"], rate_hz, self.cursor, retain_until)

@@ -161,8 +161,8 @@ class _Conversion:
         """
         if self._writer is not None:
             raise RecordingError(
-                f"{self._path}: holds several recordings, or several files of one run; allowed: one. Open the files "
-                "from before the merge"
+                f"{self._path}: holds several recordings, or several files of one run; allowed: one recording in one "
+                "file. Open the files that were merged into this file"
             )
         self._header = read_header(self._path, message.data)
         log.warning(
@@ -208,8 +208,8 @@ class _Conversion:
             message.data = self._tick_from_json(message.data)
         elif schema is None or schema.data != self._schema:
             raise RecordingError(
-                f"{self._path}: the messages of /ticks are encoded as {encoding(channel, schema)}, not with the schema "
-                "of the recording; allowed: protobuf with that schema, json. Use `rtloop import` to read numbers"
+                f"{self._path}: the messages of /ticks are encoded as {encoding(channel, schema)}, and their schema "
+                "is not rtloop's; allowed: json, or protobuf with rtloop's schema. Use `rtloop import` to read numbers"
             )
         if len(self._ticks) >= self._rows and message.log_time > self._ticks[-1].log_time:
             self._flush(self._writer)

@@ -148,7 +148,7 @@ def require_room(axis: AxisOptions, ends_um: tuple[float, float], hold_um: float
     )
     if amplitude_um > allowed_um:
         fault = f"amplitude_um: {amplitude_um:g} µm about the held {hold_um:g} µm; allowed: up to {allowed_um:.4g} µm"
-        raise ConfigError("request", [f"response: {fault}, by axis.{axis.name}.{limit}"])
+        raise ConfigError("request", [f"response: {fault}, limited by axis.{axis.name}.{limit}"])
 
 
 def _line_grid(request: ResponseRequest, rate_hz: float, near_hz: float | None, half_width_hz: float) -> LineGrid:

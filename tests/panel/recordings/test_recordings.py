@@ -82,7 +82,7 @@ def test_the_last_seconds_are_captured(panel: Panel):
     ("body", "code", "words"),
     [
         ({"run": RUN - 1, "first": 0, "end": 5}, 410, "was started again"),
-        ({"first": 5, "end": 5}, 422, "end: 5; allowed: above first = 5"),
+        ({"first": 5, "end": 5}, 422, "end: 5; allowed: above 5, the value of `first`"),
         ({"first": 0}, 422, "allowed: either `seconds` alone, or `first` with `end`"),
         ({"seconds": 1.0, "first": 0, "end": 4}, 422, "ticks to capture: not clear; allowed: either `seconds` alone"),
         ({"seconds": 0.25, "first": 0}, 422, "ticks to capture: not clear; allowed: either `seconds` alone"),

@@ -134,7 +134,7 @@ def _require_contiguous(source: McapSource, indexes: Sequence[IndexedChunk], end
             break
         position += index.length + index.index_length
     if position != end:
-        raise DamagedChunk("the chunk index contradicts the chunks")
+        raise DamagedChunk("the chunk index at the end of the file does not match its data")
 
 
 def scan_chunks(source: McapSource, position: int = len(MAGIC)) -> tuple[list[ChunkEntry], list[str]]:
