@@ -62,7 +62,7 @@ def write_mat(recording: Recording, part: IO[bytes], target: Path, selection: Se
 def matlab_variable(path: Path) -> str:
     """Return the variable's name in a file: the stem of its name in letters, digits and underscores.
 
-    `rec_` precedes a name that does not begin with a letter. It is cut to LONGEST_NAME characters.
+    "rec_" precedes a name that does not begin with a letter. It is cut to LONGEST_NAME characters.
     """
     name = re.sub(r"\W", "_", path.stem, flags=re.ASCII)
     return (name if name[:1].isalpha() else f"rec_{name}")[:LONGEST_NAME]

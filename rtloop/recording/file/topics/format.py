@@ -128,7 +128,7 @@ def tick_dtype(columns: Sequence[str]) -> np.dtype[Any]:
 def doubles(columns: Sequence[str]) -> list[tuple[str, str]]:
     """Fields (name, type) of a numpy dtype for a protobuf message of doubles.
 
-    Column number N, from 1 on, has two fields: its tag, named `_tag_N`, and then its double with its own name.
+    Column number N, from 1 on, has two fields: its tag, named "_tag_" and N, and then its double with its own name.
     """
     fields: list[tuple[str, str]] = []
     for number, name in enumerate(columns, start=1):
