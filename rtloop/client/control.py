@@ -178,7 +178,7 @@ class Client:
                 self.post("/setpoint", {"axis": axis, "value": held_um})
             except RtloopError as error:
                 raise LoopFault(
-                    f"interrupted; the service ends the measurement, but did not restore the reference: {error}"
+                    f"interrupted; the old reference of axis {axis} could not be restored, set it again: {error}"
                 ) from None
             raise LoopFault(f"interrupted; axis {axis} holds {held_um:g} µm as before") from None
 

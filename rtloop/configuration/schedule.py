@@ -38,7 +38,9 @@ class ScheduleOptions(Options):
         """Require exactly one of mode, reference and reset_trip; `axis` is optional with a reference, else refused."""
         changes = [self.mode is not None, self.reference is not None, self.reset_trip]
         if sum(changes) != 1:
-            raise ValueError(f"{sum(changes)} changes; allowed in an entry: exactly one of mode, reference, reset_trip")
+            raise ValueError(
+                f"{sum(changes)} changes in one entry; allowed: exactly one of mode, reference, reset_trip"
+            )
         if self.axis is not None and self.reference is None:
             raise ValueError(
                 f"axis: {self.axis!r} is set in an entry without a reference; mode and reset_trip act on all axes. "

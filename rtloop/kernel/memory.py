@@ -205,7 +205,7 @@ def require_owners(controller_axes: Sequence[int]) -> None:
         if (count == 0) != (number < owned_axes):
             owners = "no controller" if count == 0 else "two controllers"
             raise ValueError(
-                f"controller_axes of axis {number}: {count}, which gives this axis {owners}; allowed: one controller"
+                f"axis {number} has {owners}, because its controller_axes is {count}; allowed: one controller"
             )
         owned_axes = max(owned_axes, number + count)
 

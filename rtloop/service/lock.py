@@ -74,10 +74,10 @@ class Lock:
         Refusal for None and for another `key`, also while the lock is free.
         """
         if key_sha256 is None:
-            raise Refusal("emergency key: no key is configured; set service.emergency_key_sha256")
+            raise Refusal("no emergency key is configured; set service.emergency_key_sha256")
         if not hmac.compare_digest(hashlib.sha256(key.encode(errors="replace")).hexdigest(), key_sha256):
             log.warning("%s gave a wrong emergency key", name)
-            raise Refusal("emergency key: differs from the configured one")
+            raise Refusal("the given emergency key is not the one of service.emergency_key_sha256")
         with self._guard:
             holder = self._current_holder()
             if holder is not None and holder.name != name:

@@ -461,7 +461,7 @@ def test_a_position_that_moves_further_than_stated_is_refused(linear_response: t
         if not is_refused:
             assert analyse([run], stated).rows
             continue
-        with pytest.raises(UnsuitableData, match=f"moved by {moved_um:.3g} µm; .* use a smaller amplitude_um"):
+        with pytest.raises(UnsuitableData, match=f"moved by {moved_um:.3g} µm; .* Use a smaller amplitude_um"):
             analyse([run], stated)
 
 
