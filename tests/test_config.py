@@ -112,7 +112,7 @@ def test_one_mistake_one_line(change, message):
         ('at_tick = -1\nmode = "off"', "schedule.0.at_tick: -1: must be greater than or equal to 0"),
         ('at_tick = 1\nmode = "of"', "schedule.0.mode: 'of': must be 'off', .*"),
         ("at_tick = 1", "schedule.0: 0 changes in one entry; allowed: exactly one of mode, reference, reset_trip"),
-        ('at_tick = 1\nmode = "off"\nreset_trip = true', "schedule.0: 2 changes; .* exactly one of .*"),
+        ('at_tick = 1\nmode = "off"\nreset_trip = true', "schedule.0: 2 changes in one entry; .* exactly one of .*"),
         ('at_tick = 1\naxis = "x"\nmode = "off"', "schedule.0: axis: 'x' is set in an entry without a reference; .*"),
         ('at_tick = 1\naxis = "z"\nreference = {kind = "hold"}', "schedule.axis: 'z' is not an axis; the axes are x"),
         ('at_tick = 1\nreference = {kind = "sine", amplitude = 1.0, frequency_hz = 9999.0}',

@@ -222,8 +222,8 @@ def _map_tustin(transfer: Transfer, period_s: float, prewarp_hz: float | None) -
     w = bilinear_factor(period_s, prewarp_hz)
     if np.any(transfer.zeros == w) or np.any(transfer.poles == w):
         raise ValueError(
-            f"period_s: {period_s:g} s; the transfer function has a pole or zero at s = {w:g} rad/s, which the bilinear "
-            "rule moves to infinity with this period; use another period"
+            f"period_s: {period_s:g} s; the transfer function has a pole or zero at s = {w:g} rad/s, which the "
+            "bilinear rule moves to infinity with this period; use another period"
         )
     gain = complex(transfer.gain)
     for i, pole in enumerate(transfer.poles):
