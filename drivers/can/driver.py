@@ -124,8 +124,9 @@ class CanDriver(PythonDriver):
     def write(self, volts: Sequence[float]) -> None:
         """Send `volts`, one per output channel, with the next sequence number; do not wait for the answer.
 
-        Volts are clipped to the range of the DBC's integers. Raises DriverError if the driver is not open, ValueError
-        for NaN, OverflowError for infinity; python-can's errors pass through.
+        Volts are clipped to the range of the DBC's integers. Raises ValueError for NaN or another number of values,
+        OverflowError for infinity, DriverError after the bus was closed; python-can's errors pass through. Call `open`
+        before.
         """
         self._send(self._stream.next_sequence(), volts)
 

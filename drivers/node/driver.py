@@ -346,10 +346,10 @@ class SerialDriver(NodeDriver):
         return float("inf") if baud is None else baud / (BITS_PER_BYTE * longest)
 
     def _require_rate(self, link: Link, welcome: Welcome) -> None:
-        """Measure PROBES exchanges with the node.
+        """Send HELLO to the node PROBES times, and measure the time to each answer; no output moves.
 
-        Raises DriverError if fewer than half of them are answered, each within RETRY_S, or if the median of the
-        answered ones takes longer than a period of the loop.
+        `welcome` is not used. Raises DriverError if fewer than half are answered, each within RETRY_S, or if the median
+        time is longer than a period of the loop; OSError if the line fails.
         """
         durations_s = []
         for sequence in range(1, self.PROBES + 1):

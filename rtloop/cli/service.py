@@ -95,9 +95,9 @@ def hil_serve(config: Path, on_can: bool, on_udp: bool, on_serial: bool, tied: b
 def _serve_board(configuration: Configuration, axes: list[str], is_stopped: Callable[[], bool]) -> None:
     """Be the simulated board of a configuration with driver 'shm' until `is_stopped()`; tell systemd when it is ready.
 
-    `axes` are the names of the axes in the order of outputs. Takes real-time priority for this process. Raises
-    ConfigError for a driver other than 'shm' or invalid options, UnavailableError if the system refuses the block's
-    file.
+    `axes` are the names of the axes in the order of outputs. Requests real-time priority, and goes on without it if
+    it is refused. Raises ConfigError for a driver other than 'shm' or invalid options, UnavailableError if the system
+    refuses the block's file or another board serves this file.
     """
     from rtloop.drivers.shm import ShmOptions
     from rtloop.engine.plan import Pacing

@@ -177,9 +177,10 @@ def _unreachable(axis: AxisOptions, lowest_um: float, highest_um: float, ends_um
 
 
 def _beyond_drive(axis: AxisOptions, lowest_um: float, highest_um: float) -> Iterator[str]:
-    """Yield a line for a reference from `lowest_um` to `highest_um` that the drive cannot hold.
+    """Yield one line if the drive's limits do not allow a reference from `lowest_um` to `highest_um`, else none.
 
-    A reference that changes comes back to its nearer end after its farther end, whose memory the actuator then has.
+    The feedforward's model goes from rest to the end on the side where the drive reaches farther, then, with the
+    hysteresis of that motion, to the other end. The line states the positions that the limits allow.
     """
     limits, actuator = axis.limits, axis.feedforward.actuator()
     ends_v = limits.lowest_v, limits.drive_v

@@ -83,9 +83,9 @@ def starting_outputs_v(driver: Driver, recorded_v: Sequence[float] | Real | None
 
 
 def ramp(from_v: Real, safe_v: Real, step_v: float) -> Iterator[Real]:
-    """Yield rows from `from_v` (exclusive) to `safe_v` (inclusive), both (outputs,); none if they are equal.
+    """Yield rows from `from_v` (exclusive) to `safe_v` (inclusive), both (outputs,) in V; none if they are equal.
 
-    No value moves by more than `step_v` from row to row.
+    Each output moves by `step_v`, above 0, from row to row (by less in its last move), then stays at its safe value.
     """
     current_v = from_v
     while not np.array_equal(current_v, safe_v):

@@ -156,9 +156,10 @@ class Layout:
         return {"feedforward_law": laws, "controller_law": laws, "controller_axes": Allowed(0, axes - number)}
 
     def description(self) -> dict[str, Any]:
-        """Return the description of the layout in a recording.
+        """Return the description of the layout in a recording; each type is as of `np.lib.format.dtype_to_descr`.
 
-        Keys: `coefficients`, `state`, `loop_state` (types), `laws` (name, axes, types), `sha256` of these, `revision`.
+        Keys: `coefficients`, `state`, `loop_state` (types), `laws` (list of {name, axes, coefficients, state}; the last
+        two are types), `sha256` of all these (hexadecimal text), `revision`.
         """
         tables = {"coefficients": COEFFICIENTS, "state": STATE, "loop_state": LOOP_STATE}
         content: dict[str, Any] = {name: np.lib.format.dtype_to_descr(dtype) for name, dtype in tables.items()}

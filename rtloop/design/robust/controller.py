@@ -59,8 +59,11 @@ class Candidates(NamedTuple):
 
 
 def point_bounds(sections: int) -> tuple[Real, Real]:
-    """Return the least and the largest numbers of a point of the search for a controller with this number of sections
-    of second order, each (2 + 4·sections,), in the order of `build_candidates`.
+    """Return the least and the largest values, each (2 + 4·sections,), of a point of the search for a controller with
+    `sections` sections of second order.
+
+    A point is log k, log(1 − z₀), then for each section log ω and ζ of its zeros, log ω and log ζ of its poles, with ω
+    in radians a sample.
     """
     low, high = zip(*(SECTION * sections), strict=True)
     return np.array([*LOWEST, *low]), np.array([*HIGHEST, *high])

@@ -16,9 +16,10 @@ from rtloop.interchange.formats.table import Table, UnreadableData
 
 
 def read_parquet(path: Path) -> Table:
-    """Return all columns of numbers and times; a column of dates counts in s from its first row.
+    """Return all columns of numbers and times: durations in s, dates in s from the first row.
 
-    Raises UnreadableData if the file is no Parquet file, damaged, too large or without numbers; MissingExtra without
+    The table's `about` names the other columns, which are left out. Raises UnreadableData if the file cannot be opened,
+    is no Parquet file, is damaged or too large, or has no column of numbers with two rows or more; MissingExtra without
     pyarrow.
     """
     try:

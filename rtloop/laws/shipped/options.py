@@ -42,9 +42,10 @@ class PrandtlIshlinskiiOptions(FeedforwardOptions):
         return self
 
     def actuator(self) -> PlayModel:
-        """Return the identified forward model, with its dead band.
+        """Return the identified forward model, from V to µm, with its dead band (a first threshold above 0).
 
-        If the options have an inverse in its place, return the forward model that this inverse compensates.
+        If the options have an inverse in its place, return the forward model that this inverse compensates; it has no
+        dead band.
         """
         if self.thresholds_v:
             return PlayModel(np.array(self.thresholds_v), np.array(self.weights_um_per_v))

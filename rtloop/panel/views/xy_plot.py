@@ -77,7 +77,8 @@ class XyPlot:
     def _model_position(self, model: PlayModel, past: TickHistory, first: int, drive: Real) -> Real:
         """Return the model's position (n,), µm, over a drive (n,), V, from tick `first` on.
 
-        The drive before `first`, as far as `past` has it, sets the state of the model's hysteresis.
+        The drive before `first`, over at most four times the shown duration, sets the state of the model's hysteresis;
+        before that, drive and position count as 0.
         """
         earlier_drive = self._earlier_drive(past, first)
         return model_output(model, np.concatenate([earlier_drive, drive]))[earlier_drive.size :]

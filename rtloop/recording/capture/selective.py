@@ -129,7 +129,8 @@ class SelectiveSession(Session):
     def _finish_file(self, kind: str, result: str, end_tick: int, event_tick: int) -> None:
         """Finish the file as `Session` does, with its last event at `event_tick`, but not after `end_tick`.
 
-        Ticks that still wait, from `end_tick` on, go into the next file.
+        `kind` of that event is FINISHED or ROTATED; `result` tells how the loop ended, "rotated" for ROTATED. Ticks
+        that still wait, from `end_tick` on, go into the next file. An error of the file sets `error`; none is raised.
         """
         super()._finish_file(kind, result, end_tick, min(end_tick, event_tick))
 

@@ -180,7 +180,10 @@ class RunSource:
         return content if isinstance(content, list) else []
 
     def _is_within(self, message: Message, tick_range: TickRange) -> bool:
-        """Whether an event, a snapshot or a whole overview lies in a range; the event that ends a file does not."""
+        """Whether an event, a snapshot or a whole overview lies in a range.
+
+        False for every other message, and for the event that ends a file.
+        """
         if message.channel == format.LAW:
             return tick_range.first <= snapshot_tick(message) < tick_range.end
         if message.channel == format.OVERVIEW:

@@ -86,7 +86,10 @@ class SimulatedInputs:
         self.facts, self.wiring, self._driver = driver.facts, driver.wiring, driver
 
     def pointers(self) -> Pointers:
-        """Open the driver, which the caller closes. Returns its pointers. Raises DriverError if it cannot be opened."""
+        """Open the driver that the constructor received, and return its pointers.
+
+        The owner of the driver closes it; this class does not. Raises DriverError if the driver cannot be opened.
+        """
         return self._driver.open()
 
     def load(self, rows: Rows) -> None:

@@ -146,7 +146,10 @@ class _Trials:
 
     @property
     def best_table(self) -> Real:
-        """The table (n, 2) of the best cycle. Raises ValueError before the first `add`."""
+        """The table (n, 2: reference, command, µm) of the cycle with the smallest rms error.
+
+        Raises ValueError before the first `add`.
+        """
         return self.tables[self.best_cycle]
 
 

@@ -52,7 +52,10 @@ class AxisSums:
     """Condition at the newest update; None outside closed loop."""
 
     def add(self, error_um: Rows, drive_v: Rows, is_closed_loop: Rows) -> None:
-        """Add ticks: error (µm) and drive (V), (n,) each, and whether each tick was in closed loop (n,)."""
+        """Add ticks: the error (µm) of those in closed loop, and the drive (V) of all.
+
+        All arrays are (n,); `is_closed_loop` marks the ticks in closed loop. Values that are not finite are skipped.
+        """
         errors = error_um[is_closed_loop & np.isfinite(error_um)]
         drives = drive_v[np.isfinite(drive_v)]
         self.closed_ticks += len(errors)

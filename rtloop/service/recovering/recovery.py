@@ -180,10 +180,11 @@ class Recovery:
         return None if self._host.armed else StepReason.DISARMED
 
     def confirm(self, supervisor: Supervisor, live: LiveLaw) -> Return | None:
-        """Judge the newest readings if a confirmation is due; return a Return once all confirmations have succeeded.
+        """Judge the newest readings if a confirmation is due; unsound ones set the count of confirmations to 0.
 
-        The recovery is RETURNING then, and later calls return None. None also before, and if an obstacle is found at
-        the end: the recovery latches (no return before `reset`).
+        Once all required ones have succeeded in succession, the recovery is RETURNING, and the result is a Return: the
+        state to return to, options and serial number. None before and after that, for another loop, and if an obstacle
+        is found at the end: the recovery latches (no return before `reset`).
         """
         with self._guard:
             options, former = self._options, self._former

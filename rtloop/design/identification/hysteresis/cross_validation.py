@@ -50,9 +50,11 @@ def cross_validate(recordings: Sequence[Equations], limits: Limits) -> list[Real
 
 
 def unseen_errors(recording: Equations, common: SharedGains) -> Real:
-    """Return errors in µm (blocks, 2) of a recording not used for `common`, as `cross_validate`; NaN where memory is
-    not known. Its own offsets and drift are fitted to every other piece and judged on the pieces between, then the
-    reverse.
+    """Return errors (blocks, 2) in µm, measured minus modelled, of a recording that was not used for `common`.
+
+    Column 0: the whole model; column 1: the plays alone, less their mean over each stretch of known memory. NaN where
+    memory is not known. The recording's own offsets and drift are fitted to every other piece and judged on the pieces
+    between, then the reverse.
     """
     errors_um, is_odd = np.full((recording.is_known.size, 2), np.nan), piece_numbers(recording) % 2 == 1
     for fitted_blocks in (recording.is_known & is_odd, recording.is_known & ~is_odd):
