@@ -297,7 +297,10 @@ def test_a_folder_that_cannot_be_read_is_named(shared):
 
 
 def test_a_folder_takes_the_verdicts_of_one_process_at_a_time(tmp_path):
-    with open_table([], (), tmp_path, "verdicts.jsonl"), pytest.raises(UnavailableError, match="another `rtloop archive`"):
+    with (
+        open_table([], (), tmp_path, "verdicts.jsonl"),
+        pytest.raises(UnavailableError, match="another `rtloop archive`"),
+    ):
         open_table([], (), tmp_path, "verdicts.jsonl").__enter__()
 
 

@@ -98,7 +98,7 @@ def test_taps_step_in_the_middle_of_the_range() -> None:
     assert lowest == pytest.approx((REMANENCE_UM - bounds.lowest_um) / 30.0)
     half = MODEL_OPTIONS.model_copy(update={"gain": 2.0})  # D(0) = 0.5: the command is twice the position
     assert step_bounds(axis, half, required(15.0)).lowest_um == pytest.approx(bounds.lowest_um / 2)
-    with pytest.raises(ValueError, match=rf"value is 41 µm; allowed: up to {HIGH_UM - REMANENCE_UM:.4g} µm, because"):
+    with pytest.raises(ValueError, match=rf"value is 41 µm; allowed: up to {HIGH_UM - REMANENCE_UM:.4g} µm, for a"):
         step_bounds(axis, MODEL_OPTIONS, required(41.0))
 
 

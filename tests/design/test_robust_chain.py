@@ -144,7 +144,7 @@ def test_a_controller_without_taps_is_written_all_the_same(recordings, tmp_path,
     refused = automatically(recordings, tmp_path, SPEC.format(percent=3.0))
     assert refused.exit_code == 1, refused.output
     assert reason in refused.stderr
-    assert f"{tmp_path / 'made.toml'} is written with the controller that was found, without taps" in refused.stderr
+    assert f"{tmp_path / 'made.toml'} is written with the controller that was found, but without taps" in refused.stderr
     configuration = load(tmp_path / "made.toml")
     (axis,) = configuration.axes
     assert (axis.prefilter.taps, axis.prefilter.command_taps) == ((), ())
