@@ -150,7 +150,8 @@ def test_equal_sides_keep_steps_to_both() -> None:
 
 def test_a_reference_beyond_the_drive_is_refused_with_key_value_and_what_is_possible() -> None:
     (axis,) = stage().axes
-    message = r"specification\.command\.reference_um: value is 50 µm; allowed: up to 40 µm, for a command .*limits\.drive_min_v = -2"
+    key = r"specification\.command\.reference_um"
+    message = rf"{key}: value is 50 µm; allowed: up to 40 µm, for a command .*limits\.drive_min_v = -2"
     with pytest.raises(ValueError, match=message):
         step_bounds(axis, MODEL_OPTIONS, required(50.0, 55.0))
     half = MODEL_OPTIONS.model_copy(update={"gain": 2.0})  # D(0) = 0.5: the command is twice the position

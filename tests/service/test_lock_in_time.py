@@ -117,7 +117,7 @@ def test_no_key_breaks_it_where_none_is_configured():
     lock = Lock(Clock())
     lock.take("ada")
     for key in ("", "None"):
-        with pytest.raises(Refusal, match="no key is configured"):
+        with pytest.raises(Refusal, match="no emergency key is configured"):
             lock.break_open("bob", key, None)
 
 
