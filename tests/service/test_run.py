@@ -14,7 +14,9 @@ import numpy as np
 import pytest
 
 import rtloop
+from rtloop.errors import UnavailableError
 from rtloop.recording.replay.replay import replay
+from rtloop.supervision import supervisor
 from tests.recording.real_loop import record, rows_of
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -237,6 +239,18 @@ def test_an_output_folder_that_cannot_be_made_ends_with_73(tmp_path: Path) -> No
     assert code == 73
     assert str(blocked) in err
     assert summary["exit_code"] == 73
+
+
+def test_a_recording_that_does_not_open_ends_the_start(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As on a file system that does not answer; the loop and its recorder are ready by then."""
+
+    def begin_to_wait(*_: object) -> None:
+        monkeypatch.setattr(supervisor, "START_TIMEOUT_S", 0.0)
+
+    monkeypatch.setattr(supervisor.RecorderKeeper, "start", begin_to_wait)
+    with pytest.raises(UnavailableError, match="the recording was not open within 0 s"):
+        rtloop.run(PAPER, duration_s=0.1, unpaced=True, folder=tmp_path)
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_a_recordings_name_is_no_folder(tmp_path: Path) -> None:
