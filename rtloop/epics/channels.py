@@ -108,7 +108,7 @@ class NumberChannel(Channel, ChannelDouble):
     """A channel whose value is a number of double precision."""
 
     async def write_from_dbr(self, data: Any, data_type: Any, metadata: Any, *, flags: int = 0) -> None:
-        """Convert a client's value and write it. Raises CaprotoValueError for an empty text, which caproto makes 0."""
+        """Convert a client's value and write it. Raises CaprotoValueError for an empty text (caproto would write 0)."""
         if native_type(data_type) is ChannelType.STRING and not all(text.strip() for text in data):
             raise CaprotoValueError(data)
         await super().write_from_dbr(data, data_type, metadata, flags=flags)

@@ -50,7 +50,7 @@ class RecordedRun:
             ) from None
 
     def _read(self, metadata: dict[str, Any]) -> None:
-        """Set the attributes from a run's description. Raises LookupError, TypeError or ValueError for another one."""
+        """Set the attributes from a run's description. Raises LookupError, TypeError, ValueError if malformed."""
         self.experiment: str = metadata["name"]
         self.label: str = metadata["run"]
         self.run_count: int = metadata["runs"]

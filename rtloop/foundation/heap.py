@@ -9,11 +9,11 @@ KEPT_BYTES, LARGEST_HEAP_BYTES = 64 << 20, 32 << 20
 
 
 def keep_freed_memory() -> None:
-    """Keep up to KEPT_BYTES of freed memory in this process, and in those that it forks from now on.
+    """Keep up to KEPT_BYTES of freed memory in this process, and in processes that it forks later, for new arrays.
 
-    By default, the GNU C library returns an array of a megabyte to the system when it is freed; the next array of that
-    size then costs a page fault for each 4 KiB, a third of the time of reading a recording. Arrays of up to
-    LARGEST_HEAP_BYTES are kept. Without that library, nothing changes.
+    By default, the GNU C library returns an array of a megabyte to the system when it is freed, and a new array of that
+    size causes a page fault for each 4 KiB. All these faults were a third of the time of reading a recording. An array
+    larger than LARGEST_HEAP_BYTES is still returned. Without the GNU C library, nothing changes.
     """
     try:
         set_option = ctypes.CDLL(None).mallopt

@@ -68,8 +68,8 @@ def _complex(pairs: Any) -> Complex:
 
 
 def _format_margin(margin: Mapping[str, float | None]) -> str:
-    """Return a margin, its "value" ± its "std", as text; "–" for each that is None."""
-    value, std = ("–" if number is None else f"{number:{form}}" for number, form in (
-        (margin["value"], ".4g"), (margin["std"], ".2g"),
-    ))  # fmt: skip
-    return "–" if margin["value"] is None else f"{value} ± {std}"
+    """Return a margin, its "value" ± its "std", as text; "–" for a std, or a value, that is None."""
+    if margin["value"] is None:
+        return "–"
+    std = "–" if margin["std"] is None else f"{margin['std']:.2g}"
+    return f"{margin['value']:.4g} ± {std}"

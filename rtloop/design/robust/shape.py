@@ -45,8 +45,8 @@ class Subject:
     options: ShapeOptions
 
     def restrict_resonance(self, percent: float) -> Subject:
-        """Return a copy whose scenarios vary the resonance by ±`percent` of the model's, neither damping nor gain, and
-        the delay as before.
+        """Return a copy whose scenarios vary the resonance frequency by ±`percent` of the model's. They keep the delays
+        of the present scenarios, and vary neither damping nor gain.
         """
         varied = {"resonance_percent": percent, "damping": (1.0,), "gain_percent": 0.0}
         scenarios = self.options.scenarios.model_copy(update=varied)

@@ -148,7 +148,7 @@ def add_simulation(configuration: Configuration, verifications: Verifications) -
 
 
 def _simulate_axis(bench: Bench, axis: AxisOptions, verification: Verification, design: DesignOptions) -> Verification:
-    """Return the verification with the axis's simulated steps, or with a warning if they cannot be evaluated."""
+    """Return a copy with the axis's simulated step responses, or with a warning if these cannot be evaluated."""
     try:
         return replace(verification, simulated=simulate(bench, axis, verification.slowest_s, design))
     except ValueError as error:
@@ -156,7 +156,7 @@ def _simulate_axis(bench: Bench, axis: AxisOptions, verification: Verification, 
 
 
 def _warn_unsimulated(verification: Verification, error: Exception) -> Verification:
-    """Return the verification with a warning that its steps are not simulated."""
+    """Return a copy with a warning that the steps are not simulated, because of `error`."""
     return replace(verification, warnings=(*verification.warnings, f"steps are not simulated: {error}"))
 
 

@@ -98,7 +98,7 @@ class Recorder:
                 self._pause(pause_s)
 
     def _pause(self, pause_s: float) -> None:
-        """Sleep for `pause_s`, or half of it if the loop ends in that half."""
+        """Sleep for `pause_s`; if the control loop has ended after the first half, leave out the second half."""
         time.sleep(pause_s / 2)
         if not ProcessState.has_ended(self.block.load(Word.LOOP_STATE)):
             time.sleep(pause_s / 2)

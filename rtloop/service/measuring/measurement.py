@@ -236,8 +236,9 @@ class _ExcitationRun:
         )
 
     def _whole_periods(self, lines: LineGrid, loop_signals: dict[str, Real]) -> PeriodSignals:
-        """Return error, command and position, µm, (TRIAL_PERIODS, samples) each, of the periods of a trial that `play`
-        has played: those between the settling period and the fade, which may be longer than a period.
+        """Return error, command and position, µm, (TRIAL_PERIODS, samples) each, of a trial that `play` has played.
+
+        The settling period before and the fade after are left out. The fade may be longer than a period.
         """
         first, end = lines.samples, (1 + TRIAL_PERIODS) * lines.samples
         series = (loop_signals[name][first:end] for name in ("error_um", "command_um", "position_um"))

@@ -87,8 +87,8 @@ def find_closed_loop(
 
 
 def _first_limited_tick(flags: Real, start: int, end: int) -> int | None:
-    """Return the first tick from `start` on, before `end`, with an active limit or a ramp by its `flags` (ticks,); None
-    if there is none.
+    """Return the first tick from `start` on, before `end`, whose flags show an active limit or a ramp; None if there is
+    none. `flags` (ticks,) has the flags of all ticks.
     """
     limited = np.flatnonzero(flags[start:end].astype(np.int64) & int(LIMITING_FLAGS))
     return start + int(limited[0]) if limited.size else None

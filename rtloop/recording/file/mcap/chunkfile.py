@@ -194,7 +194,7 @@ class ChunkFile:
             self._fd = -1
 
     def discard(self) -> None:
-        """Close the file and remove it, unless another file has taken its name; one that cannot be removed stays."""
+        """Close the file, and remove it unless its name now belongs to another file. Raises no error."""
         with contextlib.suppress(OSError):
             if self.is_in_place():
                 os.unlink(self._name)
