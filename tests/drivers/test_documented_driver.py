@@ -38,6 +38,8 @@ def last_line(folder: Path, test: str) -> str:
         "error",
         "--rootdir",
         folder,
+        "--basetemp",
+        folder / "temporary",
         folder / test,
     ]
     return completed(*command, folder=folder).stdout.strip().splitlines()[-1]
