@@ -39,7 +39,7 @@ def last_line(folder: Path, test: str) -> str:
         "--rootdir",
         folder,
         "--basetemp",
-        folder / "temporary",
+        folder / "basetemp",
         folder / test,
     ]
     return completed(*command, folder=folder).stdout.strip().splitlines()[-1]

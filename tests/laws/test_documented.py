@@ -114,7 +114,7 @@ def test_the_documented_test_of_the_notch_passes_and_finds_a_wrong_notch(folder:
 def pytest_report(folder: Path, *arguments: str) -> str:
     """Run pytest in a folder and return its report."""
     done = subprocess.run(
-        [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "--basetemp", folder / "temporary", *arguments],
+        [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "--basetemp", folder / "basetemp", *arguments],
         cwd=folder, env=environment(folder), capture_output=True, text=True, check=False,
     )  # fmt: skip
     return done.stdout

@@ -169,7 +169,7 @@ def test_the_package_installs_the_modules_that_it_lists(tmp_path: Path) -> None:
 
 def test_the_driver_keeps_the_contract(tmp_path: Path) -> None:
     init(tmp_path, "--kind", "driver", "--name", "lab_card")
-    options = ("-q", "-p", "no:cacheprovider", "-W", "error", "--rootdir", tmp_path, "--basetemp", tmp_path / "temporary")
+    options = ("-q", "-p", "no:cacheprovider", "-W", "error", "--rootdir", tmp_path, f"--basetemp={tmp_path}/basetemp")
     command = [sys.executable, "-m", "pytest", *options]
     environment = os.environ | {"PYTHONPATH": str(ROOT)}
     done = subprocess.run(
