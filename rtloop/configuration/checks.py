@@ -211,6 +211,11 @@ def loop_delay_ticks(model: ModelOptions | None, driver_delay_ticks: int) -> int
     return model.delay_ticks
 
 
+def _delayed_model(axis: AxisOptions, delay: int) -> ModelOptions | None:
+    """Return the model of an axis with the `delay` of its loop in samples, which a law judges; None without a model."""
+    return None if axis.model is None else axis.model.model_copy(update={"delay_ticks": delay})
+
+
 def promised_loop(axis: AxisOptions, rate_hz: float, delay: int, plant: Transfer | None = None) -> Loop | None:
     """Return the loop of an axis on its model, or on another `plant`, with a `delay` in samples.
 
@@ -232,10 +237,10 @@ def _check_axis(configuration: Configuration, axes: Sequence[AxisOptions], findi
     discretised.
     """
     (axis,) = axes
-    law = make_controller(axis, 1.0 / configuration.loop.rate_hz)
+    key, delay = f"axis.{axis.name}.controller", delay_ticks(configuration, axis)
+    law = make_controller(axis, 1.0 / configuration.loop.rate_hz, [_delayed_model(axis, delay)])
     if law is None:
         return [AxisCheck(axis.name)]
-    key, delay = f"axis.{axis.name}.controller", delay_ticks(configuration, axis)
     linear = _linear_part(law, key, findings, isinstance(law, TransferController))
     if linear is None and isinstance(law, TransferController):
         return [AxisCheck(axis.name, delay_ticks=delay, reference=axis.prefilter.path())]
@@ -294,10 +299,11 @@ def _check_shared(configuration: Configuration, axes: Sequence[AxisOptions], fin
     TypeError for a law that is for one axis.
     """
     names, key = tuple(axis.name for axis in axes), f"axis.{axes[0].name}.controller"
-    law = make_controller(axes[0], 1.0 / configuration.loop.rate_hz, [axis.model for axis in axes])
+    delays = [delay_ticks(configuration, axis) for axis in axes]
+    models = [_delayed_model(axis, delay) for axis, delay in zip(axes, delays, strict=True)]
+    law = make_controller(axes[0], 1.0 / configuration.loop.rate_hz, models)
     if not isinstance(law, CoupledController):
         raise TypeError(f"{key}: {law!r} is for one axis, but is given {', '.join(names)}")
-    delays = [delay_ticks(configuration, axis) for axis in axes]
     plant, loop = _coupled_plant(axes, delays, findings), None
     linear = _linear_part(law, key, findings, type(law).shipped)
     if linear is not None and plant is not None:

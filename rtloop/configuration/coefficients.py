@@ -27,11 +27,12 @@ def make_controller(
 ) -> Controller | None:
     """Return the controller of an axis; None without one. `axis_coefficients` builds, and may refuse, its coefficients.
 
-    `models` has one entry for each axis of a controller with several axes.
+    `models` has one entry for each axis of the controller, with the delay of that axis's loop; empty: the axis's model
+    as the configuration states it.
     """
     if axis.controller is None:
         return None
-    model = tuple(models) if len(models) > 1 else axis.model
+    model = tuple(models) if len(models) > 1 else models[0] if models else axis.model
     return _law_class(axis.controller, DEFAULT_LAWS[1])(axis.controller, period_s, model)
 
 
@@ -93,8 +94,16 @@ def _resting_errors(controller: Controller) -> Real:
 
 
 def _law(slot: str, law: Law, number: int) -> Mapping[str, object]:
-    """Return fields of `slot`: the number of its law in the loop's table, and the law's coefficients as bytes."""
-    return {f"{slot}_law": number, slot: build_record(law).view(np.uint8)}
+    """Return fields of `slot`: the number of its law in the loop's table, and the law's coefficients as bytes.
+
+    Raises ValueError for options without a solution; its message begins with `slot` and the key that the law names.
+    """
+    try:
+        record = build_record(law)
+    except ValueError as error:
+        is_key = str(error).partition(":")[0] in type(law.options).model_fields
+        raise ValueError(f"{slot}{'.' if is_key else ': '}{error}") from error
+    return {f"{slot}_law": number, slot: record.view(np.uint8)}
 
 
 def _assign(coefficients: Records, name: str, value: object) -> None:

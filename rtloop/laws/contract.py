@@ -80,8 +80,8 @@ class Law(ABC):
     def __init__(self, options: Any, period_s: float, model: Any) -> None:
         """Store options, period and model; number the names in `inputs` and in `outputs`, each from 0, in `channels`.
 
-        `model` is the axis's configured plant from command to position, or None; for a coupled controller a tuple with
-        one entry for each axis.
+        `model` is the axis's configured plant from command to position, or None; its `delay_ticks` is the delay of the
+        loop, the driver's where the model states none. For a coupled controller, a tuple with one entry for each axis.
         """
         self.options, self.period_s, self.model = options, period_s, model
         self.channels = {name: place for names in (self.inputs, self.outputs) for place, name in enumerate(names)}

@@ -82,7 +82,7 @@ def tracking_share(a: Real, m: Real, c: Real, tracking_s: float, period_s: float
     radius = _spectral_radius(a - share * a @ m.reshape(-1, outputs) @ c.reshape(outputs, -1)) if a.size else 0.0
     if not radius < 1:
         raise ValueError(
-            f"controller.tracking_s: {tracking_s:g} s makes the controller unstable while the command is limited "
+            f"tracking_s: {tracking_s:g} s makes the controller unstable while the command is limited "
             f"(largest |pole| {radius:.6g}); use a smaller value, or 0"
         )
     return share

@@ -122,7 +122,9 @@ def test_the_linear_part_of_c_of_z_is_found_by_running_it():
 
 @pytest.mark.parametrize(("lead_ticks", "smooth_ticks"), [(0, 0), (2, 3)])
 def test_the_repetitive_controller_follows_its_formula(lead_ticks, smooth_ticks):
-    """ê_k = e_k + g Σ_j q_j ê_{k − N + L + j}, q a triangle of sum 1; the command is the sum of ki T ê.
+    """ê_k = e_k + g Σ_j q_j u_{k − N + L + j}, u_k = e_k + g Σ_j q_j u_{k − N + j}, q a triangle of sum 1.
+
+    The command is the sum of ki T ê.
 
     Each tenth command is limited by 0.1 µm: the integral goes on from the limited command, and the memory takes a 0.
     """
@@ -141,10 +143,12 @@ def test_the_repetitive_controller_follows_its_formula(lead_ticks, smooth_ticks)
         bench._call("update", told)
     width = smooth_ticks + 1
     triangle = {j: (width - abs(j)) / width**2 for j in range(-smooth_ticks, width)}
-    total_um, expected_um = {}, [0.0]
+    memory_um, expected_um = {}, [0.0]
     for k, error_um in enumerate(errors_um):
-        past_um = sum(q * total_um.get(k - repeat + lead_ticks + j, 0.0) for j, q in triangle.items())
-        raised_um = error_um + gain * past_um
-        total_um[k] = raised_um if limited_um[k] == 0 else 0.0
-        expected_um.append(expected_um[-1] + ki_per_s * PERIOD_S * raised_um - limited_um[k])
+        led_um, repeated_um = (
+            gain * sum(q * memory_um.get(k - repeat + lead + j, 0.0) for j, q in triangle.items())
+            for lead in (lead_ticks, 0)
+        )
+        memory_um[k] = error_um + repeated_um if limited_um[k] == 0 else 0.0
+        expected_um.append(expected_um[-1] + ki_per_s * PERIOD_S * (error_um + led_um) - limited_um[k])
     np.testing.assert_allclose(commands_um, expected_um[:-1], rtol=1e-9, atol=1e-12)

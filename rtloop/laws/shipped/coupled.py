@@ -158,7 +158,7 @@ class Coupled(CoupledController):
         controller, tracking = self._controller_and_tracking
         a, b, c, d = controller.system
         if controller.order > MAX_ORDER:
-            raise ValueError(f"controller: order {controller.order}; allowed: up to {MAX_ORDER}")
+            raise ValueError(f"order {controller.order}; allowed: up to {MAX_ORDER}")
         bands = row_bands(a)
         return {
             "order": controller.order,

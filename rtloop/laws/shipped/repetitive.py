@@ -1,12 +1,13 @@
-"""Repetitive control: the error of a period ago is added to the present error; an integrator acts on the sum.
+"""Repetitive control: errors of the periods before are added to the present error; an integrator acts on the sum.
 
-    ê_k = e_k + w_k,    w_k = g Σ_j q_j ê_{k − N + L + j},    v' = ki ê
+    u_k = e_k + g Σ_j q_j u_{k − N + j},    ê_k = e_k + g Σ_j q_j u_{k − N + L + j},    v' = ki ê
 
-A plug-in internal model (S. Hara, Y. Yamamoto, T. Omata and M. Nakano, IEEE Trans. Automatic Control 33(7), 1988) with
-a smoothing filter Q of no phase (M. Tomizuka, T.-C. Tsao and K.-K. Chew, J. Dyn. Syst. Meas. Control 111, 1989). With T
-the closed loop of the integrator alone, it is stable where that is and |g Q (1 − z^L T)| < 1 at every frequency.
+A plug-in internal model u (S. Hara, Y. Yamamoto, T. Omata and M. Nakano, IEEE Trans. Automatic Control 33(7), 1988)
+with a smoothing filter Q of no phase (M. Tomizuka, T.-C. Tsao and K.-K. Chew, J. Dyn. Syst. Meas. Control 111, 1989).
+The lead L lies outside the internal model, which therefore repeats every N ticks. With T the closed loop of the
+integrator alone, it is stable where that is and |g Q (1 − z^L T)| < 1 at every frequency.
 
-ê_k is 0 in the memory if the command of tick k was limited: no command could have reduced this error, and it would be
+u_k is 0 in the memory if the command of tick k was limited: no command could have reduced this error, and it would be
 added to the command a period later.
 """
 
@@ -118,18 +119,19 @@ class Repetitive(Controller):
 
     @staticmethod
     def update(c: Any, s: Any, told: Any) -> None:
-        """Add the smoothed sum of a period ago to the error, and advance the integral by the result.
+        """Add the smoothed memory, read L ticks ahead, to the error, and advance the integral by the result.
 
-        The result is stored for the next period; if the command was limited, 0 is stored, and the integral is moved to
-        the applied command as well.
+        The memory of the next period is the error plus the smoothed memory of a period ago; if the command was limited,
+        it is 0, and the integral is moved to the applied command as well.
         """
-        place, recalled_um = s.at + c.ahead, 0.0
+        ahead, newest = s.at + c.ahead, s.at + c.count - 1
+        led_um, repeated_um = 0.0, 0.0
         for j in range(c.count):
-            recalled_um += c.weights[j] * s.past_um[(place - j) % c.places]
-        total_um = told.error_um + recalled_um
-        s.past_um[s.at] = total_um if told.applied_um == told.command_um else 0.0
+            led_um += c.weights[j] * s.past_um[(ahead - j) % c.places]
+            repeated_um += c.weights[j] * s.past_um[(newest - j) % c.places]
+        s.past_um[s.at] = told.error_um + repeated_um if told.applied_um == told.command_um else 0.0
         s.at = (s.at + 1) % c.places
-        s.integral_um += c.ki * total_um + told.applied_um - told.command_um
+        s.integral_um += c.ki * (told.error_um + led_um) + told.applied_um - told.command_um
 
     def linear(self) -> Any:
         """Return the transfer of the integrator alone; `build` checks the memory."""

@@ -157,7 +157,7 @@ class TransferController(Controller):
         controller = self.discrete
         order = controller.b.size
         if order > MAX_ORDER:
-            raise ValueError(f"controller: order {order}; allowed: up to {MAX_ORDER}")
+            raise ValueError(f"order {order}; allowed: up to {MAX_ORDER}")
         a, m, c = controller.a, controller.antiwindup, controller.c
         share = tracking_share(a, m, c, self.options.tracking_s, self.period_s)
         places = _kernel_places(controller.a)
