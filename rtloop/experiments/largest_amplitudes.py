@@ -22,7 +22,7 @@ FEEDFORWARD_PEAK = 1.02
 
 def largest_command(setting: Setting) -> Bound:
     """Return the largest slow command without feedback, µm to both sides, with the limit that sets it."""
-    return setting.reach.divided(FEEDFORWARD_PEAK, "with a dead band the command is up to")
+    return setting.reach.divided(FEEDFORWARD_PEAK, "with the dead band, the command is up to", "the reference")
 
 
 def largest_step_up(setting: Setting) -> Bound:
@@ -53,7 +53,7 @@ def _largest_step_towards(setting: Setting, direction: float) -> Bound:
     modelled_reversal = None if model is None else model.step_reversal
     reversal = UNKNOWN_PEAK - 1 if modelled_reversal is None else max(modelled_reversal, MIN_PEAK - 1)
     if setting.is_one_sided:
-        return setting.reach.divided(max(peak, reversal), "the command of a step is up to")
+        return setting.reach.divided(max(peak, reversal), "the command of a step is up to", "the step")
     sign = direction * math.copysign(1.0, setting.um_per_v)
     earlier_commands_um = np.zeros(1)
     if sign * sum(drive_range_v) < 0 or (sum(drive_range_v) == 0 and direction < 0):
@@ -62,7 +62,7 @@ def _largest_step_towards(setting: Setting, direction: float) -> Bound:
     bound = min(
         Bound(axis.limits.command_um, f"limits.command_um = {axis.limits.command_um:g}"),
         setting.trip_towards(direction),
-    ).divided(peak, "the command of a step is up to")
+    ).divided(peak, "the command of a step is up to", "the step")
     actuator = axis.feedforward.actuator()
 
     def is_held(height_um: float) -> bool:
@@ -73,16 +73,18 @@ def _largest_step_towards(setting: Setting, direction: float) -> Bound:
     held_um = largest_true(is_held, bound.magnitude)
     peak_um = np.append(earlier_commands_um, held_um * (1 + 1e-6) * peak)
     if can_hold(actuator, direction * peak_um, *drive_range_v):
-        key, effect = setting.largest_drive(-sign)[1], f"step back goes {reversal:.3g} times as far beyond 0"
+        key = setting.largest_drive(-sign)[1]
+        effect = f"the command of a step back to 0 goes beyond 0 by {reversal:.3g} times the height of the step"
     else:
-        key, effect = setting.largest_drive(sign)[1], f"step is up to {peak:.3g} times as large"
-    return min(bound, Bound(held_um, f"{key} (the command of a {effect})"))
+        key = setting.largest_drive(sign)[1]
+        effect = f"the command of a step is up to {peak:.3g} times as large as the step"
+    return min(bound, Bound(held_um, f"{key} ({effect})"))
 
 
 def largest_sine(setting: Setting) -> Bound:
     """Return the largest amplitude of a sine of the reference at any frequency, µm, with the limit that sets it."""
     peak = max((setting.model and setting.model.sine_peak) or UNKNOWN_PEAK, MIN_PEAK)
-    return setting.reach.divided(peak, "the command of a sine is up to")
+    return setting.reach.divided(peak, "the command of a sine is up to", "the sine")
 
 
 def largest_swept_sine(setting: Setting) -> Bound:
@@ -97,8 +99,8 @@ def largest_swept_sine(setting: Setting) -> Bound:
     open_peak = model.open_peak if model else 1.0
     return min(
         largest_sine(setting),
-        setting.reach.divided(open_peak, "at the resonance the stage's motion without control is"),
-        swing.divided(2 * closed_peak, "the position's swing from peak to peak is"),
+        setting.reach.divided(open_peak, "at the resonance the stage's motion without control is", "the amplitude"),
+        swing.divided(2 * closed_peak, "the position's swing from peak to peak is", "the amplitude"),
     )
 
 

@@ -109,9 +109,11 @@ def _select_axis(base: Configuration, name: str | None) -> AxisOptions:
     """
     names = [axis.name for axis in base.axes]
     if name is None and len(names) > 1:
-        raise ConfigError(base.source, [f"several axes, {', '.join(names)}; select one with --axis"])
+        raise ConfigError(
+            base.source, [f"the configuration has several axes, {', '.join(names)}; select one with --axis"]
+        )
     if name is not None and name not in names:
-        raise ConfigError(base.source, [f"--axis {name}: there is no such axis; there are {', '.join(names)}"])
+        raise ConfigError(base.source, [f"--axis {name}: there is no such axis; allowed: {', '.join(names)}"])
     return next(axis for axis in base.axes if name in (None, axis.name))
 
 

@@ -66,7 +66,7 @@ class Experiment:
             return f"axis.{axis.name}.controller: missing; this experiment needs a closed loop"
         if self.needs_rig and not is_rig:
             kind = configuration.driver_kind
-            return f"driver.kind: {kind!r}; this experiment changes the rig, which only the driver 'sim' allows"
+            return f"driver.kind: {kind!r}; allowed: 'sim', because this experiment changes the simulated rig"
         return None
 
     def fit_options(self, options: Options, setting: Setting, compared: Setting | None = None) -> Options:

@@ -46,7 +46,8 @@ class RecordedRun:
             self._read(metadata)
         except (LookupError, TypeError, ValueError) as error:
             raise RecordingError(
-                f"{recording.paths[0]}: the description of its experiment is damaged or of another version: {error!r}"
+                f"{recording.paths[0]}: the recorded description of the experiment is damaged, or rtloop of another "
+                f"version wrote it ({error!r})"
             ) from None
 
     def _read(self, metadata: dict[str, Any]) -> None:
@@ -143,9 +144,8 @@ class RecordedRun:
         end_tick = self._ticks[-1] + 1 if self._ticks.size else 0
         if end_tick < self.planned_ticks:
             raise UnsuitableData(
-                f"{self._label_prefix}the run ended after {end_tick / self.rate_hz:.1f} of "
-                f"{self.planned_ticks / self.rate_hz:g} s; "
-                "not analysed"
+                f"{self._label_prefix}the run ended after {end_tick / self.rate_hz:.1f} s of the planned "
+                f"{self.planned_ticks / self.rate_hz:g} s; not analysed"
             )
         if not self._may_trip and (clipping := clipping_text(self._flags())):
             raise UnsuitableData(

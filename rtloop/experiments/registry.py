@@ -33,7 +33,7 @@ def select_experiments(names: Sequence[str]) -> list[Experiment]:
     unknown = [name for name in names if name not in EXPERIMENTS]
     if unknown:
         known_names = ", ".join(EXPERIMENTS)
-        raise ConfigError("experiment", [f"{name!r} is not an experiment; there are {known_names}" for name in unknown])
+        raise ConfigError("experiment", [f"{name!r} is not an experiment; allowed: {known_names}" for name in unknown])
     return [experiment for name, experiment in EXPERIMENTS.items() if name in names]
 
 

@@ -140,8 +140,9 @@ def _middle_notes(run: RecordedRun) -> list[str]:
     if not run.middle_um:
         return []
     return [
-        f"The drive has one sign: the experiment moves about {run.middle_um:g} µm, the middle of the positions that it "
-        "reaches in any order. Reference, command and position are relative to this middle."
+        f"The drive has only one sign. Therefore the experiment moves about {run.middle_um:g} µm, the middle of the "
+        "positions that the drive can reach from every other position. Reference, command and position are "
+        "relative to this middle."
     ]
 
 
@@ -154,7 +155,8 @@ def _analyse(experiment: Experiment, runs: Sequence[RecordedRun]) -> Analysis:
         run.require_complete()
     if len(runs) < runs[0].run_count:
         raise UnsuitableData(
-            f"only {len(runs)} of {runs[0].run_count} recordings of this experiment are given; not analysed"
+            f"only {len(runs)} of {runs[0].run_count} recordings of this experiment are given; not analysed. "
+            "Give all of them"
         )
     return experiment.analyse(runs, experiment.options.model_validate(runs[0].parameters))
 

@@ -26,12 +26,12 @@ class Bound(NamedTuple):
     magnitude: float
     reason: str
 
-    def divided(self, factor: float, effect: str) -> Bound:
+    def divided(self, factor: float, effect: str, signal: str) -> Bound:
         """Return the bound of a signal if the limited signal is `factor` times as large: the magnitude over `factor`.
 
-        The reason gets an explanation that begins with `effect`, such as "(`effect` 1.4 times as large)".
+        The reason gets an explanation that begins with `effect`: "(`effect` 1.4 times as large as `signal`)".
         """
-        return Bound(self.magnitude / factor, f"{self.reason} ({effect} {factor:.3g} times as large)")
+        return Bound(self.magnitude / factor, f"{self.reason} ({effect} {factor:.3g} times as large as {signal})")
 
 
 @dataclass(frozen=True)
@@ -167,7 +167,8 @@ class Setting:
         limits = self.axis.limits
         if self.is_one_sided:
             low_um, high_um = self._one_sided_range
-            reason = f"limits.drive_min_v = 0 (commands of {low_um:.4g} … {high_um:.4g} µm are possible in any order)"
+            commands_text = f"only commands of {low_um:.4g} … {high_um:.4g} µm can follow each other in any order"
+            reason = f"limits.drive_min_v = 0 ({commands_text})"
             return Bound(min(high_um - self.middle.um, self.middle.um - low_um), reason)
         direction = -1.0 if -self.drive_range_v[0] < self.drive_range_v[1] else 1.0
         held_um = abs(float(loading_curve(self.axis.feedforward.actuator(), self.reach_v)))

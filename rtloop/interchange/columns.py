@@ -84,7 +84,7 @@ def read_mapping(path: Path) -> ColumnSelection:
         raise ConfigError(
             str(path),
             [
-                f"signals: {name!r}; allowed: letters, digits and _ in a name, up to 100, and no digit at its beginning"
+                f"signals: {name!r}; allowed: a name of up to 100 letters, digits and _, with no digit first"
                 for name in invalid_names
             ],
         )

@@ -240,7 +240,8 @@ def _import_ticks(table: Table, rows: int) -> tuple[Real, list[str]]:
     ):
         return ticks, []
     return new_ticks, [
-        f"the file's ticks, {ticks[0]:g} to {ticks[-1]:g}, do not count the samples of the file; new ticks count from 0"
+        f"the ticks in the file, {ticks[0]:g} to {ticks[-1]:g}, do not number the samples one by one; the recording "
+        "gets new ticks from 0"
     ]
 
 

@@ -99,7 +99,7 @@ def test_a_missing_recording_changes_the_report(campaign: tuple[Path, dict[str, 
         shutil.copy(path, tmp_path)
     next(iter(sorted(tmp_path.glob("*.mcap")))).unlink()
     (section,) = make_report(load_runs(sorted(tmp_path.glob("*.mcap")))).content["experiments"]
-    assert section["problem"] == "only 1 of 2 recordings of this experiment are given; not analysed"
+    assert section["problem"] == "only 1 of 2 recordings of this experiment are given; not analysed. Give all of them"
     assert section not in content["experiments"]
 
 
@@ -110,7 +110,7 @@ def test_impossible_experiments_name_the_reason(tmp_path: Path) -> None:
     assert (unknown.exit_code, "'fig3' is not an experiment" in unknown.output) == (78, True)
     fixed = command("run", "disturbance", BOARD, "--out", tmp_path)
     assert fixed.exit_code == 1
-    assert "driver.kind: 'shm'; this experiment changes the rig" in fixed.output
+    assert "driver.kind: 'shm'; allowed: 'sim', because this experiment changes" in fixed.output
     listed = command("list")
     assert listed.exit_code == 0
     assert "harmonic.amplitude_um=2.0" in listed.output
@@ -160,12 +160,12 @@ def test_a_compared_configuration_must_have_the_axis() -> None:
     two = PAPER.with_name("two-axis.toml")
     refused = command("run", "steps", two, "--axis", "y", "--beside", PAPER)
     assert refused.exit_code != 0
-    assert "--axis y: there is no such axis; there are x" in refused.output
+    assert "--axis y: there is no such axis; allowed: x" in refused.output
 
 
 def test_a_description_without_a_key_is_named(campaign: tuple[Path, dict[str, Any]], tmp_path: Path) -> None:
     folder, _ = campaign
     text = load(next(iter(sorted(folder.glob("*.mcap"))))).configuration
     for damaged in (text.replace('"segments"', '"parts"', 1), text.replace('"asked"', '"asked": 5, "old"', 1)):
-        with pytest.raises(RecordingError, match="its experiment is damaged or of another version"):
+        with pytest.raises(RecordingError, match="the recorded description of the experiment is damaged"):
             RecordedRun(cast(Any, SimpleNamespace(configuration=damaged, paths=[tmp_path / "run.mcap"])))

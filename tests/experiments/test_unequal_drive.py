@@ -153,7 +153,7 @@ def test_the_step_back_limits_a_step_where_the_other_side_is_short() -> None:
     peak_v, back_v = plays.drive_to(1.1 * up_um), plays.drive_to(-0.1 * up_um)
     assert peak_v < 0.9 * HIGHEST_V
     assert back_v == pytest.approx(-0.5, abs=1e-6)
-    assert "step back goes 0.1 times as far beyond 0" in largest_step_up(stage).reason
+    assert "a step back to 0 goes beyond 0 by 0.1 times the height of the step" in largest_step_up(stage).reason
 
 
 def test_equal_sides_scale_all_levels_by_one_factor() -> None:
@@ -254,7 +254,7 @@ def test_steps_on_a_drive_of_one_sign_are_analysed_about_the_middle(tmp_path: Pa
     assert rows["settling time to 5 %, median"]["mark"] == "good"
     assert section["middle_um"] == pytest.approx(middle_um(), rel=0.005)
     assert section["notes"][0].startswith(
-        f"The drive has one sign: the experiment moves about {section['middle_um']:g} µm"
+        f"The drive has only one sign. Therefore the experiment moves about {section['middle_um']:g} µm"
     )
     (run,) = load_runs([path])
     for name in ("reference_um", "position_um", "command_um"):

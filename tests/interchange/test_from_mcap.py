@@ -169,11 +169,11 @@ BAD: list[tuple[Any, str, Any, str]] = [
     (b"", "protobuf", None, "messages are encoded as protobuf;"),
     (b"", "protobuf", ("A", "protobuf", b"\xff\xff"), "the schema 'A' cannot be read"),
     (b"", "protobuf", ("A", "protobuf", CIRCLE), "the schema 'A' cannot be read"),
-    (b"\xff\xff", "protobuf", ("lab.B", "protobuf", B), "message 0: contents do not fit the schema"),
-    (b"\0\1\0\0", "cdr", RECURSIVE, "message 0: contents do not fit the schema"),
+    (b"\xff\xff", "protobuf", ("lab.B", "protobuf", B), "message 0: the contents do not match the schema"),
+    (b"\0\1\0\0", "cdr", RECURSIVE, "message 0: the contents do not match the schema"),
     (b"\0\1\0\0\xff\xff\xff\xff", "cdr", EMPTY_ITEMS, "contains lists, and also a message type without fields"),
-    (b"\0\1\0\0\xff\xff\xff\xff", "cdr", ("a/msg/A", "ros2msg", b"float64[] x"), "contents do not fit the schema"),
-    (b"", "cdr", ("a/msg/A", "ros2msg", b"\xff nonsense ["), "cannot be read|do not fit the schema"),
+    (b"\0\1\0\0\xff\xff\xff\xff", "cdr", ("a/msg/A", "ros2msg", b"float64[] x"), "contents do not match the schema"),
+    (b"", "cdr", ("a/msg/A", "ros2msg", b"\xff nonsense ["), "cannot be read|do not match the schema"),
     (b"{", "json", None, "message 0: not JSON"),
     (b"[" * 100_000, "json", None, "message 0: not JSON"),
     (b'{"a": "text"}', "json", None, "the messages contain no number"),
@@ -198,7 +198,7 @@ def test_long_lists_are_left_out(tmp_path: Path):
 
 def test_messages_without_common_fields_are_no_table(tmp_path: Path):
     path = written(tmp_path / "a.mcap", [{f"f{place % 3000}": 1} for place in range(9_000)])
-    with pytest.raises(UnreadableData, match="not a table: more than"):
+    with pytest.raises(UnreadableData, match="not a table: 9000 messages have more than"):
         read_mcap(path)
 
 

@@ -123,7 +123,7 @@ def test_every_tenth_tick_comes_back_as_a_slower_recording(recording: Recording,
     assert back.header["rate_hz"] == 1000.0
     assert np.array_equal(back["tick"], np.arange(COUNT // 10))
     assert np.array_equal(back["deadline_ns"], recording["deadline_ns"][::10])
-    assert "new ticks count from 0" in back.header["imported"]["notes"][-1]
+    assert "the recording gets new ticks from 0" in back.header["imported"]["notes"][-1]
 
 
 def test_lost_ticks_stay_lost(tmp_path: Path):

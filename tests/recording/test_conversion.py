@@ -271,7 +271,7 @@ def encode_as_cbor(run: Run) -> list[FileMessage]:
 UNREADABLE: list[tuple[Callable[[Run], list[FileMessage]], dict[str, Any], str]] = [
     (lambda run: run.without("/configuration"), {}, "the topic /configuration, .* has no message before /ticks"),
     (lambda run: [run.messages[0], *run.messages[:0:-1]], {}, "out of order: tick .*`mcap sort` sorts the messages"),
-    (swap_blocks, {}, rf"out of order: tick 0 after {TICKS - 1}; .*`mcap sort` sorts"),
+    (swap_blocks, {}, rf"out of order: tick 0 after tick {TICKS - 1}; .*`mcap sort` sorts"),
     (encode_as_cbor, {}, "/ticks are encoded as cbor, and their schema is not rtloop's; allowed: json, or protobuf"),
     (lambda run: run.messages, {"ticks": "proto3"}, "/ticks are encoded as protobuf, and their schema is not rtloop's"),
 ]
@@ -311,7 +311,10 @@ INVALID_TICKS: list[tuple[Callable[[dict[str, Any]], Any], str]] = [
     (lambda tick: {**tick, "tick": 10**400}, "a tick in JSON cannot be read .OverflowError"),
     (lambda tick: {**tick, "deadline_ns": -1}, "deadline_ns: -1"),
     (lambda tick: {**tick, "deadline_ns": float("nan")}, "deadline_ns: nan"),
-    (lambda tick: {**tick, "deadline_ns": tick["deadline_ns"] + 1}, "log times contradict the deadlines"),
+    (
+        lambda tick: {**tick, "deadline_ns": tick["deadline_ns"] + 1},
+        "log times of the ticks do not match their deadlines",
+    ),
     (lambda tick: {key: value for key, value in tick.items() if key != "x_drive_v"}, "KeyError: 'x_drive_v'"),
     (lambda tick: {**tick, "x_drive_v": None}, "cannot be read .TypeError"),
     (lambda tick: [], "cannot be read .TypeError"),

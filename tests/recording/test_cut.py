@@ -206,7 +206,7 @@ def test_a_run_without_its_oldest_files_is_cut(parts: list[Path], tmp_path: Path
     assert is_identical(tmp_path / "out.mcap", 1_600)
     lost, later = (load(part)["tick"].astype(int).tolist() for part in parts[1:3])
     report = cut([parts[0], parts[2]], lost[0] - 5, later[0] + 5, tmp_path / "hole.mcap")
-    problem = f"{len(lost)} recorded ticks are missing: damaged, or in a file that was not given"
+    problem = f"{len(lost)} recorded ticks are missing: they are damaged, or in a file of the run that was not given"
     assert (report["gaps"], report["problems"]) == ([(lost[0], len(lost))], [problem])
     path = write_recording(tmp_path / "late.mcap", make_rows(3_000, first=500), first_tick=500)
     with pytest.raises(RecordingError, match="not in the recording; allowed: ticks 500 to 3499"):
@@ -242,7 +242,10 @@ def test_damaged_ticks_are_a_gap_and_named(tmp_path: Path):
     report = cut(path, 1_500, 3_500)
     assert (report["gaps"], report["complete"]) == ([(2_000, 1_000)], False)
     assert any("is damaged" in problem for problem in report["problems"])
-    assert report["problems"][-1] == "1000 recorded ticks are missing: damaged, or in a file that was not given"
+    assert (
+        report["problems"][-1]
+        == "1000 recorded ticks are missing: they are damaged, or in a file of the run that was not given"
+    )
     assert cut(path, 3_500, 3_600)["complete"]
 
 

@@ -118,7 +118,7 @@ CHANGES = {
     "flags: 0.5; allowed: a whole number from 0 to 4.29497e+09": ("flags", 2, 0.5),
     "out of order: tick 6 after 6": ("tick", 1, 6.0),
     "out of order: deadline_ns 200 after 250": ("deadline_ns", 1, 250.0),
-    "log times contradict the deadlines": ("_log_time", 1, 3),
+    "the log times of the ticks do not match their deadlines": ("_log_time", 1, 3),
     "contains other data than ticks": ("_channel", 3, 2),
 }
 

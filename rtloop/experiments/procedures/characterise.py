@@ -101,8 +101,8 @@ def analyse(recordings: Sequence[RecordedRun], _: CharacteriseOptions) -> Analys
     notes = ["The model is [axis.feedforward] times D(0), the static gain of [axis.model], driven with the recorded "
              "voltage.", *_range_notes(run)]  # fmt: skip
     if run.simulated_hysteresis == "residual":
-        notes.append("The simulated actuator (truth = \"residual\") differs from the model on purpose, so that some "
-                     "hysteresis remains after compensation.")  # fmt: skip
+        notes.append("The simulated actuator (option hysteresis.truth = \"residual\" of the plant) differs from the "
+                     "model on purpose, so that some hysteresis remains after compensation.")  # fmt: skip
     return Analysis(rows, curves, (_table(shapes),), notes)
 
 
@@ -166,8 +166,8 @@ def draw(figure: Any, curves: Mapping[str, Any], ink: Palette) -> None:
 EXPERIMENT = Experiment(
     "characterise",
     "Hysteresis under slow sines, and its model",
-    "The actuator is driven slowly, without any controller: half the drive, all of it from its lowest to its highest "
-    "value, a minor loop.",
+    "The actuator is driven slowly, without any controller, through three loops: half of the drive, the whole drive "
+    "from its lowest to its highest value, and a minor loop.",
     CharacteriseOptions,
     runs,
     analyse,

@@ -75,11 +75,12 @@ def analyse(recordings: Sequence[RecordedRun], options: CompensationOptions) -> 
     ]
     notes = ["y is x/D(0), where D(0) is the static gain of [axis.model]; at this frequency the dynamics should have "
              "no other effect.",
-             "The model is [axis.feedforward], driven with the recorded voltage. With its own inverse, "
-             "only the dead band of the first threshold remains."]  # fmt: skip
+             "The model is [axis.feedforward], driven with the recorded voltage. If the inverse of this "
+             "model computed that voltage, only the dead band of the first threshold remains."]  # fmt: skip
     if run.simulated_hysteresis == "residual":
-        notes.append("The simulated actuator (truth = \"residual\") was chosen to leave 3.75 % of hysteresis. A "
-        "result of 3.75 % shows that rig, inverse and analysis agree; it says nothing about a real stage.")  # fmt: skip
+        notes.append("The simulated actuator (option hysteresis.truth = \"residual\" of the plant) was chosen to "
+        "leave 3.75 % of hysteresis. A result of 3.75 % shows that rig, inverse and analysis agree. This result says "
+        "nothing about a real stage.")  # fmt: skip
     return Analysis(rows, {"v_y_error": thin_signals(v, y, error)}, notes=notes)
 
 
@@ -105,13 +106,14 @@ def draw(figure: Any, curves: Mapping[str, Any], ink: Palette) -> None:
     ink.label(loop, "command v / µm", "output y / µm", "output of the inverse compensation", legend="best")
     error_panel.axhline(0, color=ink.faint, linewidth=0.8)
     error_panel.plot(v, error, color=ink.error, linewidth=1.0)
-    ink.label(error_panel, "command v / µm", "ε = v − y / µm", "what compensation leaves")
+    ink.label(error_panel, "command v / µm", "ε = v − y / µm", "error after compensation")
 
 
 EXPERIMENT = Experiment(
     "compensation",
     "Inverse compensation alone",
-    "Feedforward without feedback: the command is a slow sine, and the inverse hysteresis makes the drive.",
+    "Feedforward without feedback: the command is a slow sine. The inverse hysteresis model computes the "
+    "drive from it.",
     CompensationOptions,
     runs,
     analyse,

@@ -105,7 +105,8 @@ def analyse(recordings: Sequence[RecordedRun], options: DisturbanceOptions) -> A
         table.append([f"{hz:g}", f"{error_nm:.1f}", f"{error_nm / amplitude_um / 1e3:.5f}"])
         curves["sines"].append((hz, error_nm))
     curves |= _frequency_curves(recordings[0], amplitude_um)
-    notes = ["Ω is added before the dynamics. The model is the loop of [axis.controller] and [axis.model] as sampled.",
+    notes = ["The disturbance Ω (µm) is added to the displacement of the actuator, before the dynamics of the stage. "
+             "The model is the sampled loop of [axis.controller] and [axis.model].",
              "The loop at rest moves within the dead band of the hysteresis, which the inverse does not correct: slow "
              "errors decay more slowly than in the linear model."]  # fmt: skip
     tables = (Table("Sines", ("f / Hz", "remaining amplitude / nm", "per Ω"), table),) if table else ()
@@ -246,7 +247,7 @@ def draw(figure: Any, curves: Mapping[str, Any], ink: Palette) -> None:
 EXPERIMENT = Experiment(
     "disturbance",
     "Rejection of the disturbance",
-    "Ω in the simulated rig, as a step and as sines, with the loop closed at rest.",
+    "A disturbance Ω of the simulated rig acts on the closed loop at rest, as a step and as sines.",
     DisturbanceOptions,
     runs,
     analyse,

@@ -124,17 +124,18 @@ def analyse(recordings: Sequence[RecordedRun], options: HarmonicOptions) -> Anal
     headings = ("f / Hz", *(f"{name}: {column}" for name in ("drive", "feedforward", "closed") for column in
                             ("dB", "phase / °", "γ²")))  # fmt: skip
     notes = [
-        f"Amplitude {options.amplitude_um:g} µm. Drive alone: position per volt, relative to {_raw_gain(run):.4g} "
-        "µm/V, the model's mean gain over the whole drive. A small amplitude does not leave the dead band of the "
-        "hysteresis: what drive and feedforward reach at low frequencies depends on it. The model's figures for both "
-        "are those of [axis.feedforward] at this amplitude.",
-        "In closed loop, at high frequencies, the command is smaller than the dead band, which reduces the motion "
-        "more than the linear model does.",
+        f"The amplitude is {options.amplitude_um:g} µm. The drive alone is shown as position per volt, relative to "
+        f"{_raw_gain(run):.4g} µm/V, the model's mean gain over the whole drive. A small amplitude does not leave the "
+        "dead band of the hysteresis. Therefore the gains of drive and feedforward at low frequencies depend on the "
+        "amplitude. The model's values of these gains are those of [axis.feedforward] at this amplitude.",
+        "In closed loop, at high frequencies, the command is smaller than the dead band of the hysteresis. The dead "
+        "band makes the motion smaller than in the linear model.",
         "γ² is the part of the power of input and output that is at the excitation's frequency. Harmonics of the "
         "hysteresis lower γ², most where one of them meets the resonance. Noise lowers γ² where the controller's notch "
         f"leaves a very small command. Points below {MIN_COHERENCE:g} are not drawn.",
-        "The models are [axis.model] held over each tick, shifted by the hysteresis at this amplitude, and the loop of "
-        "[axis.controller] and [axis.model] as it runs.",
+        "The dashed model curves are [axis.model] with its input held over each tick, shifted by the gain of the "
+        "hysteresis at this amplitude. The solid model curve is the sampled loop of [axis.controller] and "
+        "[axis.model].",
     ]
     curves = {"found": sweeps, "near_hz": model.near_hz, "modelled": model.curves(shifts_db),
               "claimed": run.specification.claims.get("resonance_hz")}  # fmt: skip
@@ -278,7 +279,8 @@ def unwrap_phases(degrees: Real, mask: Real) -> Real:
 EXPERIMENT = Experiment(
     "harmonic",
     "Harmonic response",
-    "Stepped sines from 0.01 Hz to beyond the resonance: the drive alone, with feedforward, with feedback as well.",
+    "Stepped sines from 0.01 Hz to beyond the resonance, three times: the drive alone, with feedforward, and with "
+    "feedforward and feedback.",
     HarmonicOptions,
     runs,
     analyse,

@@ -135,7 +135,7 @@ def analyse(recordings: Sequence[RecordedRun], options: ResponseOptions) -> Anal
         for name, label, _ in ROWS
         if math.isfinite((margin := getattr(measurement.margins, name)).value)
     ]
-    notes = [f"The position was moved by {moved_um:.3g} µm; the figures are those of a loop that moves as little."]
+    notes = [f"The multisine moved the position by {moved_um:.3g} µm. The figures hold for motions of this size only."]
     if measurement.mode is not None and measurement.mode.misfit > LARGEST_MISFIT:
         notes.append(
             f"The residuals are {measurement.mode.misfit:.2g} times as large as the measurement's uncertainty "
@@ -193,7 +193,7 @@ def draw(figure: Any, curves: Mapping[str, Any], ink: Palette) -> None:
         phase.semilogx(hz, np.degrees(np.unwrap(np.angle(model))), color=ink.model, linewidth=0.8)
         sensitivity.loglog(hz, 1 / np.abs(1 + model), color=ink.model, linewidth=0.8)
     magnitude.set_ylim(bottom=0.3 * float(np.abs(loop).min()))
-    ink.label(magnitude, "", "|L|", "loop, measured in closed loop", legend="lower left")
+    ink.label(magnitude, "", "|L|", "loop gain L, measured in closed loop", legend="lower left")
     ink.label(phase, "", "phase of L / °")
     ink.label(sensitivity, "frequency / Hz", "|S|")
 
@@ -201,7 +201,8 @@ def draw(figure: Any, curves: Mapping[str, Any], ink: Palette) -> None:
 EXPERIMENT = Experiment(
     "response",
     "Loop and margins, measured",
-    "Feedforward and feedback: a small multisine; L, S and their margins with standard deviations.",
+    "A small multisine excites the loop with feedforward and feedback. Results: loop gain L, sensitivity S, and their "
+    "margins with standard deviations.",
     ResponseOptions,
     runs,
     analyse,

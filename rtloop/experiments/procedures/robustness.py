@@ -96,12 +96,12 @@ def analyse(recordings: Sequence[RecordedRun], options: RobustnessOptions) -> An
         tolerance = next_shift_distance(tested_shift, options.shifts_percent, is_downward=end == "lowest")
         rows.append(ordered[0].row("", f"{end} tested shift that settles", "%", tested_shift, model_shift, tolerance))
     tolerated_text = f"; the model tolerates {format_range(tolerated_shifts)}" if tolerated_shifts else ""
-    notes = ["The model's range has the tested shifts with which the sampled loop of [axis.controller] and "
+    notes = ["The model's range consists of the tested shifts for which the sampled loop of [axis.controller] and "
     f"[axis.model] is stable{tolerated_text}. The tolerance is the distance to the next tested shift.",
              "The hysteresis widens the range: within its dead band the command does not reach the actuator, and a "
              "ringing that is small enough dies away by its own damping although the linear loop is unstable. Only a "
              "ringing that leaves the dead band grows, until the interlocks of the configuration trip."]  # fmt: skip
-    headings = ("shift / %", "model", "run", "last fifth, peak to peak / µm", "largest |x| / µm")
+    headings = ("shift / %", "model", "run", "x in the last fifth, peak to peak / µm", "largest |x| / µm")
     curves = {"traces": traces, "outcomes": outcomes, "rate_hz": ordered[0].rate_hz}
     return Analysis(rows, curves, (Table("Every shift", headings, table),), notes)
 

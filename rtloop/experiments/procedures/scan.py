@@ -172,7 +172,7 @@ def analyse(recordings: Sequence[RecordedRun], options: ScanOptions) -> Analysis
         ]
         table.append([f"{hz:g}", *(f"{value:.4f}" for value in percent), f"{1e3 * np.abs(errors[-1]).max():.1f}"])
         traces.append((hz, percent, errors[0], errors[-1]))
-    headings = ("f / Hz", *(f"cycle {cycle}" for cycle in range(len(recordings))), "largest error at the end / nm")
+    headings = ("f / Hz", *(f"cycle {cycle}" for cycle in range(len(recordings))), "largest error, last cycle / nm")
     notes = ["Rms error of the mean of the evaluated periods, as a part of peak to peak. The mean removes noise, "
     "which is not an error of the scan."]  # fmt: skip
     return Analysis(rows, {"traces": traces}, (Table("Error from cycle to cycle, % of peak to peak", headings, table),),
@@ -202,7 +202,8 @@ def draw(figure: Any, curves: Mapping[str, Any], ink: Palette) -> None:
 EXPERIMENT = Experiment(
     "scan",
     "Scans that are learned",
-    "Feedforward and feedback: triangles whose table of reference and command is learned from cycle to cycle.",
+    "Feedforward and feedback follow triangles. A table of the reference and an addition to the command is learned "
+    "from cycle to cycle, to reduce the error.",
     ScanOptions,
     runs,
     analyse,

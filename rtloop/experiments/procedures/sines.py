@@ -79,7 +79,7 @@ def analyse(recordings: Sequence[RecordedRun], options: SinesOptions) -> Analysi
         is_shown = cycles <= SHOWN_CYCLES
         traces.append((hz, cycles[is_shown], setpoint[::step][is_shown], measured[::step][is_shown]))
     headings = ("f / Hz", "rms error / µm", "largest error / µm", "|x/x_d|", "dB", "phase / °", "coherence")
-    notes = ["The model is the loop of [axis.controller] and [axis.model] as sampled, without hysteresis; the "
+    notes = ["The model is the sampled loop of [axis.controller] and [axis.model], without hysteresis. The "
              "hysteresis adds to the error at low frequencies."]  # fmt: skip
     return Analysis(rows, {"traces": traces}, (Table("Every frequency", headings, table),), notes)
 

@@ -182,13 +182,13 @@ def draw(figure: Any, curves: Mapping[str, Any], ink: Palette) -> None:
     overview.set_xlim(0, 1e3 * SHOWN_S)
     zoom.set_xlim(0, curves["zoom_ms"])
     ink.label(overview, "time since the step / ms", "position x / µm", "a step of the drive", legend="lower right")
-    ink.label(zoom, "time since the step / ms", "", "its beginning")
+    ink.label(zoom, "time since the step / ms", "", "beginning of the response")
 
 
 EXPERIMENT = Experiment(
     "step-response",
     "Open-loop step",
-    "The whole drive at once, without any controller: a damped ringing.",
+    "The drive makes one step to its limit, without any controller. The position answers with a damped ringing.",
     StepResponseOptions,
     runs,
     analyse,

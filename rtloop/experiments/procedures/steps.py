@@ -68,7 +68,7 @@ def analyse(recordings: Sequence[RecordedRun], _: StepsOptions) -> Analysis:
     reference, position, command, drive = run.read("reference_um", "position_um", "command_um", "drive_v")
     measured_steps = _evaluate_steps(run, reference, position, command)
     if not measured_steps:
-        raise UnsuitableData("no step to evaluate: no level differs from the one before, or none lasts long enough")
+        raise UnsuitableData("no step to evaluate: every level equals the level before it, or is too short")
     median_figures = np.median([step.figures for step in measured_steps], axis=0)
     start = run.segments_labelled("rest")[0].start_tick
     model_signals = run.model.closed_response(reference[start:]) if run.model else None
@@ -108,10 +108,10 @@ def analyse(recordings: Sequence[RecordedRun], _: StepsOptions) -> Analysis:
         "asked_ms": run.specification.settling_ms,
         "claimed": run.specification.claims.get("settling_ms"),
     }
-    notes = ["The model is the loop of [axis.controller] and [axis.model] as sampled, given the recorded reference, "
-             "without hysteresis: the remaining hysteresis makes smaller steps ring longer.",
-             "The static error is the mean of the last fifth of a level against the reference: in a short level, a "
-             "slow pole and the hysteresis have not settled."]  # fmt: skip
+    notes = ["The model is the sampled loop of [axis.controller] and [axis.model] with the recorded reference, without "
+             "hysteresis. The remaining hysteresis makes smaller steps ring longer.",
+             "The static error is the difference between the reference and the mean position in the last fifth of a "
+             "level. In a short level, a slow pole and the hysteresis have not settled."]  # fmt: skip
     return Analysis(rows, curves, (_steps_table(measured_steps),), notes)
 
 

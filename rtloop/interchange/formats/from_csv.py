@@ -154,8 +154,8 @@ def _require_even_rows(path: Path, dialect: CsvDialect, without_last: np.ndarray
 
 
 def _uneven_row_message(line: int, columns: int, dialect: CsvDialect) -> str:
-    """Return the message for a line, counted from 1, with another number of columns than the first."""
-    allowed = f"allowed: {len(dialect.names)}, as in the first line"
+    """Return the message for a line, counted from 1, with another number of columns than most lines."""
+    allowed = f"allowed: {len(dialect.names)}, as in most lines"
     return f"line {line} has {count_text(columns, 'column')}; {allowed}"
 
 

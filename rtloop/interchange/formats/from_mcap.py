@@ -160,7 +160,9 @@ class _TopicReader:
     def _add_column(self, name: str) -> Real:
         """Add a column filled with NaN, and return it. Raises UnreadableData beyond the memory limit."""
         if (len(self._columns) + 1) * self._rows * 8 > MAX_GROWTH * self._contents.bytes[self._topic] + SPARE_BYTES:
-            reason = f"more than {len(self._columns)} different fields in {self._rows} messages, each with few of them"
-            raise UnreadableData(f"{self._location}: not a table: {reason}")
+            raise UnreadableData(
+                f"{self._location}: not a table: {self._rows} messages have more than {len(self._columns)} different "
+                "fields, and each message has few of them"
+            )
         self._columns[name] = np.full(self._rows, np.nan)
         return self._columns[name]

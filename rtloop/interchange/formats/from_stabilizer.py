@@ -37,8 +37,7 @@ def read_stabilizer(path: Path) -> Table:
         size = os.fstat(file.fileno()).st_size
         if len(head) == 0 or head[0]["format"] != ADC_DAC_FORMAT or head[0]["samples"] == 0:
             raise UnreadableData(
-                f"{path}: not a stream of Stabilizer in format 1, which contains the codes of ADC and DAC; allowed: "
-                "format 1 only"
+                f"{path}: not a Stabilizer stream of format 1 (codes of ADC and DAC); allowed: format 1 only"
             )
         columns = FileColumns(path)
         columns.require_room("the stream", (size // 2,))
@@ -64,7 +63,7 @@ def read_stabilizer(path: Path) -> Table:
     lost = int(np.sum(steps[1:] - batches)) // batches
     about = {
         "lost frames": str(lost),
-        "sample period": f"{SAMPLE_PERIOD_S * 1e6:g} µs assumed; for another period: --time 'sample * 2.56 µs'",
+        "sample period": f"{SAMPLE_PERIOD_S * 1e6:g} µs is assumed; for another period, use --time 'sample * 2.56 µs'",
     }
     return Table(columns.columns, columns.units, "time", about)
 

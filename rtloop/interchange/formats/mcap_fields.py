@@ -79,7 +79,7 @@ def _double(value: float) -> float:
     try:
         return float(value)
     except OverflowError:
-        raise DecodingError("an integer is too large") from None
+        raise DecodingError("an integer is too large for a 64-bit float") from None
 
 
 def _items(values: Any) -> Iterator[tuple[str, Any]]:
@@ -150,7 +150,7 @@ def _protobuf(schema: Schema) -> Callable[[bytes], Fields]:
         try:
             return _flat(kind.FromString(payload), children)
         except (DecodeError, RecursionError):
-            raise DecodingError("contents do not fit the schema") from None
+            raise DecodingError("the contents do not match the schema of the message") from None
 
     return decode
 
@@ -184,7 +184,7 @@ def _ros2(schema: Schema) -> Callable[[bytes], Fields]:
         except DecodingError:
             raise
         except Exception:
-            raise DecodingError("contents do not fit the schema") from None
+            raise DecodingError("the contents do not match the schema of the message") from None
 
     return decode
 

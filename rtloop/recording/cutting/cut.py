@@ -120,7 +120,8 @@ def cut(
         problems = [*source.problems]
         if copy.unexplained_ticks:
             problems.append(
-                f"{copy.unexplained_ticks} recorded ticks are missing: damaged, or in a file that was not given"
+                f"{copy.unexplained_ticks} recorded ticks are missing: they are damaged, or in a file of the run that "
+                "was not given"
             )
         return {
             "recording": str(source.path),

@@ -249,8 +249,8 @@ class _Conversion:
         if self._last_tick < 0:
             writer.start_unix_ns = start_ns
         if ticks.first <= self._last_tick:
-            raise DamagedChunk(f"out of order: tick {ticks.first} after {self._last_tick}")
+            raise DamagedChunk(f"ticks out of order: tick {ticks.first} after tick {self._last_tick}")
         if start_ns != writer.start_unix_ns:
-            raise DamagedChunk("log times contradict the deadlines")
+            raise DamagedChunk("the log times of the ticks do not match their deadlines")
         self._last_tick = ticks.last
         writer.write_ticks(ticks.rows)

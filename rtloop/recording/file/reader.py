@@ -238,7 +238,7 @@ class Reader:
         intervals = self.overview_intervals(self._messages(format.OVERVIEW))
         is_plausible = are_plausible(intervals)
         if not is_plausible.all():
-            self._report("an overview covers no ticks, or ticks that another overview covers")
+            self._report("an overview of omitted ticks covers no ticks, or ticks of another overview")
         return intervals[is_plausible]
 
     def overview_intervals(self, messages: Iterable[Message]) -> Intervals:

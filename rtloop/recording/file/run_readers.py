@@ -102,7 +102,7 @@ def _require_one_run(readers: Sequence[Reader]) -> None:
     first, numbers = readers[0], [_sequence(reader) for reader in readers]
     for reader in readers[1:]:
         if any(reader.header.get(key) != first.header.get(key) for key in RUN_KEYS):
-            raise RecordingError(f"{reader.path}: not of the same run as {first.path}")
+            raise RecordingError(f"{reader.path}: not of the same run as {first.path}; give only files of one run")
     for reader, number, next_number in zip(readers[1:], numbers, numbers[1:], strict=False):
         if number == next_number:
             raise RecordingError(f"{reader.path}: file {number} of the run is given twice; give only one of the two")

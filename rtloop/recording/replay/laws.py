@@ -62,7 +62,8 @@ def require_law(recording: Recording) -> None:
     if "imported" in recording.header:
         raise RecordingError(
             f"{recording.paths[0]}: nothing to replay; the recording holds signals imported from "
-            f"{recording.header['imported']['file']}, and no law. Use info, plot, export, cut or identify"
+            f"{recording.header['imported']['file']}, and no law. Use `rtloop info`, `plot`, `export`, `cut` or "
+            "`identify`"
         )
 
 
@@ -91,7 +92,7 @@ def _find_law(entry: Mapping[str, Any], recording: Recording, trust: TrustedLaws
     location = f"{recording.paths[0]}: law {name!r}"
     if digest is None:
         if name not in BUILT_IN:
-            raise RecordingError(f"{location}: not a law of this version; there are {', '.join(BUILT_IN)}")
+            raise RecordingError(f"{location}: not a law of this version of rtloop; its laws: {', '.join(BUILT_IN)}")
         return LawReference(name)
     for law in (*trust.files, *_installed_laws(name)):
         if law.kind == name and law.sha256 == digest:

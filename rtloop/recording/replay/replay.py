@@ -213,7 +213,7 @@ class Replay:
         for snapshot in [] if self._next_snapshot is None else [self._next_snapshot, *self._snapshots]:
             if last and last["result"] != RECOVERED and snapshot.tick > last["ticks_executed"]:
                 self.report.add_unverified(
-                    None, None, f"a snapshot of the law at tick {snapshot.tick}, after the end of the run"
+                    None, None, f"a snapshot of the law at tick {snapshot.tick} is after the end of the run"
                 )
         self._report_unreadable()
         if last is None:

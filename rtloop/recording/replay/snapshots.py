@@ -29,7 +29,7 @@ def first_difference(recorded: bytes, replayed: bytes, axes: Sequence[str], law:
             )
             place = name if len(pairs) == 1 else f"{name}[{index}]"
             return place, pairs[index][0].item(), pairs[index][1].item()
-    return "law, bytes that belong to no field", None, None
+    return "bytes of the law that belong to no field", None, None
 
 
 def _snapshot_fields(axes: Sequence[str], law: LawMemory) -> Iterator[tuple[str, np.dtype[Any], int]]:

@@ -82,9 +82,10 @@ def unjudged_contents(header: Mapping[str, Any]) -> list[str]:
     measured_names = ", ".join(signals.COMMON_SIGNALS[column].name for column in signals.MEASURED_COLUMNS)
     return [
         f"measured times: {measured_names}, flag OVERRUN, rate_hz, host",
-        "inputs as far as no output depends on them: adc_v, reference_um, feed_um, deadline_ns, periods_missed, "
+        "inputs, where no output depends on them: adc_v, reference_um, feed_um, deadline_ns, periods_missed, "
         "sample_age_us, enable_v",
         f"observed signals: {', '.join(header['observed']) or 'there are none'}",
-        "events but for the commands that the law obeys: generators of references, texts, who, time_ns, identity",
+        "events other than commands to the law, such as generators of references; texts, who, time_ns and identity of "
+        "events",
         "the state that the first snapshot starts from; the configuration's text",
     ]

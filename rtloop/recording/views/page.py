@@ -57,7 +57,8 @@ def _page_subtitle(drawing: DrawnRecording) -> str:
     """File name, host and number of points as text."""
     recording, host = drawing.recording, drawing.recording.header.get("host", {})
     has_lines = all(band.is_line for band in drawing.bands.values())
-    points = f"{len(drawing.time_s):,} points, {'every tick' if has_lines else 'each with the extremes of its ticks'}"
+    content = "one for every tick" if has_lines else "each with the least and largest value of its ticks"
+    points = f"{len(drawing.time_s):,} points, {content}"
     parts = [recording.paths[0].name, host.get("cpu"), host.get("kernel"), points]
     return " · ".join(filter(None, parts))
 

@@ -76,9 +76,9 @@ class McapSource:
             raise RecordingError(f"{path}: {error.strerror}") from None
         if magic != MAGIC:
             self.close()
-            description = (
-                "an empty file" if not magic else "cut off in its first bytes" if MAGIC.startswith(magic) else ""
-            )
+            description = ""
+            if MAGIC.startswith(magic):
+                description = "a file that is cut off in its first bytes" if magic else "an empty file"
             if magic and path.suffix == ".toml":
                 description = "a text in TOML; `rtloop check` reads configurations, `rtloop design` specifications"
             raise RecordingError(f"{path}: not a recording: {description or 'not an MCAP file'}")
@@ -103,7 +103,7 @@ class McapSource:
 def _file_name_hint(path: Path) -> str:
     """Return ", but there is …" with the finished file of a missing unfinished one, or the reverse; "" without it."""
     if path.suffix == ".part" and path.with_suffix("").exists():
-        return f", but there is {path.with_suffix('').name}, finished or recovered meanwhile"
+        return f", but there is {path.with_suffix('').name}, which was finished or recovered meanwhile"
     part = path.with_name(path.name + ".part")
     return f", but there is {part.name}, left from an unfinished run" if part.exists() else ""
 

@@ -137,7 +137,7 @@ def unpack_chunk(record: bytes) -> bytes:
     try:
         # The size in the frame is checked first, so that a damaged frame cannot allocate all the memory.
         if zstandard.get_frame_parameters(data).content_size != head.uncompressed:
-            raise DamagedChunk("the sizes contradict each other")
+            raise DamagedChunk("the compressed data and the header give different sizes")
         content = _decompressors.of_thread.decompress(data)
     except zstandard.ZstdError:
         raise DamagedChunk("cannot be decompressed") from None

@@ -76,7 +76,7 @@ def read_chunk(source: McapSource, entry: ChunkEntry) -> bytes:
     if entry.index:
         head = parse_chunk_head(record)
         if (head.start, head.end, head.uncompressed) != (entry.index.start, entry.index.end, entry.index.uncompressed):
-            raise DamagedChunk("the content contradicts the index")
+            raise DamagedChunk("the times or the size in its header differ from the index")
     return record
 
 

@@ -89,7 +89,7 @@ class TickLayout:
         if check < len(columns) + 2:
             name, values = columns[check - len(columns)], integers[:, check - len(columns)]
             return f"out of order: {name} {values[row]:g} after {values[row - 1]:g}"
-        return "log times contradict the deadlines"
+        return "the log times of the ticks do not match their deadlines"
 
     def start_ns(self, content: bytes) -> int:
         """Start of the run, in ns since the UNIX epoch, computed from a chunk of ticks.

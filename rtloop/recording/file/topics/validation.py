@@ -326,7 +326,7 @@ def parse_event(payload: bytes, axes: Sequence[str]) -> Event:
         raise MalformedText(f"axis: {_shorten(event['axis'])}; allowed: null, {', '.join(axes)}")
     if (model := _RECORDER_DETAILS.get(kind)) is not None:
         if event["who"] != RECORDER:
-            raise MalformedText(f"event {kind}: its field who is {_shorten(event['who'])}; allowed: {RECORDER}")
+            raise MalformedText(f"event {kind}: the field who is {_shorten(event['who'])}; allowed: {RECORDER}")
         _validate(model, details, "what.")
         return event
     if not is_kind_name(kind):
@@ -336,7 +336,7 @@ def parse_event(payload: bytes, axes: Sequence[str]) -> Event:
             "for a kind that this version does not know"
         )
     if not is_member_name(Origin, event["who"]) and (fault := name_problem(event["who"])):
-        raise MalformedText(f"event {kind}: its field who: {fault}")
+        raise MalformedText(f"event {kind}: the field who: {fault}")
     _validate(_MessageDetails, details, "what.")
     _require_command(kind, event["axis"], [_command_value(value) for value in details["values"]])
     return event
@@ -363,12 +363,12 @@ def _require_command(kind: str, axis: str | None, values: list[float]) -> None:
     allowed_values = {"set_mode": [*Mode], "set_reference": [*Generator], "load_law": [0, 1]}.get(kind)
     if allowed_values and first not in allowed_values:
         numbers = ", ".join(f"{value:d}" for value in allowed_values)
-        raise MalformedText(f"{kind}: the first of its numbers (what.values) is {first:g}; allowed: {numbers}")
+        raise MalformedText(f"event {kind}: the first number in what.values is {first:g}; allowed: {numbers}")
     minima = {Generator.TABLE: (0, 1, 1), Generator.INPUT: (0,)}.get(first, ()) if kind == "set_reference" else ()  # type: ignore[call-overload]
     for minimum, value in zip(minima, parameters, strict=False):
         if not (value.is_integer() and minimum <= value <= LARGEST_TICK):
             raise MalformedText(
-                f"{kind}: one of its numbers (what.values) is {value:g}; allowed: a whole number, {minimum} or more"
+                f"event {kind}: a number in what.values is {value:g}; allowed: a whole number, {minimum} or more"
             )
 
 
