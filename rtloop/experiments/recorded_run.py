@@ -144,8 +144,8 @@ class RecordedRun:
         end_tick = self._ticks[-1] + 1 if self._ticks.size else 0
         if end_tick < self.planned_ticks:
             raise UnsuitableData(
-                f"{self._label_prefix}the run ended after {end_tick / self.rate_hz:.1f} s of the planned "
-                f"{self.planned_ticks / self.rate_hz:g} s; not analysed"
+                f"{self._label_prefix}the run ended after {end_tick} of the planned {self.planned_ticks} ticks "
+                f"({end_tick / self.rate_hz:g} of {self.planned_ticks / self.rate_hz:g} s); not analysed"
             )
         if not self._may_trip and (clipping := clipping_text(self._flags())):
             raise UnsuitableData(

@@ -42,6 +42,8 @@ def read_table(path: Path, group: str | None = None) -> Table:
         table = _receive_table(path, cast("IO[bytes]", process.stdout))
     if table is None:
         number = -process.returncode
+        if number == signal.SIGKILL:
+            raise UnreadableData(f"{path}: the process that read the file was killed; free some memory, and try again")
         cause = signal.Signals(number).name if number > 0 else f"exit code {process.returncode}"
         raise UnreadableData(f"{path}: the file is damaged; the library that reads such files crashed ({cause})")
     return table

@@ -45,9 +45,10 @@ def print_replay(out: Console, path: Path, report: ReplayReport) -> None:
     elif difference is None:
         out.print(f"[red]not verified as a whole[/]: {name}: no difference in {extent} compared in bytes")
     else:
-        values = f"recorded {difference['recorded']!r}, replayed {difference['replayed']!r}"
         place = f"tick {difference['tick']}, {difference['signal']}"
-        out.print(f"[red]different[/]: {name}: {place}: {values} ({extent} compared)")
+        if (difference["recorded"], difference["replayed"]) != (None, None):
+            place += f": recorded {difference['recorded']!r}, replayed {difference['replayed']!r}"
+        out.print(f"[red]different[/]: {name}: {place} ({extent} compared)")
     out.print(f"not judged: {'; '.join(report.not_judged)}")
 
 

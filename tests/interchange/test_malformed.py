@@ -12,7 +12,7 @@ import pytest
 import scipy.io
 from scipy.io import savemat
 
-from rtloop.interchange import isolated_reader as aside
+from rtloop.interchange import isolated_reader
 from rtloop.interchange.formats import from_mat
 from rtloop.interchange.formats.table import UnreadableData
 from rtloop.interchange.reading import read_in_process
@@ -94,19 +94,28 @@ def test_a_library_that_crashes_is_an_error_of_the_file(tmp_path: Path, monkeypa
     (tmp_path / "sitecustomize.py").write_text("import os\nos.kill(os.getpid(), 11)\n")
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
     with pytest.raises(UnreadableData, match=r"scan.mat: the file is damaged; .* \(SIGSEGV\)"):
-        aside.read_table(tmp_path / "scan.mat")
+        isolated_reader.read_table(tmp_path / "scan.mat")
 
 
-def test_a_process_aside_reads_the_same(tmp_path: Path):
+def test_a_killed_reader_is_no_fault_of_the_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    reader = tmp_path / "reader"
+    reader.write_text("#!/bin/sh\nkill -9 $$\n")
+    reader.chmod(0o700)
+    monkeypatch.setattr(isolated_reader.sys, "executable", str(reader))
+    with pytest.raises(UnreadableData, match=r"scan\.mat: the process that read the file was killed; free some memory"):
+        isolated_reader.read_table(tmp_path / "scan.mat")
+
+
+def test_an_isolated_process_reads_the_same(tmp_path: Path):
     numbers = np.random.default_rng(3).normal(size=100_000)
     savemat(tmp_path / "scan.mat", {"t": np.arange(100_000.0), "u": numbers})
-    table, expected = aside.read_table(tmp_path / "scan.mat"), read_in_process(tmp_path / "scan.mat")
+    table, expected = isolated_reader.read_table(tmp_path / "scan.mat"), read_in_process(tmp_path / "scan.mat")
     assert {name: values.tobytes() for name, values in table.columns.items()} == {
         name: values.tobytes() for name, values in expected.columns.items()
     }
     assert (table.time, dict(table.about)) == (expected.time, dict(expected.about))
     with pytest.raises(UnreadableData, match="no group 'x'"):
-        aside.read_table(tmp_path / "scan.mat", "x")
+        isolated_reader.read_table(tmp_path / "scan.mat", "x")
 
 
 def main() -> None:

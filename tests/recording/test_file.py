@@ -182,6 +182,14 @@ def test_the_file_is_finished_well_at_the_minimum_of_free_space(tmp_path: Path, 
         assert (reader.totals["ticks_executed"], reader.totals["ticks_logged"]) == (len(rows), 2000)
 
 
+def test_a_new_file_says_what_room_it_needs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("os.statvfs", lambda _: SimpleNamespace(f_frsize=1 << 20, f_bavail=520))
+    need = "520 MiB are free; at least 500 MiB must stay free, and a new file needs 32 MiB"
+    with pytest.raises(OutputError, match=need):
+        Writer(tmp_path / "run.mcap", make_header(), 1, min_free_bytes=500 << 20, room_bytes=32 << 20)
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_a_growing_file_needs_little_memory_for_each_chunk(tmp_path: Path):
     """A day without rotation is 350 000 chunks."""
     chunks = 400

@@ -116,6 +116,8 @@ def test_shapes_that_do_not_fit_are_refused(numbers, bounds, times) -> None:
 
 CHANGES = {
     "flags: 0.5; allowed: a whole number from 0 to 4.29497e+09": ("flags", 2, 0.5),
+    "tick: 1234567.5; allowed: a whole number from 0 to ": ("tick", 2, 1234567.5),
+    "out of order: tick 7 after 1234567": ("tick", 0, 1234567.0),
     "out of order: tick 6 after 6": ("tick", 1, 6.0),
     "out of order: deadline_ns 200 after 250": ("deadline_ns", 1, 250.0),
     "the log times of the ticks do not match their deadlines": ("_log_time", 1, 3),

@@ -218,6 +218,8 @@ class Writer:
         if self._min_free_bytes == 0:
             raise OutputError(f"{self.path}: {os.strerror(errno.ENOSPC)}", errno.ENOSPC)
         requirement = f"at least {self._min_free_bytes >> 20} MiB must stay free"
+        if room_bytes:
+            requirement += f", and a new file needs {room_bytes >> 20} MiB"
         raise OutputError(f"{self.path}: {free_bytes >> 20} MiB are free; {requirement}", LOW_SPACE)
 
 

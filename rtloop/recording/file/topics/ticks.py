@@ -88,7 +88,7 @@ class TickLayout:
             return integer_problem(columns[check], integers[row : row + 1, check]) or ""
         if check < len(columns) + 2:
             name, values = columns[check - len(columns)], integers[:, check - len(columns)]
-            return f"out of order: {name} {values[row]:g} after {values[row - 1]:g}"
+            return f"out of order: {name} {values[row]:.0f} after {values[row - 1]:.0f}"
         return "the log times of the ticks do not match their deadlines"
 
     def start_ns(self, content: bytes) -> int:
@@ -120,4 +120,4 @@ def integer_problem(name: str, values: Real) -> str | None:
     is_valid = (values >= low) & (values <= high) & (values == np.floor(values))
     if is_valid.all():
         return None
-    return f"{name}: {float(values[np.argmin(is_valid)]):g}; allowed: a whole number from {low:g} to {high:g}"
+    return f"{name}: {values[np.argmin(is_valid)]:.17g}; allowed: a whole number from {low:g} to {high:g}"
