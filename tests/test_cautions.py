@@ -233,10 +233,10 @@ def test_weights_far_beyond_the_sensor_are_not_judged_on_hardware(tmp_path: Path
 @pytest.mark.parametrize(
     ("low_v", "high_v", "said"),
     [
-        (-10.0, 10.0, " or -9.99 … 9.99 V at the sensor"),
-        (0.0, 10.0, " or above 9.99 V at the sensor, which reads 0 … 10 V"),
-        (-10.0, 5.0, " or below -9.99 V at the sensor, which reads -10 … 5 V"),
-        (0.0, 5.0, ", never at the sensor, which reads 0 … 5 V"),
+        (-10.0, 10.0, " or outside -9.99 … 9.99 V at the sensor"),
+        (0.0, 10.0, " or above 9.99 V at the sensor, whose input reads 0 … 10 V"),
+        (-10.0, 5.0, " or below -9.99 V at the sensor, whose input reads -10 … 5 V"),
+        (0.0, 5.0, ", at no voltage of the sensor, whose input reads 0 … 5 V"),
     ],
 )
 def test_limits_that_the_input_cannot_read_are_not_shown(low_v: float, high_v: float, said: str) -> None:
@@ -245,4 +245,4 @@ def test_limits_that_the_input_cannot_read_are_not_shown(low_v: float, high_v: f
     out = Console(file=io.StringIO(), width=300)
     judgement = AxisJudgement(axis, replace(check, law=None, on_model=None), {}, None, None, None)
     print_axis(out, judgement, Channel("adc0", low_v, high_v))
-    assert f"trips beyond ±60 µm{said}\n" in out.file.getvalue()
+    assert f"the loop trips beyond ±60 µm{said}\n" in out.file.getvalue()

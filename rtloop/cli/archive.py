@@ -32,10 +32,20 @@ def _add_options(command: Any) -> Any:
     for option in (
         JSON,
         click.option(
-            "--out", type=OUTPUT, help="Folder that stores each verdict, where the same command continues [none]."
+            "--out",
+            type=OUTPUT,
+            help="Folder for the verdicts, from which the same command continues after a stop.  [default: none]",
         ),
-        click.option("--scheduler", metavar="ADDRESS", help="Dask scheduler in place of processes: tcp://HOST:8786."),
-        click.option("--jobs", type=click.IntRange(1, 1024), help="Worker processes [one for each processor]."),
+        click.option(
+            "--scheduler",
+            metavar="ADDRESS",
+            help="Address of a Dask scheduler, such as tcp://HOST:8786, whose workers replace the local processes.",
+        ),
+        click.option(
+            "--jobs",
+            type=click.IntRange(1, 1024),
+            help="Number of worker processes.  [default: one for each processor]",
+        ),
         click.argument("patterns", metavar="PATTERN...", type=OUTPUT, nargs=-1, required=True),
     ):
         command = option(command)
@@ -121,8 +131,10 @@ def _examine(
             workers.close()
     print_result(report, as_json, lambda report: _print_report(report, examination.columns, examination.good_verdict))
     if report["pending"]:
-        remedy = ": the same command continues" if out else "; use --out FOLDER to continue later"
-        click.echo(f"stopped, {count_text(report['pending'], 'recording')} not examined yet{remedy}", err=True)
+        remedy = (
+            "To continue, run the same command again" if out else "Without --out FOLDER, the same command begins again"
+        )
+        click.echo(f"stopped, {count_text(report['pending'], 'recording')} not examined yet. {remedy}", err=True)
         return STOPPED
     return LoopFault.exit_code if set(report["counts"]) - {examination.good_verdict} else 0
 

@@ -25,11 +25,17 @@ if TYPE_CHECKING:
 @click.argument("hysteresis", metavar="HYST", type=OUTPUT)
 @click.argument("step", metavar="STEP", type=OUTPUT)
 @click.option("--specs", type=OUTPUT, required=True, help="Specification of the loop; its [plant] is not used.")
-@click.option("--out", type=OUTPUT, required=True, help="The configuration to write, never over an existing file.")
-@AXIS
-@click.option("--order", type=click.IntRange(1, 20), help="Number of poles of the dynamics [searched].")
 @click.option(
-    "--robust", is_flag=True, help="Damp the resonance, and make the pre-filter's taps: minutes instead of seconds."
+    "--out", type=OUTPUT, required=True, help="Configuration file to write; an existing file is not overwritten."
+)
+@AXIS
+@click.option(
+    "--order", type=click.IntRange(1, 20), help="Number of poles of the dynamics.  [default: found by a search]"
+)
+@click.option(
+    "--robust",
+    is_flag=True,
+    help="Design a controller that damps the resonance, and the taps of the pre-filter; takes minutes, not seconds.",
 )
 @JSON
 @report_errors
@@ -58,9 +64,8 @@ def auto(
         print_taps(loop.taps, loop.subject)
         controller_percent, options = loop.design.scenarios.resonance_percent, loop.subject.options
         figures = (
-            f"controller for resonances within ±{controller_percent:g} % of the model's, {options.taps} taps per "
-            "row for "
-            f"resonances within ±{options.scenarios.resonance_percent:g} %"
+            f"the controller damps resonances within ±{controller_percent:g} % of the model's; the pre-filter has "
+            f"{options.taps} taps in each row, for resonances within ±{options.scenarios.resonance_percent:g} %"
         )
         stage = loop.stage
     else:
@@ -68,12 +73,12 @@ def auto(
         synthesis, stage = chain.synthesis, chain.stage
         synthesised_norm = synthesis.achieved
         figures = (
-            f"controller of order {synthesis.controller.order}, ‖F_l(P, C)‖∞ {synthesised_norm:.4g} on the model with "
-            "its delay"
+            f"controller of order {synthesis.controller.order}; ‖F_l(P, C)‖∞, the norm of the weighted closed loop, is "
+            f"{synthesised_norm:.4g} on the model with its delay"
         )
-    click.echo(f"{out} is written. Identified: {stage.describe()}; {figures}", err=True)
+    click.echo(f"{out} is written. Identified: {stage.describe()}. Designed: {figures}", err=True)
     reference = describe_reference(reference_values(stage, axis))
-    click.echo(f"[axis.reference] of {out}: {reference}; they replace the excitation of the recordings", err=True)
+    click.echo(f"[axis.reference] of {out}: {reference}. These steps replace the recordings' excitation", err=True)
     code = verify_configuration(out, None, None, as_json)
     if code and synthesised_norm > 1:
         click.echo(

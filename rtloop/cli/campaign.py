@@ -27,16 +27,22 @@ if TYPE_CHECKING:
     from rtloop.campaigns.workers import Workers
 
 CAMPAIGN = click.argument("campaign", type=OUTPUT)
-FOLDER = click.option("--out", type=OUTPUT, help="Folder of the results [campaigns/CAMPAIGN-CONFIG].")
+FOLDER = click.option("--out", type=OUTPUT, help="Folder of the results.  [default: campaigns/CAMPAIGN-CONFIG]")
 CONFIGURATION = click.option(
-    "--config", type=OUTPUT, help="Configuration in place of that of CAMPAIGN, for a comparison on the same rigs."
+    "--config", type=OUTPUT, help="Configuration that replaces the one in CAMPAIGN, to compare both on the same rigs."
 )
-RIGS = click.option("--rigs", type=click.IntRange(1, 10_000_000), help="Number of sampled rigs [that of CAMPAIGN].")
+RIGS = click.option(
+    "--rigs", type=click.IntRange(1, 10_000_000), help="Number of sampled rigs.  [default: the number in CAMPAIGN]"
+)
 PAGE = click.option("--page", type=OUTPUT, help="Write the report to this file, too, as one HTML page.")
 WORKERS = (
-    click.option("--jobs", type=click.IntRange(1, 1024), help="Worker processes [one for each processor]."),
     click.option(
-        "--scheduler", metavar="ADDRESS", help="Dask scheduler in place of processes, such as tcp://HOST:8786."
+        "--jobs", type=click.IntRange(1, 1024), help="Number of worker processes.  [default: one for each processor]"
+    ),
+    click.option(
+        "--scheduler",
+        metavar="ADDRESS",
+        help="Address of a Dask scheduler, such as tcp://HOST:8786, whose workers replace the local processes.",
     ),
 )
 STOPPED = 130
@@ -118,7 +124,7 @@ def run(
             click.echo(f"{loaded.name}: {count} on {workers.name}; {folder}", err=True)
             is_complete = run_campaign(loaded, folder, workers, view.show, lambda: interruption.requested)
     if not is_complete:
-        click.echo(f"stopped; results are in {folder}: the same command continues", err=True)
+        click.echo(f"stopped; the results so far are in {folder}. To continue, run the same command again", err=True)
         return STOPPED
     return _report(folder, loaded.options.keep_worst, as_json, page)
 
@@ -169,7 +175,7 @@ def rerun(
     loaded = load_campaign(campaign, rigs, config)
     runner, folder = CaseRunner(loaded), out or default_folder(loaded)
     if rig > loaded.options.rigs:
-        raise click.UsageError(f"RIG: {rig}; allowed: 0 … {loaded.options.rigs}; --rigs allows more")
+        raise click.UsageError(f"RIG: value is {rig}; allowed: 0 … {loaded.options.rigs}. For more rigs, use --rigs")
     case = runner.run(rig)
     with open_store(folder, loaded, runner.sample_values(0)) as store:
         is_equal = store.equals(case)
@@ -270,11 +276,11 @@ def _print_summary(summary: CampaignSummary, folder: Path) -> None:
         if list((folder / "worst").glob("*.mcap")):
             out.print(f"recordings: {escape(folder / 'worst')}")
     for rig in summary.crashed:
-        out.print(f"[red]rig {rig}[/]: the worker process died each time that this rig ran; counted as failed")
+        out.print(f"[red]rig {rig}[/]: the worker process died each time that this rig ran; the rig counts as failed")
     for rig, text in summary.refused[:5]:
-        out.print(f"[yellow]rig {rig}[/]: not possible, not counted: {escape(text)}")
+        out.print(f"[yellow]rig {rig}[/] cannot run and is not counted: {escape(text)}")
     if len(summary.refused) > 5:
-        out.print(f"[yellow]and {len(summary.refused) - 5} more rigs that are not possible[/]")
+        out.print(f"[yellow]and {len(summary.refused) - 5} more rigs that cannot run[/]")
 
 
 def value_text(value: Any) -> str:

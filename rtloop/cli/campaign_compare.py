@@ -59,8 +59,8 @@ def _print_comparison(comparison: Comparison) -> None:
             f"(95 % interval {100 * estimate.low:.2f} … {100 * estimate.high:.2f} %)"
         )
     out.print(
-        f"passed by {first} alone: {comparison.only_first:,} rigs; by {second} alone: {comparison.only_second:,} rigs; "
-        f"p = {comparison.p_value:.3g} if both were equally good"
+        f"rigs that pass only with {first}: {comparison.only_first:,}; only with {second}: {comparison.only_second:,}. "
+        f"If both were equally good, the probability of such a difference would be p = {comparison.p_value:.3g}"
     )
     rows = [
         (

@@ -32,10 +32,19 @@ if TYPE_CHECKING:
 @FOLDER
 @worker_options
 @click.option(
-    "--rigs", default=1000, show_default=True, type=click.IntRange(1, 10_000_000), help="Rigs that are tried."
+    "--rigs", default=1000, show_default=True, type=click.IntRange(1, 10_000_000), help="Number of rigs that are tried."
 )
-@click.option("--figure", default="", help="Figure that is maximised [the largest figure in parts of its limit].")
-@click.option("--target", type=float, default=float("inf"), help="End once the figure reaches this value.")
+@click.option(
+    "--figure",
+    default="",
+    help="Figure that the search maximises.  [default: the largest ratio of a figure to its limit]",
+)
+@click.option(
+    "--target",
+    type=float,
+    default=float("inf"),
+    help="End the search once the figure reaches this value.  [default: no target]",
+)
 @click.option("--record", is_flag=True, help="Record the worst rig in FOLDER/worst.")
 @JSON
 @report_errors
@@ -79,7 +88,12 @@ def search(
 @click.argument("key")
 @CONFIGURATION
 @worker_options
-@click.option("--tolerance", default=0.0, type=click.FloatRange(0.0), help="Width of the last step, in the key's unit.")
+@click.option(
+    "--tolerance",
+    default=0.0,
+    type=click.FloatRange(0.0),
+    help="Accuracy of the ends of the range, in the unit of KEY; 0: as fine as the search can.",
+)
 @JSON
 @report_errors
 def boundary(

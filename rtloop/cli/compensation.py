@@ -25,13 +25,13 @@ RANDOM_COMMANDS = 20_000
     "--actuator",
     type=OUTPUT,
     required=True,
-    help="File with the actuator's [axis.feedforward], from another recording than CONFIG's inverse.",
+    help="File with the actuator's [axis.feedforward], identified from another recording than the inverse of CONFIG.",
 )
-@click.option("--axis", help="Name of the axis [the first one].")
+@click.option("--axis", help="Name of the axis.  [default: the first axis]")
 @click.option(
     "--command-um",
     type=click.FloatRange(0, min_open=True),
-    help="Largest command |v|, in µm, for bound and simulation [limits.command_um].",
+    help="Largest command |v|, in µm, for the bound and the simulation.  [default: limits.command_um]",
 )
 @PLOT
 @JSON
@@ -126,17 +126,19 @@ def _print_compensation(report: dict[str, Any]) -> None:
     out.print(f"|v| ≤ {report['command_um']:g} µm: largest |Ω| = |y − ρ v|, bound ξ and simulated")
     out.print(rows)
     out.print(
-        f"eq (3) of the paper: {report['eq_3_um']:.4f} µm, no bound where the weights have both signs; "
-        f"the safe bound Σ ζ|w|: {report['triangle_bound_um']:.4f} µm"
+        f"eq (3) of the paper gives {report['eq_3_um']:.4f} µm, which is no bound where the weights have both signs; "
+        f"Σ ζ|w| = {report['triangle_bound_um']:.4f} µm is a bound for all weights"
     )
     if report["same_model"]:
         print_warnings(
             [
-                "the actuator equals the model from which the inverse is computed: the deviation is that of the dead "
-                "band below the first threshold, without an error of the model. For the error of the model, give "
-                "--actuator the model identified from another recording"
+                "the actuator equals the model from which the inverse is computed. The deviations show only the dead "
+                "band below the first threshold, and no error of the model. To include the error of the model, use "
+                "--actuator FILE, where FILE contains the model identified from another recording"
             ]
         )
     if report["dead_band"] == "exact":
-        out.print("these figures leave out dead_band = 'exact', with which less hysteresis remains")
+        out.print(
+            "these figures do not include dead_band = 'exact' of CONFIG; with this setting, less hysteresis remains"
+        )
     print_files(out, report)

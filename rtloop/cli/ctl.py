@@ -29,9 +29,14 @@ SECTION = click.argument("section", type=click.Choice(["controller", "limits", "
 
 
 @click.group()
-@click.option("--name", help="Name of the service, such as NAME for NAME.toml [the only running service].")
+@click.option("--name", help="Name of the service, such as NAME for NAME.toml.  [default: the only running service]")
 @click.option("--socket", "socket_path", type=OUTPUT, help="Path of the service's control socket, instead of --name.")
-@click.option("--as", "as_name", metavar="NAME", help="Name of the lock holder, which is recorded [operator].")
+@click.option(
+    "--as",
+    "as_name",
+    metavar="NAME",
+    help="Name under which your commands are recorded and hold the lock.  [default: operator]",
+)
 @click.pass_context
 def ctl(context: click.Context, name: str | None, socket_path: Path | None, as_name: str | None) -> None:
     """Send requests to a running service.
@@ -86,9 +91,13 @@ def post(resource: str, sentence: str = "") -> Callable[[Callable[..., Any]], Ca
 
 
 for _name, _help, _sentence in (
-    ("arm", "Allow the outputs to be driven.", "armed: the outputs may be driven; `rtloop ctl start` sets the mode"),
+    (
+        "arm",
+        "Allow the outputs to be driven.",
+        "armed: the outputs may be driven; `rtloop ctl start` sets the configured mode",
+    ),
     ("start", "Set the configured mode.", ""),
-    ("stop", "Ramp the outputs to safe and stay there.", ""),
+    ("stop", "Ramp the outputs to their safe values.", ""),
     ("reset", "Clear latched trips; the outputs stay off.", ""),
     ("reload", "Read the configuration file again and apply it.", ""),
 ):
@@ -96,7 +105,9 @@ for _name, _help, _sentence in (
 
 
 @ctl.command()
-@click.option("--break", "breaks", is_flag=True, help="Take the lock from its holder; asks for the emergency key.")
+@click.option(
+    "--break", "breaks", is_flag=True, help="Take the lock from its holder; the command asks for the emergency key."
+)
 @click.pass_context
 @report_errors
 def lock(context: click.Context, breaks: bool) -> None:
@@ -133,7 +144,7 @@ def metrics(context: click.Context) -> None:
 
 
 @ctl.command()
-@click.option("--count", type=click.IntRange(1), help="Number of lines to print [until Ctrl-C].")
+@click.option("--count", type=click.IntRange(1), help="Number of lines to print.  [default: all until Ctrl-C]")
 @click.pass_context
 @report_errors
 def watch(context: click.Context, count: int | None) -> None:

@@ -20,11 +20,16 @@ def design() -> None:
 @click.argument("spec", type=OUTPUT)
 @click.option(
     "--model", type=OUTPUT,
-    help="File with [axis.model], and maybe [axis.feedforward], of `rtloop identify dynamics` [[plant] of SPEC].",
+    help="File that `rtloop identify dynamics` wrote: its [axis.model] replaces [plant] of SPEC; its "
+    "[axis.feedforward], if there is one, goes into --out.  [default: [plant] of SPEC]",
 )  # fmt: skip
-@click.option("--out", type=OUTPUT, help="The configuration to write [the section alone, to stdout].")
+@click.option("--out", type=OUTPUT, help="Configuration file to write.  [default: only [axis.controller], to stdout]")
 @click.option("--axis", default="x", show_default=True, help="Name of the axis in the configuration that is written.")
-@click.option("--cross-check", is_flag=True, help="Compute γ with SLICOT as well (needs rtloop[slycot]).")
+@click.option(
+    "--cross-check",
+    is_flag=True,
+    help="Compute γ_opt a second time, with SLICOT, for comparison (needs rtloop[slycot]).",
+)
 @JSON
 @report_errors
 def synthesise(spec: Path, model: Path | None, out: Path | None, axis: str, cross_check: bool, as_json: bool) -> None:

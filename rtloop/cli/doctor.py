@@ -32,12 +32,15 @@ DEFAULT_RATE_HZ = 10_000.0
 @click.command()
 @click.argument("config", type=OUTPUT, required=False)
 @click.option(
-    "--seconds", type=Seconds(), default=5.0, show_default=True, help="Duration of the measurement of the loop's clock."
+    "--seconds", type=Seconds(), default=5.0, show_default=True, help="Time for which the loop's clock is measured."
 )
 @click.option(
-    "--apply", "change", is_flag=True, help="Change the settings that can be changed without a restart; needs root."
+    "--apply",
+    "change",
+    is_flag=True,
+    help="Change the settings that can be changed without a restart of the host; needs root.",
 )
-@click.option("--png", type=OUTPUT, metavar="FILE", help="Write the histogram of the lateness as a picture.")
+@click.option("--png", type=OUTPUT, metavar="FILE", help="Picture to write: histogram of the ticks' lateness.")
 @JSON
 @report_errors
 def doctor(config: Path | None, seconds: float, change: bool, png: Path | None, as_json: bool) -> int:
@@ -105,7 +108,11 @@ def _print_examination(
     """
     out, latency = console(), examination.latency
     for write in writes:
-        outcome = f"[red]refused, {escape(write.refused)}[/]" if write.refused else "done, until the next restart"
+        outcome = (
+            f"[red]refused, {escape(write.refused)}[/]"
+            if write.refused
+            else "done; lasts until the next restart of the host"
+        )
         out.print(f"{write.condition}: write {escape(repr(write.text))} to {write.path}: {outcome}")
     rows = table("", "condition", "found", "wanted", words=(1, 2, 3))
     for finding in examination.findings:
@@ -120,13 +127,13 @@ def _print_examination(
     _print_latency(latency)
     for delay in delays:
         out.print(
-            f"axis {delay.axis}: at its tightest crossover, {delay.crossover_hz:.0f} Hz, the lateness costs "
-            f"{delay.p50_deg:.2f}° of phase (p50), {delay.p99_deg:.2f}° (p99); "
-            f"the loop tolerates {_format_time(delay.tolerated_us)}"
+            f"axis {delay.axis}: at the crossover with the least delay margin, {delay.crossover_hz:.0f} Hz, the "
+            f"lateness costs {delay.p50_deg:.2f}° of phase (p50), {delay.p99_deg:.2f}° (p99); the loop tolerates a "
+            f"delay of {_format_time(delay.tolerated_us)}"
         )
     loop = f"suitable for {name} at {latency.pacing.rate_hz / 1000:g} kHz"
     if objections:
-        out.print(f"\n[bold red]not {loop}[/], whose period is {_format_time(latency.period_us)}:")
+        out.print(f"\n[bold red]not {loop}[/] (period {_format_time(latency.period_us)}), because:")
         for reason in objections:
             out.print(f"  {escape(reason)}")
     else:
@@ -138,11 +145,13 @@ def _print_latency(latency: Latency) -> None:
     pacing, out = latency.pacing, console()
     p50_us, p99_us, p999_us, max_us = latency.quantiles_us.values()
     quantiles = f"p50 {p50_us:.2f}, p99 {p99_us:.2f}, p99.9 {p999_us:.2f}, max {max_us:.2f}"
-    spin = f"the last {pacing.spin_us:g} µs spinning" if pacing.spin_us else "sleeping"
+    spin = (
+        f"busy-waiting for the last {pacing.spin_us:g} µs of a period" if pacing.spin_us else "sleeping between ticks"
+    )
     seconds = latency.lateness_us.size / pacing.rate_hz
     out.print(
         f"\n[bold]the loop's clock[/], {seconds:g} s at {pacing.rate_hz:g} Hz, {spin}: late by {quantiles} µs; "
-        f"{int(latency.missed.sum())} periods missed; {latency.stolen_s:.2f} s stolen by a hypervisor"
+        f"{int(latency.missed.sum())} periods missed; a hypervisor took {latency.stolen_s:.2f} s of processor time"
     )
     out.print(histogram_table(_histogram_classes(latency), "late by µs"))
 

@@ -18,7 +18,13 @@ POSITIVE = PositiveFloat(0.0, 1e6, min_open=True)
 
 
 @click.command()
-@click.option("--selftest", "config", type=OUTPUT, metavar="CONFIG", help="Drive the channels of CONFIG and measure.")
+@click.option(
+    "--selftest",
+    "config",
+    type=OUTPUT,
+    metavar="CONFIG",
+    help="Test the channels of CONFIG: drive the outputs, measure the inputs.",
+)
 @click.option(
     "--amplitude",
     "amplitude_v",
@@ -27,12 +33,21 @@ POSITIVE = PositiveFloat(0.0, 1e6, min_open=True)
     show_default=True,
     help="Largest step from the safe value, in V. The axis's limits and the channel's range still apply.",
 )
-@click.option("--loopback", is_flag=True, help="Judge gain and offset; needs every output wired to its input.")
+@click.option("--loopback", is_flag=True, help="Judge gain and offset; every output must be wired to its input.")
 @click.option(
-    "--gain-tolerance", type=POSITIVE, default=0.01, show_default=True, help="Largest deviation of a gain from 1."
+    "--gain-tolerance",
+    type=POSITIVE,
+    default=0.01,
+    show_default=True,
+    help="Largest deviation of a gain from 1 that --loopback accepts.",
 )
 @click.option(
-    "--offset-tolerance", "offset_v", type=POSITIVE, default=0.01, show_default=True, help="Largest offset, in V."
+    "--offset-tolerance",
+    "offset_v",
+    type=POSITIVE,
+    default=0.01,
+    show_default=True,
+    help="Largest offset, in V, that --loopback accepts.",
 )
 @JSON
 @report_errors
@@ -109,10 +124,10 @@ def _print_report(report: dict[str, Any]) -> None:
     if (exchange := report["exchange"]) is not None:
         out.print(
             f"exchange with the node: p50 {exchange['p50_us']:.1f} µs, p99 {exchange['p99_us']:.1f} µs, largest "
-            f"{exchange['max_us']:.1f} µs; {exchange['late']} of {exchange['count']} took longer than a period, "
-            f"{exchange['lost']} were not answered"
+            f"{exchange['max_us']:.1f} µs; {exchange['late']} of {exchange['count']} exchanges took longer "
+            f"than a period, {exchange['lost']} got no answer"
         )
-        out.print(f"added to the model's delay in the margins of `rtloop check`: {exchange['added_us']:.1f} µs")
+        out.print(f"the margins of `rtloop check` include this delay beyond the model's: {exchange['added_us']:.1f} µs")
     for rate in report["rates"]:
         out.print(f"{rate['rate_hz']:g} Hz: {rate['missed_share']:.2%} of the periods missed")
     highest = report["highest_rate_hz"]

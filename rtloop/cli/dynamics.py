@@ -16,33 +16,44 @@ from rtloop.cli.output import print_warnings
 @click.command()
 @RUNS
 @AXIS
-@click.option("--hysteresis", type=OUTPUT, help="File with [axis.feedforward] [the recording's own configuration].")
+@click.option(
+    "--hysteresis", type=OUTPUT, help="File with [axis.feedforward].  [default: the configuration in the recording]"
+)
 @click.option(
     "--input", default="hysteresis", show_default=True,
     type=click.Choice(["hysteresis", "command", "drive"]),
-    help="Input of the dynamics: output of the hysteresis model, recorded command v, or the drive itself.",
+    help="Input of the dynamics: output of the hysteresis model, recorded command v, or recorded drive.",
 )  # fmt: skip
-@click.option("--order", type=click.IntRange(1, 20), help="Number of poles [searched].")
+@click.option("--order", type=click.IntRange(1, 20), help="Number of poles.  [default: found by a search]")
 @click.option(
-    "--largest-order", default=14, show_default=True, type=click.IntRange(1, 20), help="Largest order in the search."
+    "--largest-order",
+    default=14,
+    show_default=True,
+    type=click.IntRange(1, 20),
+    help="Largest number of poles in the search.",
 )
-@click.option("--delay", type=click.IntRange(0, 16), help="Delay in samples [searched from 0 to 5].")
+@click.option("--delay", type=click.IntRange(0, 16), help="Delay in samples.  [default: found by a search from 0 to 5]")
 @click.option(
     "--criterion", type=click.Choice(["aic", "held-out", "validation"]),
-    help="Criterion for the order [held-out; a closed loop allows no other].",
+    help="Criterion for the number of poles; a closed loop allows only held-out.  [default: held-out]",
 )  # fmt: skip
 @click.option(
     "--loop",
     default="auto",
     show_default=True,
     type=click.Choice(["auto", "open", "closed"]),
-    help="State of the loop; auto: by the recorded mode, or open in a recording without modes.",
+    help="State of the loop in the recording; auto: from the recorded mode; open, if no mode is recorded.",
 )
 @click.option(
     "--outside", multiple=True, metavar="SIGNAL",
-    help="Recorded signal that moved the closed loop, independent of its noise [the axis's reference and feed].",
+    help="Recorded signal that excited the closed loop and is independent of its noise; repeatable.  "
+    "[default: reference and feed of the axis]",
 )  # fmt: skip
-@click.option("--compare", type=OUTPUT, help="Recording of a chirp or multisine, for a measured frequency response.")
+@click.option(
+    "--compare",
+    type=OUTPUT,
+    help="Recording of a chirp or multisine, with whose frequency response the model is compared.",
+)
 @OUT
 @PLOT
 @JSON

@@ -25,23 +25,29 @@ class Address(click.ParamType):
         try:
             return str(ipaddress.IPv4Address(value))
         except ValueError:
-            self.fail(f"value is {value!r}; allowed: an IPv4 address of this host, or 0.0.0.0 for all", param, ctx)
+            self.fail(
+                f"value is {value!r}; allowed: an IPv4 address of this host, or 0.0.0.0 for all addresses", param, ctx
+            )
 
 
 @click.command()
-@click.option("--name", help="Name of the service, such as NAME for NAME.toml [the only running service].")
+@click.option("--name", help="Name of the service, such as NAME for NAME.toml.  [default: the only running service]")
 @click.option("--socket", "socket_path", type=OUTPUT, help="Path of the service's control socket, instead of --name.")
-@click.option("--prefix", type=PREFIX, help="Begin of the name of each channel, such as LAB:LOOP: [NAME:].")
+@click.option(
+    "--prefix",
+    type=PREFIX,
+    help="Beginning of the name of each channel, such as LAB:LOOP:.  [default: NAME: with the service's name]",
+)
 @click.option(
     "--interface",
     type=Address(),
     default="127.0.0.1",
     show_default=True,
-    help="Address of this host on which clients are served; 0.0.0.0: all.",
+    help="IPv4 address of this host at which clients are served; 0.0.0.0: all addresses.",
 )
-@click.option("--allow-control", is_flag=True, help="Let every client that reaches the interface drive the loop.")
+@click.option("--allow-control", is_flag=True, help="Let every client that reaches --interface drive the loop.")
 @click.option("--as", "as_name", metavar="NAME", default="epics", show_default=True,
-              help="Name of the lock holder for what clients write, which is recorded.")  # fmt: skip
+              help="Name under which the clients' commands are recorded and hold the lock.")  # fmt: skip
 @report_errors
 def epics(
     name: str | None, socket_path: Path | None, prefix: str | None, interface: str, allow_control: bool, as_name: str
@@ -49,7 +55,7 @@ def epics(
     """Serve a running loop as EPICS channels (Channel Access).
 
     A separate process; no tick waits for it. Read only, unless --allow-control is used. The port is
-    EPICS_CA_SERVER_PORT [5064].
+    EPICS_CA_SERVER_PORT, by default 5064.
     """
     from rtloop.client.control_socket import find_control_socket
 

@@ -36,21 +36,25 @@ RUN_OPTIONS = (
         "settings",
         metavar="EXPERIMENT.KEY=VALUE",
         multiple=True,
-        help="A parameter; see `rtloop experiment list`.",
+        help="Value of an experiment's parameter; `rtloop experiment list` shows all parameters.",
     ),
-    click.option("--axis", help="Name of the axis [the only one]; every other axis rests."),
+    click.option("--axis", help="Name of the axis; every other axis rests.  [default: the only axis]"),
     click.option(
-        "--paced", is_flag=True, help="Run in real time, as hardware always does, even where virtual time is possible."
+        "--paced",
+        is_flag=True,
+        help="Run a simulated rig in real time, not in virtual time; hardware always runs in real time.",
     ),
     click.option(
         "--beside",
         "comparison",
         metavar="CONFIG",
         type=OUTPUT,
-        help="Another configuration for the same experiments, whose figures and steps are shown for comparison.",
+        help="Second configuration, which runs the same experiments; the report compares its figures and steps.",
     ),
     click.option(
-        "--out", type=OUTPUT, help="Folder for recordings and report [NAME-experiments-TIME in recording.folder]."
+        "--out",
+        type=OUTPUT,
+        help="Folder for recordings and report.  [default: NAME-experiments-TIME in recording.folder]",
     ),
     JSON,
 )
@@ -83,7 +87,7 @@ def list_experiments() -> None:
         out.print(f"  {entry.description}")
         for name, field in entry.options.model_fields.items():
             value = list(field.default) if isinstance(field.default, tuple) else field.default
-            text = "…  (by default fitted to the axis)" if value is None else value
+            text = "…  (default: chosen for the axis)" if value is None else value
             out.print(f"  --set {entry.name}.{name}={text}", style="dim", markup=False)
 
 
@@ -121,7 +125,7 @@ experiment.add_command(
 
 @experiment.command()
 @click.argument("runs", metavar="RUN...", type=OUTPUT, nargs=-1, required=True)
-@click.option("--out", type=OUTPUT, help="Folder for the report [folder of the first recording].")
+@click.option("--out", type=OUTPUT, help="Folder for the report.  [default: folder of the first recording]")
 @JSON
 @report_errors
 def report(runs: tuple[Path, ...], out: Path | None, as_json: bool) -> int:
@@ -174,14 +178,16 @@ def run_experiments(
         planned_runs += comparison_runs
         skipped |= {f"{name} with {comparison.name}": reason for name, reason in comparison_skipped.items()}
     if not planned_runs:
-        raise LoopFault("\n  ".join(["no experiment can be done", *(f"{n}: {why}" for n, why in skipped.items())]))
+        raise LoopFault(
+            "\n  ".join(["no experiment can run. Reasons:", *(f"{n}: {why}" for n, why in skipped.items())])
+        )
     with Interruption() as interruption:
         paths, problems = _record_all(planned_runs, folder, paced or stage.prepared.facts.real, interruption)
     for problem in problems:
         click.echo(f"rtloop: {problem}", err=True)
     if interruption.requested:
         click.echo(
-            "rtloop: interrupted; the outputs are parked (at their safe values); the recorded runs are reported",
+            "rtloop: interrupted. The outputs are parked (at their safe values). The report covers the recorded runs",
             err=True,
         )
     if not paths:
@@ -190,8 +196,8 @@ def run_experiments(
     try:
         is_complete = _report_recordings(paths, folder, skipped, as_json, extra)
     except KeyboardInterrupt:
-        hint = f"to make it from the recordings: `rtloop experiment report {folder}`"
-        raise LoopFault(f"interrupted; no report was written; {hint}") from None
+        remedy = f"To write the report from the recordings: `rtloop experiment report {folder}`"
+        raise LoopFault(f"interrupted; no report was written. {remedy}") from None
     return 0 if is_complete and not interruption.requested and not problems else LoopFault.exit_code
 
 

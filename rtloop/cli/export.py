@@ -21,17 +21,30 @@ FORMAT = click.Choice(["csv", "parquet", "npz", "mat", "hdf5"])
 
 @click.command()
 @FILES
-@click.option("--to", type=FORMAT, required=True, help="Format; parquet and hdf5 need rtloop[data].")
-@click.option("--out", type=OUTPUT, help="The file to write [FILE with another ending].")
+@click.option("--to", type=FORMAT, required=True, help="Format of the file; parquet and hdf5 need rtloop[data].")
+@click.option("--out", type=OUTPUT, help="File to write.  [default: FILE with another ending]")
 @click.option(
-    "--from", "start_s", type=Seconds(allows_zero=True), default=0.0, help="Seconds since the start of the run [0]."
+    "--from",
+    "start_s",
+    type=Seconds(allows_zero=True),
+    default=0.0,
+    help="Beginning of the part, in s since the start of the run.  [default: 0]",
 )
-@click.option("--until", "end_s", type=Seconds(), default=None, help="Seconds since the start of the run [its end].")
 @click.option(
-    "--every", type=click.IntRange(min=1), default=1, metavar="N", help="Write one tick of N, without averaging."
+    "--until",
+    "end_s",
+    type=Seconds(),
+    default=None,
+    help="End of the part, in s since the start of the run.  [default: end of the run]",
 )
 @click.option(
-    "--signals", default="", metavar="A,B,…", help="Export only these signals, tick and deadline_ns; x_* is a pattern."
+    "--every", type=click.IntRange(min=1), default=1, metavar="N", help="Write every N-th tick, without averaging."
+)
+@click.option(
+    "--signals",
+    default="",
+    metavar="A,B,…",
+    help="Export only these signals, besides tick and deadline_ns; * stands for any text, as in x_*.",
 )
 @JSON
 @report_errors
@@ -63,11 +76,21 @@ def export(
 
 @click.command()
 @FILES
-@click.option("--out", type=OUTPUT, help="The picture to write: .png, .pdf or .svg [FILE with .png].")
+@click.option("--out", type=OUTPUT, help="Picture to write: .png, .pdf or .svg.  [default: FILE with .png]")
 @click.option(
-    "--from", "start_s", type=Seconds(allows_zero=True), default=0.0, help="Seconds since the start of the run [0]."
+    "--from",
+    "start_s",
+    type=Seconds(allows_zero=True),
+    default=0.0,
+    help="Beginning of the part, in s since the start of the run.  [default: 0]",
 )
-@click.option("--until", "end_s", type=Seconds(), default=None, help="Seconds since the start of the run [its end].")
+@click.option(
+    "--until",
+    "end_s",
+    type=Seconds(),
+    default=None,
+    help="End of the part, in s since the start of the run.  [default: end of the run]",
+)
 @click.option("--html", is_flag=True, help="Write one HTML page with zoom and pan, instead of a PNG.")
 @JSON
 @report_errors

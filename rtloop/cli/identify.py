@@ -15,9 +15,9 @@ from rtloop.workbench.tables import console
 if TYPE_CHECKING:
     from rtloop.workbench.identified_model import IdentifiedModel
 RUNS = click.argument("runs", metavar="RUN...", type=OUTPUT, nargs=-1, required=True)
-AXIS = click.option("--axis", help="Name of the axis [the only one].")
-OUT = click.option("--out", type=OUTPUT, help="The TOML file to write, never over an existing one.")
-PLOT = click.option("--plot", type=OUTPUT, help="The picture (PNG) to write.")
+AXIS = click.option("--axis", help="Name of the axis.  [default: the only axis]")
+OUT = click.option("--out", type=OUTPUT, help="TOML file to write; an existing file is not overwritten.")
+PLOT = click.option("--plot", type=OUTPUT, help="Picture (PNG) to write.")
 
 
 @click.group()
@@ -32,7 +32,7 @@ def identify() -> None:
 @click.option(
     "--placement", default="auto", show_default=True,
     type=click.Choice(["auto", "chebyshev", "chebyshev-from-0", "uniform"]),
-    help="Placement of thresholds: with a dead band (chebyshev) or without; auto takes the one with less error.",
+    help="Placement of the thresholds: with a dead band (chebyshev) or without; auto: the one with less error.",
 )  # fmt: skip
 @click.option(
     "--thresholds",
@@ -45,9 +45,15 @@ def identify() -> None:
 )  # fmt: skip
 @click.option(
     "--memory", default="auto", show_default=True, type=click.Choice(["auto", "rest", "unknown"]),
-    help="Memory of the actuator at the start of each RUN: none (rest) or unknown; auto: by the start of its drive.",
+    help="Memory of the actuator at the start of each RUN: none (rest) or unknown; auto: judged by "
+    "the drive at the start.",
 )  # fmt: skip
-@click.option("--validate", type=OUTPUT, multiple=True, help="A recording to judge the model by; repeatable.")
+@click.option(
+    "--validate",
+    type=OUTPUT,
+    multiple=True,
+    help="Recording with which the model is judged, but not fitted; repeatable.",
+)
 @OUT
 @PLOT
 @JSON

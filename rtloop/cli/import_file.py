@@ -43,20 +43,26 @@ class ColumnListing(dict[str, Any]):
     "maps",
     multiple=True,
     metavar="SIGNAL=COLUMN",
-    help="Make a signal from a column; COLUMN alone: import the column unchanged.",
+    help="Make SIGNAL from COLUMN; COLUMN alone: import the column unchanged.",
 )
-@click.option("--all", "everything", is_flag=True, help="Import all other columns too, under their own names.")
-@click.option("--time", metavar="COLUMN", help="Column of times [found by its name].")
+@click.option("--all", "everything", is_flag=True, help="Import the columns without --map too, under their own names.")
+@click.option("--time", metavar="COLUMN", help="Column of times.  [default: found by its name]")
 @click.option(
-    "--rate", "rate_hz", type=click.FloatRange(1e-3, 1e6), metavar="HZ", help="Rate of the rows, instead of --time."
+    "--rate",
+    "rate_hz",
+    type=click.FloatRange(1e-3, 1e6),
+    metavar="HZ",
+    help="Rate of the rows, in Hz, instead of --time.",
 )
 @click.option(
     "--position-first", is_flag=True,
-    help="In each row the position was sampled before the drive changed [both at the same time].",
+    help="In each row, the position was sampled before the drive changed.  [default: both at the same time]",
 )  # fmt: skip
-@click.option("--group", help="Raster, group or topic, where FILE has several [the longest].")
-@click.option("--mapping", type=OUTPUT, help="TOML file with these options [NAME.map.toml or map.toml beside FILE].")
-@click.option("--out", type=OUTPUT, help="The recording to write, for one FILE only [FILE with .mcap].")
+@click.option("--group", help="Raster, group or topic to import, if FILE has several.  [default: the longest]")
+@click.option(
+    "--mapping", type=OUTPUT, help="TOML file with these options.  [default: NAME.map.toml or map.toml beside FILE]"
+)
+@click.option("--out", type=OUTPUT, help="Recording to write; allowed with one FILE.  [default: FILE with .mcap]")
 @JSON
 @report_errors
 def import_command(
@@ -100,7 +106,7 @@ def import_command(
         with Counter("ticks imported", sys.stderr) as counter:
             report = import_file(file, selection, mapping, out, counter.show)
         for column in report["in_other_files"]:
-            click.echo(f"{file}: {column} is left out, because its values are stored in another file", err=True)
+            click.echo(f"{file}: column {column} is left out, because its values are stored in another file", err=True)
         is_listing = isinstance(report, ColumnListing)
         print_result(report, as_json, _print_listing if is_listing else _print_import)
         code = LISTING_EXIT_CODE if is_listing else code
@@ -186,7 +192,7 @@ def _print_listing(report: Mapping[str, Any]) -> None:
     rows = [(escape(column["name"]), escape(column["unit"] or "?"), *_range_cells(column)) for column in columns]
     out.print(table("column", "unit", "least", "largest", rows=rows))
     if len(report["columns"]) > MAX_COLUMNS:
-        out.print(f"… and {count_text(len(report['columns']) - MAX_COLUMNS, 'column')} more; --json shows all of them")
+        out.print(f"… and {count_text(len(report['columns']) - MAX_COLUMNS, 'column')} more; --json shows all columns")
     _print_notes(out, report["notes"])
     out.print("\nNothing was written. State the column and unit of each signal, for example:\n")
     time = "" if report["rate_hz"] else " --rate HZ"
@@ -194,7 +200,7 @@ def _print_listing(report: Mapping[str, Any]) -> None:
     example = _suggest_mapping(report["columns"], report["time_column"])
     maps = [f"--map {escape(shlex.quote(f'{name}={source}'))}" for name, source in example]
     out.print("    " + " \\\n    ".join(maps))
-    out.print("\nTo import every column unchanged: --all. More: rtloop import --help")
+    out.print("\nTo import every column unchanged, use --all. For all options: rtloop import --help")
 
 
 def _suggest_mapping(columns: list[dict[str, Any]], time: str | None) -> list[tuple[str, str]]:

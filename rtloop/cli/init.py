@@ -25,35 +25,55 @@ NAMES = {"law": "my_law", "driver": "my_card"}
     type=click.Choice(["paper", "stage", "law", "driver"]),
     default="paper",
     show_default=True,
-    help="The paper's loop; a simulated stage; a law; a driver.",
+    help="Subject of the files: the paper's loop, a simulated stage, a law or a driver.",
 )
-@click.option("--name", type=LAW_NAME, help="Name of the law [my_law] or driver [my_card].")
+@click.option("--name", type=LAW_NAME, help="Name of the law or driver.  [default: my_law or my_card]")
 @click.option(
     "--config",
     type=OUTPUT,
     metavar="STAGE.toml",
-    help="Configuration in FOLDER for the law to run on [the paper's rig].",
+    help="Configuration in FOLDER, in which the law will run.  [default: the paper's rig]",
 )
-@click.option("--resonance-hz", type=float, help="Resonance of the stage, 1 to 10000 Hz [800].")
-@click.option("--damping", type=float, help="Damping ratio of the resonance, 0.001 to 0.9 [0.02].")
-@click.option("--range-um", type=float, help="Position at the largest drive, from rest, in µm [20].")
-@click.option("--gain-um-per-v", type=float, help="In place of --range-um: that position divided by the largest drive.")
-@click.option("--drive-v", type=float, help="Largest drive, 0.1 to 10 V [10].")
-@click.option("--drive-min-v", type=float, help="Lowest drive, minus the largest drive to 0 V [minus the largest].")
+@click.option("--resonance-hz", type=float, help="Resonance of the stage, 1 to 10000 Hz.  [default: 800]")
+@click.option("--damping", type=float, help="Damping ratio of the resonance, 0.001 to 0.9.  [default: 0.02]")
+@click.option("--range-um", type=float, help="Position at the largest drive, reached from rest, in µm.  [default: 20]")
+@click.option(
+    "--gain-um-per-v",
+    type=float,
+    help="Position at the largest drive divided by this drive, in µm/V; replaces --range-um.",
+)
+@click.option("--drive-v", type=float, help="Largest drive, 0.1 to 10 V.  [default: 10]")
+@click.option(
+    "--drive-min-v",
+    type=float,
+    help="Lowest drive, in V, from minus the largest drive to 0.  [default: minus the largest drive]",
+)
 @click.option(
     "--hysteresis-percent",
     type=float,
     help="Largest difference between rising and falling positions at one drive, in percent of the stroke between the "
-    "lowest and the largest drive, 0 to 30 [15.3].",
+    "lowest and the largest drive, 0 to 30.  [default: 15.3]",
 )
-@click.option("--sensor-um-per-v", type=float, help="Scale of the sensor, up to 10 V [a quarter of the travel].")
 @click.option(
-    "--sensor-min-v", type=float, help="Lowest reading of the sensor, -10 to 0 V; below it, the loop trips [-10]."
+    "--sensor-um-per-v",
+    type=float,
+    help="Scale of the sensor, in µm/V; the sensor reads up to 10 V.  [default: --range-um / 4 V]",
 )
-@click.option("--sensor-noise-um", type=float, help="Noise of the sensor, µm rms [a 4000th of the travel].")
-@click.option("--sensor-noise-mv", type=float, help="In place of --sensor-noise-um: noise of the reading, mV rms.")
-@click.option("--sensor-resolution-um", type=float, help="Step of the sensor's reading, µm [as the noise].")
-@click.option("--rate-hz", type=float, help="Rate of the loop [10000 Hz; more for a resonance above 1000 Hz].")
+@click.option(
+    "--sensor-min-v",
+    type=float,
+    help="Lowest reading of the sensor, -10 to 0 V; the loop trips below this reading.  [default: -10]",
+)
+@click.option("--sensor-noise-um", type=float, help="Noise of the sensor, µm rms.  [default: --range-um / 4000]")
+@click.option(
+    "--sensor-noise-mv", type=float, help="Noise of the sensor's reading, mV rms; replaces --sensor-noise-um."
+)
+@click.option(
+    "--sensor-resolution-um", type=float, help="Step of the sensor's reading, µm.  [default: the sensor's noise]"
+)
+@click.option(
+    "--rate-hz", type=float, help="Rate of the loop, in Hz.  [default: 10000; higher for a resonance above 1000 Hz]"
+)
 @report_errors
 def init(folder: Path, kind: str, name: str | None, config: Path | None, **figures: float | None) -> None:
     """Write files to begin with into FOLDER [the current folder].
@@ -86,7 +106,9 @@ def _require_in_folder(config: Path, folder: Path, kind: str) -> None:
     if kind != "law":
         raise click.UsageError(f"--config: not allowed with --kind {kind}; allowed with --kind law")
     if config.resolve().parent != folder.resolve():
-        raise click.UsageError(f"--config: {config} is not in {folder.resolve()}; allowed: a file in FOLDER")
+        raise click.UsageError(
+            f"--config: {config} is not in {folder.resolve()}; allowed: a file directly in this folder"
+        )
 
 
 def _starter(kind: str, name: str | None, config: Path | None, figures: dict[str, float]) -> Starter:

@@ -36,7 +36,7 @@ def law() -> None:
 
 @law.command()
 @click.argument("name", type=LAW_NAME)
-@click.option("--out", type=OUTPUT, default=Path(), help="Folder for the three files [the current folder].")
+@click.option("--out", type=OUTPUT, default=Path(), help="Folder for the three files.  [default: the current folder]")
 @report_errors
 def new(name: str, out: Path) -> None:
     """Write NAME.py, its test and an example configuration.
@@ -88,5 +88,5 @@ def _print_laws(entries: Sequence[dict[str, Any]]) -> None:
         origin = "rtloop" if entry["shipped"] else escape(entry["defined_in"])
         rows.add_row(entry["kind"], entry["slot"] or "", about, origin)
     console().print(rows)
-    hint = '\nYour own law: file = "mine.py" in [axis.controller]. To write an example: rtloop law new mine'
+    hint = '\nTo use your own law, write file = "mine.py" in [axis.controller]. To make an example: rtloop law new mine'
     console().print(escape(hint))

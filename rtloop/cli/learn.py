@@ -23,9 +23,13 @@ from rtloop.workbench.tables import console, table
     default=2.0,
     show_default=True,
     type=click.FloatRange(0, 50, max_open=True),
-    help="Learn only if the error shrinks for every resonance within ± this percentage of the model's.",
+    help="Uncertainty of the model's resonance, in ± %; learning starts only if it converges in this whole range.",
 )
-@click.option("--out", type=OUTPUT, help="File for the learned table, for `ctl waveform`; never over an existing file.")
+@click.option(
+    "--out",
+    type=OUTPUT,
+    help="File to write: the learned table, which `rtloop ctl waveform` plays; an existing file is not overwritten.",
+)
 @JSON
 @click.pass_context
 @report_errors
@@ -55,4 +59,4 @@ def learn(
         (str(n), *(f"{1e3 * c[key]:.1f}" for key in ("rms_um", "largest_um"))) for n, c in enumerate(content["cycles"])
     ]
     console().print(table("cycle", "rms error / nm", "largest / nm", rows=errors))
-    click.echo(f"{content['ended']}; the best table keeps playing" + (f"\n{out}" if out else ""))
+    click.echo(f"learning ended: {content['ended']}; the best table keeps playing" + (f"\n{out}" if out else ""))

@@ -60,8 +60,8 @@ class Seconds(click.ParamType):
         except ValueError:
             seconds = math.nan
         if not (0 < seconds < math.inf or (self._allows_zero and seconds == 0)):
-            bound = "from" if self._allows_zero else "above"
-            self.fail(f"value is {value}; allowed: a number of seconds {bound} 0", param, ctx)
+            bound = ", 0 or more" if self._allows_zero else " above 0"
+            self.fail(f"value is {value}; allowed: a finite number of seconds{bound}", param, ctx)
         return seconds
 
 

@@ -57,8 +57,10 @@ def panel_process(config: Path, enabled: bool, port: int, name: str | None = Non
 @click.argument("service", metavar="[NAME|SOCKET]", required=False)
 @port_option("--port")
 @click.option("--open", "opens", is_flag=True, help="Open the panel in the browser.")
-@click.option("--token-file", type=OUTPUT, help="File with the access token; created if it does not exist.")
-@click.option("--foxglove", is_flag=True, help="Serve viewers of the Foxglove WebSocket protocol; they can only look.")
+@click.option("--token-file", type=OUTPUT, help="File with the access token; a missing file is created.")
+@click.option(
+    "--foxglove", is_flag=True, help="Serve Foxglove viewers (WebSocket) too; these viewers cannot control the loop."
+)
 @click.option("--until-stdin-ends", "tied", is_flag=True, hidden=True)
 @report_errors
 def panel(service: str | None, port: int, opens: bool, token_file: Path | None, foxglove: bool, tied: bool) -> int:

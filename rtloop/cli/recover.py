@@ -23,7 +23,11 @@ TICK = click.IntRange(min=0)
 
 @click.command()
 @FILES
-@click.option("--out", type=OUTPUT, help="The recovered file (of one FILE) [NAME.mcap for NAME.mcap.part].")
+@click.option(
+    "--out",
+    type=OUTPUT,
+    help="Recovered file to write; allowed with one FILE.  [default: NAME.mcap for NAME.mcap.part]",
+)
 @JSON
 @report_errors
 def recover(files: tuple[Path, ...], out: Path | None, as_json: bool) -> None:
@@ -49,12 +53,20 @@ def recover(files: tuple[Path, ...], out: Path | None, as_json: bool) -> None:
 @click.command()
 @FILES
 @click.option(
-    "--from", "from_s", type=Seconds(allows_zero=True), help="Seconds since the start of the run [its beginning]."
+    "--from",
+    "from_s",
+    type=Seconds(allows_zero=True),
+    help="Beginning of the part, in s since the start of the run.  [default: start of the run]",
 )
-@click.option("--until", "until_s", type=Seconds(), help="Seconds since the start of the run [its end].")
-@click.option("--from-tick", "first", type=TICK, metavar="TICK", help="First tick that is included, instead of --from.")
-@click.option("--until-tick", "end", type=TICK, metavar="TICK", help="First tick that is left out, instead of --until.")
-@click.option("--out", type=OUTPUT, help="The recording to write [NAME.cut-TICK.mcap beside FILE].")
+@click.option(
+    "--until",
+    "until_s",
+    type=Seconds(),
+    help="End of the part, in s since the start of the run.  [default: end of the run]",
+)
+@click.option("--from-tick", "first", type=TICK, metavar="TICK", help="First tick of the part, instead of --from.")
+@click.option("--until-tick", "end", type=TICK, metavar="TICK", help="First tick after the part, instead of --until.")
+@click.option("--out", type=OUTPUT, help="Recording to write.  [default: NAME.cut-TICK.mcap beside FILE]")
 @JSON
 @report_errors
 def cut(
@@ -90,7 +102,7 @@ def _print_recovery(report: dict[str, Any]) -> None:
     out.print(f"{output}: {count_text(report['ticks'], 'tick')} recovered from {original}")
     _print_gaps(out, report)
     if not report["complete"]:
-        out.print("the end of the run is missing: ticks after the last recovered one are unknown")
+        out.print("the end of the run is missing: the ticks after the last recovered tick are unknown")
 
 
 def _print_cut(report: dict[str, Any]) -> None:
@@ -98,7 +110,7 @@ def _print_cut(report: dict[str, Any]) -> None:
     out = console()
     span = f"ticks {report['first']} to {report['end'] - 1}"
     if report["begin"] < report["first"]:
-        span += f", and the ticks before them from tick {report['begin']} on, which a replay needs"
+        span += f", preceded by ticks {report['begin']} to {report['first'] - 1}, which a replay needs"
     ticks = count_text(report["ticks"], "tick")
     out.print(f"{escape(report['output'])}: {ticks} of {escape(report['recording'])}: {span}")
     _print_gaps(out, report)

@@ -19,12 +19,22 @@ from rtloop.workbench.tables import console
 @FILES
 @click.option("--config", type=OUTPUT, help="Run the law of this configuration on the recorded inputs.")
 @click.option("--resimulate", is_flag=True, help="Run the recorded reference in closed loop with the simulated rig.")
-@click.option("--law", "laws", type=OUTPUT, multiple=True, help="File with a recorded law that is not installed here.")
 @click.option(
-    "--trust-recorded-law", is_flag=True, help="Run the code of the laws in the recording, if you trust its source."
+    "--law",
+    "laws",
+    type=OUTPUT,
+    multiple=True,
+    help="Python file of a recorded law that is not installed on this host; repeatable.",
 )
 @click.option(
-    "--jobs", type=click.IntRange(min=1), help="Processes that replay at once.  [default: one for each processor]"
+    "--trust-recorded-law",
+    is_flag=True,
+    help="Run the code of the laws in the recording; use it only if you trust the recording.",
+)
+@click.option(
+    "--jobs",
+    type=click.IntRange(min=1),
+    help="Number of processes that replay at the same time.  [default: one for each processor]",
 )
 @JSON
 @report_errors

@@ -39,27 +39,35 @@ DURATION = click.option(
     default=6.0,
     show_default=True,
     type=click.FloatRange(1, 60),
-    help="Duration of the largest multisine, in s; smaller ones precede it.",
+    help="Duration of the multisine at full amplitude, in s; multisines of smaller amplitude precede it.",
 )
 PERIOD = click.option(
     "--period",
     "period_s",
     type=click.FloatRange(0.05, 10),
-    help="Period of the multisine, in s [by the width of the lightly damped mode].",
+    help="Period of the multisine, in s.  [default: chosen by the width of the lightly damped mode]",
 )
 NEAR = click.option(
     "--near-hz",
     type=click.FloatRange(0, min_open=True),
-    help="Expected frequency of the lightly damped mode [the model's].",
+    help="Expected frequency of the lightly damped mode, in Hz.  [default: the model's]",
 )
-OUT = click.option("--out", type=OUTPUT, help="The JSON file to write, never over an existing one.")
+OUT = click.option("--out", type=OUTPUT, help="JSON file to write; an existing file is not overwritten.")
 
 
 @click.command("response")
 @SERVICE_AXIS
 @AMPLITUDE
-@click.option("--from-hz", type=click.FloatRange(0, min_open=True), help="Lowest frequency [2 / period].")
-@click.option("--to-hz", type=click.FloatRange(0, min_open=True), help="Highest frequency [0.45 of the rate].")
+@click.option(
+    "--from-hz",
+    type=click.FloatRange(0, min_open=True),
+    help="Lowest frequency of the multisine, in Hz.  [default: 2 / period]",
+)
+@click.option(
+    "--to-hz",
+    type=click.FloatRange(0, min_open=True),
+    help="Highest frequency of the multisine, in Hz.  [default: 0.45 of the loop's rate]",
+)
 @DURATION
 @PERIOD
 @NEAR
@@ -176,7 +184,7 @@ def _report_resonance(content: dict[str, Any], as_json: bool) -> None:
 
     if content["resonance"] is None:
         raise UnsuitableData(
-            "no lightly damped mode stands out in the band; give its expected frequency with --near-hz HZ"
+            "no lightly damped mode stands out in the measured band; state its expected frequency with --near-hz HZ"
         )
     echo_json({"resonance": content["resonance"]}) if as_json else _print_resonance(content)
 
@@ -191,13 +199,13 @@ def _print_response(content: dict[str, Any], files: Sequence[Path]) -> None:
         rows.add_row(label, format_number(margin["value"]), format_number(margin["std"], ".2g"), model_text, unit)
     out.print(rows)
     if model:
-        out.print(f"measured |L| divided by |L| of the model, median: {format_number(model['gain_ratio'])}")
+        out.print(f"median of measured |L| divided by |L| of the model: {format_number(model['gain_ratio'])}")
     if content["resonance"]:
         _print_resonance(content)
     out.print(
         f"multisine of {content['lines']} frequencies, {content['from_hz']:g} … {content['to_hz']:g} Hz, "
         f"{content['periods']} periods; "
-        f"the position moved by {content['moved_um']:.3g} µm"
+        f"the position moved by up to {content['moved_um']:.3g} µm"
     )
     for file in files:
         out.print(file, markup=False)
@@ -210,8 +218,8 @@ def _print_resonance(content: dict[str, Any]) -> None:
     mode = content["resonance"]
     console().print(
         f"resonance {mode['hz']:.3f} ± {mode['hz_std']:.2g} Hz, damping {mode['damping']:.5f} ± "
-        f"{mode['damping_std']:.2g} (1σ; {mode['from_hz']:g} … {mode['to_hz']:g} Hz; the residuals are "
-        f"{mode['misfit']:.2g} times as large as the measurement's uncertainty explains)"
+        f"{mode['damping_std']:.2g} (1σ), fitted from {mode['from_hz']:g} to {mode['to_hz']:g} Hz; the residuals are "
+        f"{mode['misfit']:.2g} times as large as the measurement's uncertainty explains"
     )
     if mode["misfit"] > LARGEST_MISFIT:
         console().print(f"[yellow]{NOT_LINEAR}[/]")

@@ -31,15 +31,15 @@ if TYPE_CHECKING:
 @click.option(
     "--gain-um",
     type=click.FloatRange(0),
-    help="Change of the reference, in µm, towards the middle of the range, to measure the gain. 0: the gain is not "
-    "measured, and the model's gain is used [a quarter of the specification's largest step].",
+    help="Change of the reference for the measurement of the gain, in µm, towards the middle of the range. 0: the gain "
+    "is not measured; the model's gain is used.  [default: a quarter of the specification's largest step]",
 )
 @click.option(
     "--bound-percent",
     default=15.0,
     show_default=True,
     type=click.FloatRange(0, 50, min_open=True),
-    help="Largest distance, in %, of a measured resonance or gain from the model's. Beyond it, the taps stay.",
+    help="Largest difference of the measured resonance or gain from the model's, in %; beyond it, the taps stay.",
 )
 @click.option(
     "--within-percent",
@@ -48,10 +48,13 @@ if TYPE_CHECKING:
     type=click.FloatRange(0, 50),
     help="Range around the measured resonance, in ± %, for which the taps are made.",
 )
-@click.option("--spec", type=OUTPUT, help="The specification [the axis's key `specification`].")
-@click.option("--yes", is_flag=True, help="Swap without asking.")
+@click.option("--spec", type=OUTPUT, help="Specification file.  [default: key `specification` of the axis]")
+@click.option("--yes", is_flag=True, help="Swap better taps in without a question.")
 @click.option(
-    "--swap", "proposal", type=InputFile(), help="Swap in the taps of this file, an output of --json; measure nothing."
+    "--swap",
+    "proposal",
+    type=InputFile(),
+    help="Swap in the taps of this file, which --json wrote, without a new measurement.",
 )
 @JSON
 @click.pass_context
@@ -121,9 +124,9 @@ def _print_proposal(proposal: Proposal) -> None:
         f"resonance {mode['hz']:.2f} ± {mode['hz_std']:.2f} Hz (standard deviation), {percent:+.2f} % from the model's"
     )
     if gain is None:
-        click.echo("gain not measured; the model's gain is used")
+        click.echo("the gain is not measured; the model's gain is used")
     else:
-        distance = "too uncertain; the model's gain is used"
+        distance = "too uncertain: the model's gain is used"
         if gain_percent is not None:
             distance = f"{gain_percent:+.2f} % from the model's"
         span = f"between {gain['from_um']:.4g} and {gain['to_um']:.4g} µm"

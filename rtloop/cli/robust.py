@@ -20,12 +20,14 @@ if TYPE_CHECKING:
 
 @click.command()
 @click.argument("spec", type=OUTPUT)
-@click.option("--config", type=OUTPUT, help="A configuration whose controller is replaced [a new configuration].")
+@click.option(
+    "--config", type=OUTPUT, help="Configuration in which the controller is replaced.  [default: a new configuration]"
+)
 @click.option(
     "--out",
     type=OUTPUT,
-    help="The configuration to write: that of --config with the new controller, or a new one with a simulated rig "
-    "[to stdout: that of --config, or the section alone].",
+    help="Configuration file to write: a copy of --config with the new controller; without --config, a new "
+    "configuration with a simulated rig.  [default: to stdout; without --config, only [axis.controller]]",
 )
 @click.option("--axis", default="x", show_default=True, help="Name of the axis in the configuration that is written.")
 @JSON
@@ -72,10 +74,18 @@ def robust(spec: Path, config: Path | None, out: Path | None, axis: str, as_json
 
 @click.command()
 @CONFIG
-@click.option("--spec", type=OUTPUT, help="The specification [the axis's key `specification`].")
-@click.option("--out", type=OUTPUT, help="The configuration to write: CONFIG with the taps [their section, to stdout].")
-@click.option("--axis", default="x", show_default=True, help="The axis whose taps are made.")
-@click.option("--plot", type=OUTPUT, help="A picture, .png: the trade-off and the step (needs rtloop[plot]).")
+@click.option("--spec", type=OUTPUT, help="Specification file.  [default: key `specification` of the axis]")
+@click.option(
+    "--out",
+    type=OUTPUT,
+    help="Configuration file to write: CONFIG with the new taps.  [default: only [axis.prefilter], to stdout]",
+)
+@click.option("--axis", default="x", show_default=True, help="Name of the axis for which the taps are made.")
+@click.option(
+    "--plot",
+    type=OUTPUT,
+    help="Picture (.png) to write: overshoot over settling time, and the step (needs rtloop[plot]).",
+)
 @JSON
 @report_errors
 def shape(config: Path, spec: Path | None, out: Path | None, axis: str, plot: Path | None, as_json: bool) -> None:
@@ -165,7 +175,8 @@ def _print_robust(robust: RobustDesign) -> None:
     from rtloop.design.robust.section import certified_values
 
     click.echo(
-        f"designed for {robust.scenario_count} scenarios; worst figures on {robust.certificate.plants} plants:",
+        f"the controller is designed for {robust.scenario_count} scenarios; worst figures on "
+        f"{robust.certificate.plants} plants:",
         err=True,
     )
     for name, value, scenario in certified_values(robust.certificate):
@@ -179,19 +190,19 @@ def print_taps(tap_design: TapDesign, subject: Subject, *, to_stderr: bool = Tru
     """
     proof = tap_design.proof
     for line in (
-        f"settling (5 %) {tap_design.settling_ms:.4g} ms, the least possible with overshoot ≤ "
-        f"{100 * subject.overshoot:g} % is {tap_design.fastest_ms:.4g} ms; a longer shape.settling_ms overshoots less; "
-        f"variation of v {tap_design.variation:.3g} per unit step",
-        f"worst of {tap_design.proved_count} plants, between ticks too: settling {proof.settling_ms:.4g} ms, "
+        f"settling time (5 %) {tap_design.settling_ms:.4g} ms; with overshoot ≤ {100 * subject.overshoot:g} %, the "
+        f"least possible is {tap_design.fastest_ms:.4g} ms. A longer shape.settling_ms gives less overshoot. Total "
+        f"variation of the command v: {tap_design.variation:.3g} per unit step",
+        f"worst figures of {tap_design.proved_count} plants, between ticks too: settling {proof.settling_ms:.4g} ms, "
         f"overshoot {100 * proof.overshoot:.3g} %, undershoot {100 * proof.undershoot:.3g} %, "
         f"v {proof.lowest_command:.4g} … {proof.highest_command:.4g} per unit step",
-        f"steps by up to {subject.bounds.step_um:g} µm between {subject.bounds.lowest_um:.4g} and "
-        f"{subject.bounds.highest_um:.4g} µm keep v within "
+        f"steps of up to {subject.bounds.step_um:g} µm between {subject.bounds.lowest_um:.4g} and "
+        f"{subject.bounds.highest_um:.4g} µm keep the command v within "
         f"{subject.bounds.low_um:.4g} … {subject.bounds.high_um:.4g} µm",
     ):
         click.echo(line, err=to_stderr)
     if tap_design.curve:
         points = ", ".join(
-            f"{settling_ms:.3g} ms {100 * overshoot:.2g} %" for settling_ms, overshoot in tap_design.curve
+            f"{settling_ms:.3g} ms: {100 * overshoot:.2g} %" for settling_ms, overshoot in tap_design.curve
         )
         click.echo(f"least overshoot for each settling time: {points}", err=to_stderr)

@@ -31,11 +31,16 @@ SHOWN_AXES = 4
 
 @click.command()
 @CONFIG
-@click.option("--duration", "duration_s", type=Seconds(), help="Seconds to run, rounded to whole ticks [until Ctrl-C].")
+@click.option(
+    "--duration",
+    "duration_s",
+    type=Seconds(),
+    help="Duration of the run, rounded to whole ticks.  [default: until Ctrl-C]",
+)
 @click.option(
     "--unpaced", is_flag=True, help="Run in virtual time, as fast as the machine allows (simulated hardware only)."
 )
-@click.option("--out", type=OUTPUT, help="Folder for the recording [recording.folder].")
+@click.option("--out", type=OUTPUT, help="Folder for the recording.  [default: recording.folder]")
 @JSON
 @panel_options
 @report_errors
@@ -56,7 +61,7 @@ def run(
     require_readable(config)
     if out is not None and out.suffix == ".mcap":
         raise click.UsageError(
-            f"--out: {out} is a recording's name; allowed: a folder. rtloop names the recording in it by date and time"
+            f"--out: {out} is a recording's name; allowed: a folder. rtloop names the recording by date and time"
         )
     if panel:
         if unpaced or out is not None or as_json:

@@ -11,7 +11,7 @@ from rtloop.cli.options import OUTPUT
 
 
 @click.command()
-@click.option("--out", type=OUTPUT, help="The file to write [stdout].")
+@click.option("--out", type=OUTPUT, help="File to write.  [default: stdout]")
 @report_errors
 def schema(out: Path | None) -> None:
     """Print the JSON Schema of a configuration.

@@ -32,7 +32,11 @@ SERVICE_NAME = MatchingText(
 
 @click.command()
 @CONFIG
-@click.option("--name", type=SERVICE_NAME, help="Name of the service, for `ctl --name` [NAME for NAME.toml].")
+@click.option(
+    "--name",
+    type=SERVICE_NAME,
+    help="Name of the service, which `rtloop ctl --name` uses.  [default: NAME for NAME.toml]",
+)
 @panel_options
 @report_errors
 def serve(config: Path, name: str | None, panel: bool, panel_port: int) -> int:
@@ -48,7 +52,11 @@ def serve(config: Path, name: str | None, panel: bool, panel_port: int) -> int:
 
 @click.command()
 @CONFIG
-@click.option("--name", type=SERVICE_NAME, help="Name that the service had in `serve --name` [NAME for NAME.toml].")
+@click.option(
+    "--name",
+    type=SERVICE_NAME,
+    help="Name of the service, as in `rtloop serve --name`.  [default: NAME for NAME.toml]",
+)
 @report_errors
 def park(config: Path, name: str | None) -> None:
     """Ramp every output of CONFIG to its safe value."""
@@ -64,15 +72,19 @@ def hil() -> None:
 
 @hil.command("serve")
 @CONFIG
-@click.option("--can", "on_can", is_flag=True, help="Be the node on the CAN bus of CONFIG (driver.kind = 'can').")
-@click.option("--udp", "on_udp", is_flag=True, help="Be the node behind UDP of CONFIG (driver.kind = 'udp').")
-@click.option("--serial", "on_serial", is_flag=True, help="Be the node on a pseudo-terminal (driver.kind = 'serial').")
+@click.option("--can", "on_can", is_flag=True, help="Simulate the node on the CAN bus of CONFIG (driver.kind = 'can').")
+@click.option(
+    "--udp", "on_udp", is_flag=True, help="Simulate the node at the UDP address of CONFIG (driver.kind = 'udp')."
+)
+@click.option(
+    "--serial", "on_serial", is_flag=True, help="Simulate the node on a pseudo-terminal (driver.kind = 'serial')."
+)
 @click.option("--until-stdin-ends", "tied", is_flag=True, hidden=True)
 @report_errors
 def hil_serve(config: Path, on_can: bool, on_udp: bool, on_serial: bool, tied: bool) -> None:
-    """Be the board of CONFIG (driver.kind = 'shm'), or a node.
+    """Simulate the board or the node of CONFIG.
 
-    The board is a simulated rig with its own clock. It goes on when a loop that drives it ends.
+    The board (driver.kind = 'shm') is a simulated rig with its own clock. It goes on when a loop that drives it ends.
     """
     from rtloop.configuration.file import load
 
@@ -81,7 +93,9 @@ def hil_serve(config: Path, on_can: bool, on_udp: bool, on_serial: bool, tied: b
     axes = sorted(outputs, key=lambda axis: (len(outputs[axis]), outputs[axis]))  # dac10 comes after dac9.
     options = {"can": on_can, "udp": on_udp, "serial": on_serial}
     if sum(options.values()) > 1:
-        raise click.UsageError("--can, --udp and --serial: more than one is given; allowed: one of them")
+        raise click.UsageError(
+            "--can, --udp and --serial: more than one of these options is given; allowed: one of them"
+        )
     line = next((name for name, is_chosen in options.items() if is_chosen), None)
     is_stopped = _watch_stop_signals()
     if tied:
@@ -109,11 +123,11 @@ def _serve_board(configuration: Configuration, axes: list[str], is_stopped: Call
     if not isinstance(options, ShmOptions):
         nodes = "'can' for `rtloop hil serve --can`, 'udp' with --udp, 'serial' with --serial"
         allowed = f"'shm' for `rtloop hil serve`, {nodes}"
-        raise ConfigError(source, [f"driver.kind: {configuration.driver_kind!r}; allowed: {allowed}"])
+        raise ConfigError(source, [f"driver.kind: value is {configuration.driver_kind!r}; allowed: {allowed}"])
     rate_hz = options.board_rate_hz or configuration.loop.rate_hz
     prepare_realtime(Pacing(rate_hz, priority=BOARD_PRIORITY))
     extent = f"{count_text(len(axes), 'channel')} at {rate_hz:g} Hz"
-    click.echo(f"board at {options.file}: {extent}; Ctrl-C ends it", err=True)
+    click.echo(f"board at {options.file}: {extent}; Ctrl-C ends the board", err=True)
     try:
         samples = serve(Path(options.file), options, axes, rate_hz, is_stopped, lambda: Notifier().send(READY=1))
     except ValueError as error:
@@ -138,7 +152,9 @@ def _serve_node(configuration: Configuration, line: str, axes: list[str], is_sto
 
     options, source = configuration.driver_options, configuration.source
     if configuration.driver_kind != line:
-        raise ConfigError(source, [f"driver.kind: {configuration.driver_kind!r}; allowed with --{line}: {line!r}"])
+        raise ConfigError(
+            source, [f"driver.kind: value is {configuration.driver_kind!r}; allowed with --{line}: {line!r}"]
+        )
     if not isinstance(options, CanOptions | NodeOptions):
         raise TypeError(
             f"driver.kind: {line!r} has options of class {type(options).__name__}; allowed: CanOptions or NodeOptions"
@@ -147,7 +163,7 @@ def _serve_node(configuration: Configuration, line: str, axes: list[str], is_sto
 
     def announce() -> None:
         """Print that the node runs, and notify systemd."""
-        click.echo(f"node on {options.label}: {count_text(len(axes), 'channel')}; Ctrl-C ends it", err=True)
+        click.echo(f"node on {options.label}: {count_text(len(axes), 'channel')}; Ctrl-C ends the node", err=True)
         Notifier().send(READY=1)
 
     serve = _node_program(options)

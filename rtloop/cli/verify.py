@@ -30,7 +30,9 @@ RED = {"MISSED", "NO"}
 
 @click.command()
 @CONFIG
-@click.option("--spec", type=OUTPUT, help="The specification [each axis's key `specification`].")
+@click.option(
+    "--spec", type=OUTPUT, help="Specification file for all axes.  [default: key `specification` of each axis]"
+)
 @click.option("--out", type=OUTPUT, help="Folder for verify.html, verify.json and pictures (needs rtloop[plot]).")
 @JSON
 @report_errors

@@ -61,7 +61,8 @@ def recording_paths(value: Any, argument: str) -> list[Path]:
     if isinstance(value, Recording):
         if value.is_part:
             raise RtloopError(
-                f"{argument}: value is {value!r}; allowed: a whole recording. `rtloop cut` writes a part into a file"
+                f"{argument}: value is {value!r}; allowed: a whole recording. To use a part, "
+                "write this part to a file with `rtloop cut`"
             )
         return list(value.paths)
     if not (paths := as_paths(value, argument)):
@@ -77,13 +78,14 @@ def single_files(value: Any, argument: str) -> list[Path]:
     """
     items = [value] if isinstance(value, str | Path | Recording) else value
     if not isinstance(items, Sequence) or isinstance(items, bytes) or not items:
-        raise RtloopError(f"{argument}: value is {value!r}; allowed: a recording, or a list of at least one")
+        raise RtloopError(f"{argument}: value is {value!r}; allowed: a recording, or a list of one or more recordings")
     paths = []
     for item in items:
         files = recording_paths(item, argument)
         if len(files) > 1:
             raise RtloopError(
-                f"{argument}: value is {item!r}; allowed: recordings of one file. `rtloop cut` joins several files"
+                f"{argument}: value is {item!r}; allowed: recordings of one file each. "
+                "`rtloop cut` joins the files of a recording"
             )
         paths += files
     return paths
@@ -92,7 +94,7 @@ def single_files(value: Any, argument: str) -> list[Path]:
 def require_seconds(value: Any, argument: str) -> float:
     """Return a finite number of seconds above 0 as float. Raises RtloopError, naming `argument`, for another value."""
     if not isinstance(value, Real) or isinstance(value, bool) or not 0 < float(value) < math.inf:
-        raise RtloopError(f"{argument}: value is {value!r}; allowed: a number of seconds above 0")
+        raise RtloopError(f"{argument}: value is {value!r}; allowed: a finite number of seconds above 0")
     return float(value)
 
 
@@ -117,7 +119,7 @@ def require_numbers(value: Any, argument: str) -> list[float]:
     except (TypeError, ValueError):
         numbers = [math.nan]
     if not all(map(math.isfinite, numbers)):
-        raise RtloopError(f"{argument}: value is {value!r}; allowed: a list of numbers")
+        raise RtloopError(f"{argument}: value is {value!r}; allowed: a list of finite numbers")
     return numbers
 
 

@@ -53,7 +53,7 @@ def print_axis(out: Console, judgement: AxisJudgement, sensor: Channel) -> None:
     slew = "no slew limit while running" if limits.slew_v_per_s is None else f"slew {limits.slew_v_per_s:g} V/s"
     out.print(
         f"\n[bold]axis {axis.name}[/]: drive {drive} V, command {_command_text(axis)} µm, {slew}, "
-        f"trip ramp {limits.trip_slew_v_per_s:g} V/s; trips beyond ±{axis.interlocks.position_um:g} µm"
+        f"trip ramp {limits.trip_slew_v_per_s:g} V/s; the loop trips beyond ±{axis.interlocks.position_um:g} µm"
         f"{_sensor_text(axis.interlocks, sensor)}"
     )
     _print_law(out, judgement.check)
@@ -82,17 +82,17 @@ def _sensor_text(interlocks: InterlockOptions, sensor: Channel) -> str:
     low_v, high_v = interlocks.sensor_min_v, interlocks.sensor_max_v
     has_low, has_high = low_v > sensor.minimum_v, high_v < sensor.maximum_v
     if has_low and has_high:
-        return f" or {low_v:g} … {high_v:g} V at the sensor"
-    ends = f"which reads {sensor.minimum_v:g} … {sensor.maximum_v:g} V"
+        return f" or outside {low_v:g} … {high_v:g} V at the sensor"
+    ends = f"whose input reads {sensor.minimum_v:g} … {sensor.maximum_v:g} V"
     if not has_low and not has_high:
-        return f", never at the sensor, {ends}"
+        return f", at no voltage of the sensor, {ends}"
     return f" or {f'below {low_v:g}' if has_low else f'above {high_v:g}'} V at the sensor, {ends}"
 
 
 def _print_law(out: Console, check: AxisCheck) -> None:
     """Print the kind and the order of an axis's controller, and each notch or resonance that C(z) shifts."""
     linear = check.linear if check.together is None else check.together.linear
-    order = "" if linear is None else f", linear about its rest, of order {linear.order}"
+    order = "" if linear is None else f", linear near its rest state, of order {linear.order}"
     if check.law is None:
         out.print("no controller; possible modes: feedforward, raw and off")
     elif check.together is not None:
@@ -121,7 +121,7 @@ def _print_analyses(out: Console, judgement: AxisJudgement) -> None:
     analyses = {heading: (key, analysis) for heading, (key, analysis) in analyses.items() if analysis is not None}
     if check.law is None or not analyses:
         return
-    heading = "on the model" if check.together is None else "on the models, each loop opened alone"
+    heading = "on the model" if check.together is None else "on the models, one loop opened at a time"
     rows = [(label, *(format_value(analysis) for _, analysis in analyses.values())) for label, format_value in ROWS]
     if judgement.is_stable_on_rig is not None:
         stable = "yes" if judgement.is_stable_on_rig else "[red]NO[/]"

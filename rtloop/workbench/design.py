@@ -88,7 +88,7 @@ class DesignResult(Result):
     @property
     def headline(self) -> str:
         """Order and norms of the controller."""
-        order = f"controller of order {self.order} (before reduction {self.full_order})"
+        order = f"controller of order {self.order} ({self.full_order} before reduction)"
         return f"{order}, γ_opt {self.gamma_opt:.6g}, ‖F_l(P, C)‖∞ {self.achieved:.6g}"
 
     @property
@@ -106,9 +106,9 @@ class DesignResult(Result):
                 f"γ_opt by SLICOT's SB10AD: {self.slicot_gamma:.6g} ({deviation_percent:+.5f} % from the value above)"
             )
         lines.append(
-            f"‖F_l(P, C)‖∞ on the model with its delay is {hinf.achieved:.6g} for the full controller (order "
-            f"{self.full_order}, designed for γ = {hinf.gamma:.6g}), and {self.achieved:.6g} for the controller "
-            f"that is written (order {self.order}, after reduction)"
+            "‖F_l(P, C)‖∞, the norm of the weighted closed loop, on the model with its delay: "
+            f"{hinf.achieved:.6g} with the full controller (order {self.full_order}, designed for γ = "
+            f"{hinf.gamma:.6g}); {self.achieved:.6g} with the written controller (order {self.order}, after reduction)"
         )
         return lines
 
@@ -227,7 +227,7 @@ def _slicot_gamma(synthesis: Synthesis, design: DesignOptions) -> float:
     from rtloop.design.synthesis.hinf.slicot import slicot_gamma  # needs the extra slycot
 
     if design.plant is None:
-        raise ValueError("plant: missing; --cross-check needs [plant]")
+        raise ValueError("plant: missing; --cross-check needs [plant] in the specification")
     return slicot_gamma(augment(design.plant.transfer(), synthesis.weights), 10 * synthesis.hinf.gamma_opt)[0]
 
 

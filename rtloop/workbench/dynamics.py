@@ -180,9 +180,9 @@ def _section_text(fit: DynamicsFit, run: AxisRecording, input_kind: Input, actua
     hysteresis, left out if it is not above 0. Raises UnsuitableData for scaled hysteresis without an inverse.
     """
     content = model_section(fit, dynamics_provenance(fit, run, input_kind))
-    comments = [f"Hysteresis with the static gain {fit.static_gain:.6g} of the dynamics below included"]
+    comments = [f"Hysteresis model, multiplied by the static gain {fit.static_gain:.6g} of the dynamics below"]
     scaled = None if actuator is None else scale_hysteresis(actuator, fit.static_gain)
     if input_kind == "drive":
         scaled = proportional_actuator(fit.static_gain)
-        comments = [f"No hysteresis: the static gain {fit.static_gain:.6g} µm/V of the dynamics below"]
+        comments = [f"Model without hysteresis: only the static gain {fit.static_gain:.6g} µm/V of the dynamics below"]
     return content if scaled is None else feedforward_section(scaled, comments) + "\n" + content

@@ -33,7 +33,9 @@ def dynamics_excitation(
             "again with --unpaced or with real-time scheduling"
         )
     if input_kind == "command" and np.isnan(run.command_um).all():
-        raise UnsuitableData(f"{run.name}: the recording has no command; use --input drive or --input hysteresis")
+        raise UnsuitableData(
+            f"{run.name}: the recording has no command signal; use --input drive or --input hysteresis"
+        )
     signal = run.command_um if input_kind == "command" else run.drive_v
     if feedforward is not None:
         signal = model_output(feedforward, run.drive_v)

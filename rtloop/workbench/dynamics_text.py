@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from rtloop.design.identification.frequency_response import SEGMENT_S
-from rtloop.design.identification.model_sections import SAMPLED_TOGETHER, static_gain_text
+from rtloop.design.identification.model_sections import static_gain_text
 from rtloop.values import count_text
 from rtloop.workbench.hysteresis_text import print_files
 from rtloop.workbench.tables import format_number, table
@@ -42,36 +42,33 @@ def print_dynamics(out: Console, report: dict[str, Any]) -> None:
     out.print(f"D(0) = 1; {static_gain_text(report['static_gain'], report['input'], spread)}", markup=False)
     out.print(f"delay {count_text(report['delay_ticks'], 'sample')}; fit {report['fit_percent']:.2f} %")
     out.print(
-        f"prediction error, one step ahead: {report['rms_error_um']:.5f} µm rms over the whole recording; the table "
-        "has the error in the part to which the model was not fitted, provided that the input changes there"
+        f"prediction error, one step ahead: {report['rms_error_um']:.5f} µm rms over the whole recording. The table "
+        "of orders shows the error in the part that was held out of the fit, if the input changes in this part"
     )
     if report["free_motion_s"]:
         out.print(
-            f"the recording does not begin at rest: free motion in its first {1e3 * report['free_motion_s']:.3g} ms, "
-            "which no recorded input explains, was estimated and left out"
+            f"the recording does not begin at rest: its first {1e3 * report['free_motion_s']:.3g} ms contain free "
+            "motion, which no recorded input explains. This motion was estimated and left out of the fit"
         )
     if report["sampled_together"]:
         out.print(
-            f"{SAMPLED_TOGETHER[0].upper()}{SAMPLED_TOGETHER[1:]}, the delay is one sample more than if the position "
-            "was sampled before the drive changed; for such rows: rtloop import --position-first"
+            "the delay assumes that drive and position of a row were sampled at the same time. If the position was "
+            "sampled before the drive changed, the delay is one sample less; then use rtloop import --position-first"
         )
     out.print(
         f"residuals: {'white' if tests['white'] else 'not white'} "
         f"(largest autocorrelation {tests['largest_autocorrelation']:.3f}), "
         f"{'independent of' if tests['independent'] else 'correlated with'} the input "
-        f"({tests['largest_cross_correlation']:.3f}, {tests['cross_ratio']:.2g} of its 99 % bound)"
+        f"(largest cross-correlation {tests['largest_cross_correlation']:.3f}, {tests['cross_ratio']:.2g} of its 99 % "
+        "bound)"
     )
     if not tests["white"]:
-        out.print(
-            "the standard deviations (±) assume noise with the correlation of these residuals; an error of the "
-            "input is "
-            "not included"
-        )
+        out.print("the standard deviations (±) include the correlation of these residuals, but no error of the input")
     if report["level_correction"]:
         unit = "V" if report["input"] == "drive" else "µm"
         out.print(
-            f"the levels of the input were corrected by up to {report['level_correction']:.3g} {unit}, from the "
-            "settled position. The model of the hysteresis has this error at these levels."
+            f"the levels of the input were corrected by up to {report['level_correction']:.3g} {unit}, so that they "
+            "agree with the settled position. The model of the hysteresis has this error at these levels."
         )
     _print_response(out, report["frequency_response"])
     print_files(out, report)
@@ -82,10 +79,10 @@ def _print_response(out: Console, comparison: dict[str, Any] | None) -> None:
     if comparison:
         out.print(
             f"measured response, {comparison['from_hz']:.4g} to {comparison['to_hz']:.4g} Hz, resolution "
-            f"{comparison['resolution_hz']:.3g} Hz{_resolution_note(comparison['resolution_hz'])}: median deviation "
-            f"{100 * comparison['median_deviation']:.2f} %, largest {100 * comparison['largest_deviation']:.1f} % at "
-            f"{comparison['largest_at_hz']:.4g} Hz; peak at {comparison['measured_peak_hz']:.4g} Hz, model "
-            f"{comparison['model_peak_hz']:.4g} Hz"
+            f"{comparison['resolution_hz']:.3g} Hz{_resolution_note(comparison['resolution_hz'])}: the model deviates "
+            f"by {100 * comparison['median_deviation']:.2f} % (median), {100 * comparison['largest_deviation']:.1f} % "
+            f"(largest, at {comparison['largest_at_hz']:.4g} Hz); the measured peak is at "
+            f"{comparison['measured_peak_hz']:.4g} Hz, the model's at {comparison['model_peak_hz']:.4g} Hz"
         )
 
 
@@ -93,4 +90,8 @@ def _resolution_note(resolution_hz: float) -> str:
     """Return a note on a resolution that is coarser than usual, because the recording is short; else ""."""
     usual_hz = 1 / SEGMENT_S
     least_s = 2 * SEGMENT_S
-    return "" if resolution_hz <= 1.01 * usual_hz else f" ({usual_hz:g} Hz needs {least_s:g} s of excitation)"
+    return (
+        ""
+        if resolution_hz <= 1.01 * usual_hz
+        else f" (a resolution of {usual_hz:g} Hz needs {least_s:g} s of excitation)"
+    )

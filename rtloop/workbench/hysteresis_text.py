@@ -21,14 +21,16 @@ def print_hysteresis(out: Console, report: dict[str, Any]) -> None:
     rows = [(str(i), f"{threshold:.4f}", f"{weight:.4f}") for i, (threshold, weight) in plays]
     out.print(table("operator", "threshold V", "weight µm/V", rows=rows))
     out.print(
-        f"error of the fit {report['rms_error_um']:.3g} µm rms, at most {report['max_error_um']:.3g} µm "
-        f"({report['max_error_percent']:.3g} % of {report['range_um']:.4g} µm); noise {report['noise_um']:.3g} µm"
+        f"error of the fit: {report['rms_error_um']:.3g} µm rms, at most {report['max_error_um']:.3g} µm "
+        f"({report['max_error_percent']:.3g} % of the range of {report['range_um']:.4g} µm); noise of the position "
+        f"{report['noise_um']:.3g} µm rms"
     )
     _print_held_out(out, report)
     if report["unexplained_um"]:
         out.print(
-            f"[yellow]the actuator is no sum of plays[/]: {report['unexplained_um']:.3g} µm rms remain with any number "
-            "of plays; the error may be larger for small steps and for loops of other sizes"
+            f"[yellow]the actuator is no sum of plays[/]: with any number of plays, an error of "
+            f"{report['unexplained_um']:.3g} µm rms remains. The error may be larger for small steps and for "
+            "hysteresis loops of other sizes"
         )
     out.print(
         "height of the hysteresis loop in percent of the position's range: "
@@ -36,7 +38,9 @@ def print_hysteresis(out: Console, report: dict[str, Any]) -> None:
         f"{format_number(report['model_h_percent'], '.2f')} % by the model"
     )
     if not report["invertible"]:
-        out.print("[red]no inverse[/]: a partial sum of the weights is not above 0; use --weights invertible")
+        out.print(
+            "[red]the model has no inverse[/]: a partial sum of the weights is not above 0. Use --weights invertible"
+        )
     print_files(out, report)
 
 
@@ -68,10 +72,16 @@ def _print_held_out(out: Console, report: dict[str, Any]) -> None:
     combined = report["held_out_all"]
     error, written = combined["error"], combined["as_written"]
     if error["std_um"] is not None:
-        out.print(f"all, held out: {_rms_text(error)} µm rms; the plays alone: {_rms_text(written)} µm rms")
+        out.print(
+            f"held-out error over all recordings: {_rms_text(error)} µm rms; with the plays alone: "
+            f"{_rms_text(written)} µm rms"
+        )
     if "tried_um" in report:
         trials_text = ", ".join(f"{name} {error_um:.3g}" for name, error_um in report["tried_um"].items())
-        out.print(f"held-out errors in µm rms: {trials_text}; chosen: {' + '.join(('plays', *report['terms']))}")
+        out.print(
+            f"held-out error of each model in µm rms: {trials_text}; chosen model: "
+            f"{' + '.join(('plays', *report['terms']))}"
+        )
         missing = f"; {report['missing']}" if report["missing"] else ""
         out.print(f"this model is valid for strokes of up to {report['stroke_v']:.4g} V{missing}")
 

@@ -47,9 +47,9 @@ def validation_comments(rows: Sequence[dict[str, Any]], extra: dict[str, Any]) -
     worst_row = max((row for row in rows if row["judged_percent"]), key=lambda row: row["max_error_percent"])
     name, memory = Path(worst_row["recording"]).name, worst_row["memory"]
     lines = [
-        f"held out: {worst_row['rms_error_um']:.3g} µm rms, at most {worst_row['max_error_percent']:.3g} % of "
-        f"{worst_row['range_um']:.4g} µm, in {name}; memory at the start: {memory}, "
-        f"{worst_row['judged_percent']:.3g} % of this recording judged"
+        f"largest held-out error, in {name}: {worst_row['rms_error_um']:.3g} µm rms, at most "
+        f"{worst_row['max_error_percent']:.3g} % of the range of {worst_row['range_um']:.4g} µm. Memory at the start: "
+        f"{memory}; {worst_row['judged_percent']:.3g} % of this recording was judged"
     ]
     play_errors_um = [row["as_written_rms_um"] for row in rows if math.isfinite(row["as_written_rms_um"])]
     if extra.get("terms") and play_errors_um:

@@ -113,10 +113,11 @@ def _configured_law(configuration: Configuration, recording: Recording) -> LawWi
     header, faults = recording.header, []
     names = [axis.name for axis in configuration.axes]
     if names != header["axes"]:
-        faults.append(f"axis: {', '.join(names)}; allowed: the recording's axes, {', '.join(header['axes'])}")
+        faults.append(f"axis: value is {', '.join(names)}; allowed: the recording's axes, {', '.join(header['axes'])}")
     if configuration.loop.rate_hz != header["rate_hz"]:
         faults.append(
-            f"loop.rate_hz: {configuration.loop.rate_hz:g} Hz; allowed: the recording's rate, {header['rate_hz']:g} Hz"
+            f"loop.rate_hz: value is {configuration.loop.rate_hz:g} Hz; allowed: the recording's rate, "
+            f"{header['rate_hz']:g} Hz"
         )
     if faults:
         raise ConfigError(configuration.source, faults)
@@ -130,7 +131,9 @@ def _make_rig(configuration: Configuration, recording: Recording) -> Driver:
     Raises ConfigError for a driver of another kind and for invalid options.
     """
     if configuration.driver_kind != "sim":
-        fault = f"driver.kind: {configuration.driver_kind!r}; allowed with --resimulate: 'sim', the simulated rig"
+        fault = (
+            f"driver.kind: value is {configuration.driver_kind!r}; allowed with --resimulate: 'sim', the simulated rig"
+        )
         raise ConfigError(configuration.source, [fault])
     try:
         kind = driver_class(configuration.driver_kind)

@@ -30,7 +30,7 @@ STEP_METRICS = (
 def print_replay(out: Console, path: Path, report: ReplayReport) -> None:
     """Print gaps, problems, ticks that are not verified, the verdict, and signals that are not judged."""
     for gap in report.gaps:
-        out.print(f"gap: {count_text(gap['count'], 'tick')} from tick {gap['first_tick']} on, missing in the recording")
+        out.print(f"gap: the recording lacks {count_text(gap['count'], 'tick')} from tick {gap['first_tick']} on")
     print_problems(out, report.problems)
     for entry in report.not_verified:
         out.print(f"[red]not verified[/]: {_range_text(entry)}{escape(entry['why'])}")
@@ -38,12 +38,14 @@ def print_replay(out: Console, path: Path, report: ReplayReport) -> None:
     if report.skipped:
         stretches = count_text(report.stretches, "stretch", "stretches")
         extent += f" in {stretches}"
-        out.print(f"not recorded, by intention: {count_text(report.skipped, 'tick')} outside {stretches} around events")
+        out.print(
+            f"not recorded, as configured: {count_text(report.skipped, 'tick')} outside {stretches} around events"
+        )
     name, difference = escape(path), report.first_difference
     if report.identical:
-        out.print(f"[green]identical[/]: {name}: {extent} compared in bytes")
+        out.print(f"[green]identical[/]: {name}: {extent} compared byte by byte")
     elif difference is None:
-        out.print(f"[red]not verified as a whole[/]: {name}: no difference in {extent} compared in bytes")
+        out.print(f"[red]not verified as a whole[/]: {name}: no difference in {extent}, compared byte by byte")
     else:
         place = f"tick {difference['tick']}, {difference['signal']}"
         if (difference["recorded"], difference["replayed"]) != (None, None):
@@ -66,7 +68,7 @@ def print_differences(out: Console, report: dict[str, Any]) -> None:
     `report` is the dict of `replay_with_other_law`.
     """
     law, recording = escape(report["config"]), escape(report["recording"])
-    out.print(f"the law of {law} on the inputs of {recording}: {count_text(report['ticks'], 'tick')}")
+    out.print(f"the law of {law}, run on the inputs of {recording}: {count_text(report['ticks'], 'tick')}")
     rows = table("difference", "largest", "at tick", "rms")
     for name, difference in report["signals"].items():
         rows.add_row(name, f"{difference['max']:.6g}", str(difference["at_tick"]), f"{difference['rms']:.6g}")

@@ -22,8 +22,8 @@ from rtloop.workbench.arguments import FileName, as_path, load_configuration, re
 from rtloop.workbench.run_result import RunResult
 
 TEMPORARY_CACHE = (
-    f"no cache folder can be written: compiled code is in {CACHE_FOLDER}, and is compiled again once that folder is "
-    "deleted"
+    f"no cache folder can be written: the compiled code is in {CACHE_FOLDER}. Once that folder is deleted, rtloop "
+    "compiles the code again"
 )
 
 

@@ -148,5 +148,7 @@ class RunResult(Result):
         matplotlib.
         """
         if self.recording is None:
-            raise LoopFault("plot: the run has no recording; see its outcome, error and notes")
+            raise LoopFault(
+                "plot: the run has no recording; the result's `outcome`, `error` and `notes` state the reason"
+            )
         return draw_recording(self.recording, start_s, end_s)

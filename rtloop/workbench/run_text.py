@@ -17,9 +17,9 @@ if TYPE_CHECKING:
     from rtloop.recording.views.summary import Summary
 
 SPECIFIED_STEP = (
-    "MISSED: the worst recorded step is beyond the limit. A specification is for the linear loop's step from rest at 0 "
-    "µm: between other levels the hysteresis adds to the error, and the static error of a loop without integrator is "
-    "a part of the position, not of the step."
+    "MISSED: the worst recorded step is beyond the limit. The limit is for a step of the linear loop from rest at 0 "
+    "µm. Between other levels, hysteresis adds to the error. Without an integrator, the static error grows with the "
+    "position, not with the height of the step."
 )
 """Difference between a recorded step and the step that a specification limits."""
 

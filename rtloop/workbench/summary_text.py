@@ -50,7 +50,7 @@ def print_summary(out: Console, summary: Summary) -> None:
         scheduling = " ".join(str(realtime[key]) for key in ("scheduler", "priority") if realtime.get(key))
         memory = "memory locked" if realtime.get("mlock") else "memory not locked"
         rows.add_row("achieved rate", rate, f"{scheduling or 'scheduler not known'}, {memory}")
-        rows.add_row("periods missed", str(summary.periods_missed), "skipped by late ticks, never caught up")
+        rows.add_row("periods missed", str(summary.periods_missed), "a late tick skips the periods that it misses")
         rows.add_row("overruns", str(summary.overruns), "ticks that ended after their period")
     else:
         rows.add_row("clock", "virtual", "unpaced: nothing was timed")
@@ -59,16 +59,18 @@ def print_summary(out: Console, summary: Summary) -> None:
         rows.add_row("limited", "", f"ticks by cause: {counts}")
     if (summary.saturated_percent or 0.0) > UNCONTROLLED_PERCENT:
         share = f"{summary.saturated_percent:.0f} % of the ticks in closed loop"
-        rows.add_row("[red]saturated[/]", "", f"[red]in {share} the law exceeded the limit of command or drive[/]")
+        rows.add_row(
+            "[red]saturated[/]", "", f"[red]in {share}, the law's output exceeded the limit of command or drive[/]"
+        )
     for axis in summary.axes:
         if axis.settled_percent is not None and axis.settled_percent < UNCONTROLLED_PERCENT:
             share = f"{100 - axis.settled_percent:.0f} % of the ticks in closed loop"
-            error = f"the error of {escape(axis.name)} was larger than {axis.settled_within_um:g} µm"
-            rows.add_row("[red]not settled[/]", "", f"[red]in {share} {error}[/]")
+            error = f"the error of axis {escape(axis.name)} was larger than {axis.settled_within_um:g} µm"
+            rows.add_row("[red]not settled[/]", "", f"[red]in {share}, {error}[/]")
         if axis.opposed:
-            opposed = f"the position of {escape(axis.name)} fell as its drive rose: check the sign of its um_per_v"
-            remedy = "and the wires of sensor and drive; `rtloop drivers --selftest CONFIG` measures it"
-            rows.add_row("[red]sign[/]", "", f"[red]{opposed}, {remedy}[/]")
+            opposed = f"the position of axis {escape(axis.name)} fell as its drive rose. Check the sign of its um_per_v"
+            remedy = "and the wires of sensor and drive; `rtloop drivers --selftest CONFIG` measures the sign"
+            rows.add_row("[red]sign[/]", "", f"[red]{opposed} {remedy}[/]")
     if cut := summary.cut:
         rows.add_row("cut", f"{cut['first']} …", f"to tick {cut['end'] - 1}, of {escape(', '.join(cut['files']))}")
     if len(summary.parts) > 1:

@@ -178,7 +178,7 @@ def test_ctrl_c_lets_the_recordings_end_and_the_same_command_continues(folder, r
     os.killpg(process.pid, signal.SIGINT)
     _, errors = process.communicate(timeout=100)
     assert (process.returncode, "Traceback" in errors) == (130, False), errors
-    assert "the same command continues" in errors
+    assert "run the same command again" in errors
     assert archive("replay", folder, "--out", out, folder=tmp_path)[1]["verdicts"] == report["verdicts"]
 
 

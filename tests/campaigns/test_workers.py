@@ -190,7 +190,7 @@ def test_a_full_disk_loses_no_result_and_the_same_command_continues(campaign, ex
             2,
             "--jobs: not allowed",
         ),
-        (["campaign", "rerun", "stage.toml", "61"], 2, "RIG: 61; allowed: 0 … 60"),
+        (["campaign", "rerun", "stage.toml", "61"], 2, "RIG: value is 61; allowed: 0 … 60"),
     ],
 )
 def test_a_mistake_of_the_command_line_is_named(campaign, arguments, code, named, monkeypatch):

@@ -216,7 +216,7 @@ def test_of_several_axes_the_compensation_is_that_of_the_first_as_its_help_says(
     words = ("design", "compensation", DEPLOY / "two-axis.toml", "--actuator", two)
     weights = [report(*words, *option)["weights"] for option in ((), ("--axis", "x"), ("--axis", "y"))]
     assert weights[0] == weights[1] != weights[2]
-    assert "[the first one]" in command("design", "compensation", "--help").stdout
+    assert "[default: the first axis]" in command("design", "compensation", "--help").stdout
 
 
 @pytest.mark.parametrize(

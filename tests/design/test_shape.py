@@ -231,7 +231,7 @@ def test_the_command_prints_figures_and_the_written_file_on_stdout(tmp_path) -> 
     out = tmp_path / "made.toml"
     result = shape(tmp_path, CONFIG, SPEC, "--out", str(out))
     assert result.exit_code == 0, result.stderr
-    assert re.search(r"settling \(5 %\) [\d.]+ ms, the least possible", result.stdout)
+    assert re.search(r"settling time \(5 %\) [\d.]+ ms; with overshoot ≤ [\d.]+ %, the least possible", result.stdout)
     assert result.stdout.endswith(f"{out} is written. To judge it: rtloop design verify {out}\n")
 
 

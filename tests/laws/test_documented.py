@@ -50,7 +50,7 @@ def test_a_new_law_runs_replays_and_is_tuned_and_swapped_live(folder: Path):
     assert [line.split()[1] for line in offline] == ["laws", "law", "check", "run", "replay"]
     output = [ran(folder, command) for command in offline]
     assert "integral_resonant" in output[0]
-    assert "law 'damping', linear about its rest, of order 1" in output[2]
+    assert "law 'damping', linear near its rest state, of order 1" in output[2]
     assert "identical" in output[4]
     example = folder / "damping.toml"
     example.write_text(example.read_text().replace("# laws = ", "laws = ") + PATIENT_SERVICE)

@@ -70,5 +70,5 @@ def test_the_summary_of_a_trip_names_a_wrong_sign_and_blames_no_right_one(old, n
     result = CliRunner().invoke(main, command)
     assert result.exit_code == 1, result.output
     assert "trip" in result.stdout
-    said = "the position of x fell as its drive rose: check the sign of its um_per_v"
+    said = "the position of axis x fell as its drive rose. Check the sign of its um_per_v"
     assert (said in " ".join(result.stdout.split())) is named

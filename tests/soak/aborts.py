@@ -66,7 +66,7 @@ def check(found: Aborted, folder: Path) -> str:
     assert "Traceback" not in found.error, found.error
     assert found.exit_code in (0, 1), found
     too_late_for_a_run = "no report was written" in found.error
-    assert found.exit_code == 0 or too_late_for_a_run or "interrupted; the outputs are parked" in found.error, (
+    assert found.exit_code == 0 or too_late_for_a_run or "interrupted. The outputs are parked" in found.error, (
         found.error
     )
     assert found.recordings, found.error

@@ -89,7 +89,7 @@ def test_two_kinds_share_a_folder_and_its_schema(tmp_path: Path) -> None:
             ("--kind", "driver", "--config", "x.toml"),
             "--config: not allowed with --kind driver; allowed with --kind law",
         ),
-        (("--kind", "law", "--config", "elsewhere/x.toml"), "allowed: a file in FOLDER"),
+        (("--kind", "law", "--config", "elsewhere/x.toml"), "allowed: a file directly in this folder"),
         (("--kind", "law", "--name", "My Law"), "value is 'My Law'; allowed: small letters"),
     ],
 )
