@@ -110,7 +110,7 @@ class DriverContract:
         for names in ([c.name for c in facts.inputs], [c.name for c in facts.outputs], facts.observed):
             assert len(set(names)) == len(names), f"two channels have the same name: {names}"
         assert facts.max_rate_hz > 0, f"max_rate_hz is {facts.max_rate_hz}; allowed: above 0"
-        assert driver.facts == facts, "the facts differ when they are read twice"
+        assert driver.facts == facts, "two reads of `facts` gave different values; allowed: the same facts at each read"
         assert self.outputs(driver) == before, "reading the facts moved the outputs; facts must not touch the hardware"
 
     def test_a_configuration_can_name_it(self) -> None:

@@ -196,7 +196,7 @@ class ShmDriver(Driver):
         """
         if os.fstat(fd).st_size < board.file_bytes():
             raise DriverError(
-                f"{self._file}: not the memory of a board, or the board has not started; "
+                f"{self._file}: this file is not the memory of a board, or the board has not started; "
                 "start the board with `rtloop hil serve CONFIG`"
             )
         facts = BoardMemory(fd).facts

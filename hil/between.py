@@ -71,8 +71,8 @@ def positions_between_ticks(
     if (modes, parts) != (coefficients["mode_count"][axis], PARTS) or not factors.flags.c_contiguous:
         raise ValueError(
             f"factors: the array has the shape {modes} × {parts} × {points}; allowed: "
-            f"{coefficients['mode_count'][axis]} × {PARTS} × any number, stored row by row, as fractions_of_period "
-            "returns it for this axis"
+            f"{coefficients['mode_count'][axis]} × {PARTS} × any number, stored row by row; use the result of "
+            "fractions_of_period for this axis"
         )
     own_state, positions_um = state[axis : axis + 1].copy(), np.empty((ticks, points))
     _fill_positions(

@@ -140,8 +140,8 @@ class CreepOptions(Options):
         gains, constants = self.gains, self.time_constants_s
         if len(gains) > MAX_LAGS or len(gains) != len(constants):
             raise ValueError(
-                f"gains has {len(gains)} and time_constants_s {len(constants)} numbers; "
-                f"allowed: equally many, at most {MAX_LAGS}"
+                f"gains has {len(gains)} numbers, time_constants_s has {len(constants)}; "
+                f"allowed: equal counts, at most {MAX_LAGS}"
             )
         if any(constant <= 0 for constant in constants):
             raise ValueError(f"time_constants_s: {list(constants)} s; allowed: numbers above 0")

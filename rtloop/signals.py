@@ -25,7 +25,7 @@ VALUE_AND_LIMIT = "{cause} {value:.6g}{unit}, its limit {limit:g}{unit}"
 COMMON_SIGNALS = (
     Signal("tick", "1", "index of the executed tick, from 0"),
     Signal("deadline_ns", "ns", "time at which the tick was due, since the start of the run"),
-    Signal("lateness_us", "µs", "time from the deadline to the wake; NaN in virtual time, unless it is simulated"),
+    Signal("lateness_us", "µs", "time from the deadline to the wake; NaN in virtual time without simulated lateness"),
     Signal("read_us", "µs", "duration of the driver's read; NaN in virtual time"),
     Signal("law_us", "µs", "time from the end of the read to the start of the write; NaN in virtual time"),
     Signal("write_us", "µs", "duration of the driver's write; NaN in virtual time"),
@@ -35,7 +35,7 @@ COMMON_SIGNALS = (
     Signal("mode", "1", "Mode in force during the tick"),
     Signal("driver_status", "1", "return value of the driver's read: 0 good, above 0 degraded, below 0 failed"),
     Signal("sample_age_us", "µs", "age of the sample as the driver states it; 0: the read itself took the sample"),
-    Signal("enable_v", "V", "voltage of the enable input; 0 without one"),
+    Signal("enable_v", "V", "voltage of the enable input; 0 if there is no enable input"),
 )
 AXIS_SIGNALS = (
     Signal("adc_v", "V", "voltage of the input"),
@@ -43,9 +43,9 @@ AXIS_SIGNALS = (
     Signal("reference_um", "µm", "reference x_d before the pre-filter; volts in raw mode"),
     Signal("error_um", "µm", "error e: pre-filtered reference minus position"),
     Signal("command_um", "µm", "command v to the inverse hysteresis, before its limit"),
-    Signal("demand_v", "V", "drive that the law asks for, before limit and slew"),
+    Signal("demand_v", "V", "drive that the law asks for, before the limits of voltage and slew rate"),
     Signal("drive_v", "V", "drive u written to the driver"),
-    Signal("feed_um", "µm", "second column of a table reference, added to v in closed loop; 0 without one"),
+    Signal("feed_um", "µm", "second column of a table reference, added to v in closed loop; 0 without this column"),
 )
 (
     TICK,

@@ -40,7 +40,7 @@ BROKEN = {
 PROBLEMS = {
     "reversed": "axis.x.controller: the loop is unstable on axis.x.model",
     "no gain": "the loop does not follow its reference",
-    "large weights": "with these weights the drive's limits reach 4.302e+04 µm, with those of the ",
+    "large weights": "with these weights the drive's limits reach 4.302e+04 µm, with the weights of the ",
     "sensor sign": "driver.channels.x.um_per_v: 10 µm/V, but the simulated sensor has -10 µm/V; with the opposite sign",
     "sensor scale": "but the simulated sensor has 1 µm/V; measured positions are 10 times the true ones",
     "delay": "axis.x.model.delay_ticks: 0, but the simulated rig has driver.latency_ticks = 10",

@@ -47,7 +47,7 @@ PROVOKED = [
     ),
     (
         (("sensor_min_v = -9.99", "sensor_min_v = -1.9"), ("sensor_max_v = 9.99", "sensor_max_v = 1.9")),
-        "reference: reaches 20 µm, beyond the end of the sensor's range, 19 µm, which trips",
+        "reference: reaches 20 µm, beyond the end of the sensor's range, 19 µm; the loop would trip",
     ),
     ((("position_um = 60.0", "position_um = 15.0"),), "reference: reaches 20 µm, beyond interlocks.position_um = 15"),
     (
@@ -93,9 +93,9 @@ def test_weights_whose_whole_stroke_is_noise_are_named() -> None:
     head = f'[loop]\nrate_hz = 10000\nmode = "off"\n[driver]\nkind = "sim"\n{wired("adc0", "dac0")}'
     (line,) = [line for line in found(head + one_axis(um_per_v=0.0009)) if "weights" in line]
     assert line.startswith(
-        "axis.x.feedforward.weights_um_per_v: with these weights the drive's limits reach 0.009 µm, within the "
+        "axis.x.feedforward.weights_um_per_v: with these weights the drive's limits reach 0.009 µm, less than the "
     )
-    assert line.endswith("noise of 0.01 µm")
+    assert line.endswith("noise of 0.01 µm; identify the weights on this stage")
 
 
 def test_a_reference_of_the_schedule_counts() -> None:
@@ -115,7 +115,7 @@ RECOVER = "[service.recover]\n"
         (f"{SERVICE}tare_s = 1.0\n{SCHEDULE.replace('-43', '-4')}", ["schedule: not allowed with service.tare_s or"]),
         (
             f"{RECOVER}{SCHEDULE.replace('-43', '-4')}",
-            ["schedule: not allowed with service.recover, because the ticks"],
+            ["schedule: not allowed with service.recover, because a loop that"],
         ),
     ],
 )

@@ -210,7 +210,7 @@ def test_a_file_of_another_kind_is_named_with_its_commands(tmp_path: Path) -> No
         (("design", "synthesise", recording), 66, "a recording, not a text file; `rtloop info`"),
         (("info", PAPER), 66, "not a recording: a text in TOML; `rtloop check`"),
         (("identify", "hysteresis", spec), 66, "not a recording: a text in TOML; `rtloop check`"),
-        (("check", spec), 78, "this file is a specification, and a configuration is needed"),
+        (("check", spec), 78, "this file is a specification; give a configuration"),
         (("design", "shape", spec, "--out", folder / "out.toml"), 78, "this file is a specification"),
         (
             ("design", "verify", PAPER, "--spec", PAPER),

@@ -29,7 +29,8 @@ class Frame:
         if message.is_extended_frame or self.length not in FD_LENGTHS[: None if self.fd else 9]:
             raise ValueError(
                 f"{self.name}: {self.length} bytes, identifier {self.identifier:#x}; "
-                "allowed: an 11-bit identifier, and a length that the bus can send"
+                "allowed: an 11-bit identifier, and a length of 0 to "
+                f"{'8, 12, 16, 20, 24, 32, 48 or 64' if self.fd else '8'} bytes"
             )
         signals = sorted(message.signals, key=lambda signal: signal.start)
         layout, position = "<", 0
@@ -144,8 +145,8 @@ def choose_exchange(frames: dict[str, Frame], channels: int, options: BusOptions
     if not pairs:
         kind = "CAN FD" if options.fd else "classic CAN"
         raise ValueError(
-            f"channels: {channels} axes; the DBC file has no {kind} frames Drive… and Sample… with the same ending "
-            f"(such as Drive2 and Sample2) and room for {channels} axes; add both frames, or set another dbc"
+            f"channels: {channels} axes; the DBC file has no pair of {kind} frames with room for {channels} axes and "
+            "names of the same ending, such as Drive2 and Sample2; add both frames, or set another dbc"
         )
     exchange = min(pairs, key=lambda pair: pair.drive.length + pair.sample.length)
     numbers = range(exchange.channel_capacity)

@@ -223,7 +223,8 @@ class NodeDriver(Driver):
         ):
             if count != expected:
                 raise DriverError(
-                    f"{options.label}: the node has {count} {name.replace('_', ' ')}; driver.{name} is {expected}"
+                    f"{options.label}: the node has {count} {name.replace('_', ' ')}; driver.{name} is {expected}; "
+                    "allowed: equal numbers"
                 )
         for name, scales, range_v in (
             ("input_range_v", welcome.inputs, options.input_range_v),

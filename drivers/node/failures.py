@@ -12,12 +12,12 @@ TEXTS = {
     BUSY: "another controller drives this node; stop the other controller",
     UNKNOWN: "the node does not know this loop, so the outputs do not follow the loop; start the loop again",
     WATCHDOG: "no drive reached the node for longer than watchdog_ms, and the node's watchdog has parked the outputs",
-    SIZE: "the number of the node's outputs is not driver.outputs; set driver.outputs to the number of the node",
-    RANGE: "the node refused a drive outside its range",
+    SIZE: "driver.outputs differs from the number of the node's outputs; set driver.outputs to this number",
+    RANGE: "the node refused a drive outside the range of the node's output",
     FLAGS: "the node refused a drive with unknown flags",
     RESTARTED: "the node has restarted, and the outputs are at the safe values",
     NOT_READY: "the node has parked its outputs",
-    LINK: "too many ticks without an answer in time: the error level has reached driver.error_limit",
+    LINK: "too many ticks without an answer in time: the error level has reached driver.error_limit; check the line",
     SILENT: "the node does not answer, or the outputs do not reach the safe values; check the node and the line",
     LINE_GONE: "the serial line has ended: the node was unplugged or has restarted",
     NOT_A_NUMBER: "a drive is not a number; nothing was sent",
@@ -26,4 +26,4 @@ TEXTS = {
 
 def failure_text(number: int) -> str:
     """Return the sentence for failure `number`; for an unknown one, a sentence with the number."""
-    return TEXTS.get(number, f"the node refused a drive for reason {number}")
+    return TEXTS.get(number, f"the node refused a drive for a reason that this rtloop does not know, number {number}")

@@ -114,7 +114,9 @@ def _replay(paths: list[Path]) -> Row:
     except RecordingError:
         if not recording.left_out:
             raise
-        return _row(DAMAGED, _reasons([*recording.left_out[: MAX_REASONS - 1], "no tick can be compared"]))
+        return _row(
+            DAMAGED, _reasons([*recording.left_out[: MAX_REASONS - 1], "no tick can be compared with its replay"])
+        )
     return _judge_report(report, _missing_files(paths), recording.extents[-1].totals is None)
 
 
@@ -171,7 +173,7 @@ def _unfinished_reason(path: Path) -> str:
     """
     if is_being_written(path):
         return "a recorder is writing this file"
-    return "left from an unfinished run; `rtloop recover` completes it"
+    return "an unfinished run left this file; complete it with `rtloop recover`"
 
 
 def _missing_files(paths: Sequence[Path]) -> list[str]:

@@ -113,7 +113,7 @@ class CaseRunner:
         nominal = self._builder.nominal_value(key)
         if isinstance(nominal, bool) or not isinstance(nominal, int | float):
             raise ValueError(
-                f"{key}: the configuration has the value {nominal!r}; relative = true needs a number there"
+                f"{key}: the configuration has the value {nominal!r}; allowed with relative = true: a number"
             )
         return nominal * value
 
@@ -250,10 +250,10 @@ def _require_equal(computed_um: Real, recorded_um: Real) -> None:
     """
     if not np.array_equal(computed_um, recorded_um, equal_nan=True):
         raise ValueError(
-            "the actuator moved in periods that the loop missed, and its true position there is unknown; remove "
-            "lateness from the campaign, or set it to a recording whose ticks are all less than a period late. Missed "
-            "periods are allowed only for a rig with driver.latency_ticks = 0, without creep and without the fault "
-            "drive_lost"
+            "the actuator moved in periods that the loop missed, so its true position in these periods is unknown; "
+            "remove lateness from the campaign, or set lateness to a recording whose ticks are all less than one "
+            "period late. Missed periods are allowed only for a rig with driver.latency_ticks = 0, without creep and "
+            "without the fault drive_lost"
         )
 
 

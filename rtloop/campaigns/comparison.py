@@ -65,7 +65,9 @@ def compare_campaigns(first: Path, second: Path) -> Comparison:
     ]
     source = f"{first} and {second}"
     if not common.size:
-        raise ConfigError(source, ["no rig is in both; run both campaigns with the same seed and keys"])
+        raise ConfigError(
+            source, ["the two campaigns have no rig in common; run both campaigns with the same seed and keys"]
+        )
     keys = [key for key in manifests[0]["keys"] if key in manifests[1]["keys"]]
     different = [key for key in keys if not np.array_equal(paired[0][key], paired[1][key])]
     if different or set(manifests[0]["keys"]) != set(manifests[1]["keys"]):
@@ -78,7 +80,8 @@ def compare_campaigns(first: Path, second: Path) -> Comparison:
     for part in ("experiments", "limits"):
         if manifests[0][part] != manifests[1][part]:
             raise ConfigError(
-                source, [f"{part}: differ between the two campaigns; allowed: equal {part}; set them in CAMPAIGN.toml"]
+                source,
+                [f"{part}: differ between the two campaigns; allowed: equal {part}; set them in both campaign files"],
             )
     figures = manifests[0]["figures"]
     return Comparison(

@@ -78,8 +78,8 @@ class Coordinator:
         """
         if item.rig == NOMINAL:
             raise LoopFault(
-                "each worker process that ran the nominal rig died; a script must call rtloop.campaign below "
-                '`if __name__ == "__main__":`, and the configuration must run with `rtloop run --unpaced`'
+                "each worker process that ran the nominal rig died; check that `rtloop run --unpaced` runs the "
+                'configuration; a script must call rtloop.campaign below `if __name__ == "__main__":`'
             )
         self.crashed.append(item.rig)
         self._store.add(item.unit, [crashed_case(item.rig, self._runner.sample_values(item.rig))])

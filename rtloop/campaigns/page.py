@@ -140,9 +140,10 @@ def _estimate_text(sampling: str, estimate: Yield, rigs: int) -> str:
         "can run. The interval is that of Clopper and Pearson (1934)"
     )
     if sampling == "random":
-        return f"{text}: it contains the true share in at least 95 % of campaigns."
+        return f"{text}: this interval contains the true share in at least 95 % of campaigns."
     independent = (
-        f" Only the rigs of the independent rows of the design count, {estimate.rigs:,} of {count_text(rigs, 'rig')}."
+        f" The yield counts only rigs that are independent of each other: {estimate.rigs:,} of "
+        f"{count_text(rigs, 'rig')}."
         if sampling == "saltelli"
         else ""
     )
@@ -246,7 +247,7 @@ def rank_keys(keys: Sequence[str], columns: Columns, summary: CampaignSummary) -
     passed = columns["status"] == PASSED
     if totals and np.isfinite(list(totals.values())).all():
         ranked = sorted(keys, key=lambda key: -totals[key])
-        return RankedKeys(ranked, "the keys with the largest total index of passing")
+        return RankedKeys(ranked, "the keys with the largest total sensitivity index for passing")
     if not passed.any() or passed.all():
         return RankedKeys(keys, f"the first keys of the campaign, as {'all' if passed.any() else 'no'} rigs pass")
     numbers = {key: _key_numbers(columns[key])[0] for key in keys}

@@ -255,14 +255,14 @@ def _draw_sensitivity(figure: Any, indices: Mapping[str, Mapping[str, Sensitivit
         for offset, column, color, hatch in ((-0.2, 0, ink.measured, ""), (0.2, 3, ink.comparison, "///")):
             panel.barh(
                 places + offset, values[:, column], 0.36, color=color, hatch=hatch, edgecolor=ink.background,
-                linewidth=0, label=("alone (first index)", "alone and with others (total index)")[column // 3],
+                linewidth=0, label=("key alone (first index)", "key alone and with others (total index)")[column // 3],
             )  # fmt: skip
             panel.hlines(
                 places + offset, values[:, column + 1], values[:, column + 2], color=ink.text, linewidth=1.1,
                 label="95 % interval" if column else None,
             )  # fmt: skip
         if not np.isfinite(values).any():
-            text = "no index: infinite for a rig,\nequal for all, or too few rigs"
+            text = "no index: a rig has an infinite value,\nall rigs have the same value,\nor there are too few rigs"
             panel.text(0.5, 0.5, text, transform=panel.transAxes, ha="center", va="center", fontsize=8)
         low, high = np.nanmin([0.0, *values.ravel()]), np.nanmax([1.0, *values.ravel()])
         panel.set_xlim(low - 0.02 * (high - low), high + 0.02 * (high - low))

@@ -102,8 +102,8 @@ class StepsExperiment(ExperimentOptions):
         """Require levels of which each differs from the one before it, from 0 on."""
         if any(a == b for a, b in zip((0.0, *self.levels_um), self.levels_um, strict=False)):
             raise ValueError(
-                f"levels_um: {list(self.levels_um)}; allowed: each level different from the one before it, and the "
-                "first from 0"
+                f"levels_um: {list(self.levels_um)}; allowed: a first level other than 0, and each further level "
+                "different from the level before"
             )
         return self
 

@@ -158,7 +158,7 @@ def find_boundary(runner: CaseRunner, key: str, evaluate: Evaluate, tolerance: f
         return case.refusal or "; ".join(case.missed)
 
     if nominal[key] is None:
-        raise ConfigError(runner.campaign.name, [f"boundary: {key!r} has no value in the configuration; set one"])
+        raise ConfigError(runner.campaign.name, [f"boundary: {key!r} has no value in the configuration; set a value"])
     begin = float(nominal[key])
     if cause := failure(begin):
         return Boundary(key, begin, begin, cause, cause, count)
@@ -205,7 +205,7 @@ def _check_search(runner: CaseRunner, figure: str) -> None:
     words = [key for key, distribution in options.uncertain.items() if not distribution.is_numeric]
     if words:
         raise ConfigError(
-            name, [f"uncertain.{key}: choices that are no numbers; a search needs numbers" for key in words]
+            name, [f"uncertain.{key}: the choices are not all numbers; a search needs numbers" for key in words]
         )
 
 

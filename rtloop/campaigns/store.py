@@ -245,7 +245,10 @@ def read_manifest(folder: Path) -> dict[str, Any]:
     except ValueError:
         raise InputFileError(f"{path}: not valid JSON; choose the folder of a campaign's results") from None
     if not isinstance(manifest, dict) or set(_MANIFEST_KEYS) - manifest.keys():
-        raise InputFileError(f"{path}: not the manifest of a campaign; needs {', '.join(_MANIFEST_KEYS)}")
+        raise InputFileError(
+            f"{path}: not the manifest of a campaign, which has the keys {', '.join(_MANIFEST_KEYS)}; choose the "
+            "folder of a campaign's results"
+        )
     return manifest
 
 
@@ -279,7 +282,8 @@ def read_columns(folder: Path) -> dict[str, Any]:
     rigs = table.column("rig").to_numpy()
     if np.unique(rigs).size != rigs.size:
         raise InputFileError(
-            f"{folder}: rigs are stored twice, as after a kill; run the campaign again, which removes the second copy"
+            f"{folder}: some rigs are stored twice, as after a run that was killed; run the campaign again: this "
+            "removes the second copies"
         )
     return {name: _values(library, table.column(name)) for name in table.column_names}
 

@@ -155,7 +155,7 @@ class DaskWorkers:
         if not self.count:
             self.close()
             raise UnavailableError(
-                f"{self.name}: no worker; start one with `dask worker --nthreads 1` and this scheduler's address"
+                f"{self.name}: no worker is connected; start `dask worker --nthreads 1` with this scheduler's address"
             )
         self._require_versions()
         self._executor = self._client.get_executor(pure=False)
@@ -203,7 +203,9 @@ class DaskWorkers:
         if isinstance(error, KilledWorker):
             return WorkerDied()
         if isinstance(error, CancelledError | CommClosedError | ConnectionError):
-            return UnavailableError(f"{self.name}: the scheduler is gone; run the same command again to continue")
+            return UnavailableError(
+                f"{self.name}: the connection to the scheduler is lost; run the same command again to continue"
+            )
         return error
 
     def recover(self) -> None:

@@ -166,13 +166,15 @@ def _unreachable(axis: AxisOptions, lowest_um: float, highest_um: float, ends_um
         yield f"reaches {farthest_um:g} µm, beyond limits.command_um = {limits.command_um:g}"
         return
     if farthest_um > position_um:
-        yield f"reaches {farthest_um:g} µm, beyond interlocks.position_um = {position_um:g}, which trips"
+        yield f"reaches {farthest_um:g} µm, beyond interlocks.position_um = {position_um:g}; the loop would trip"
     for reached_um, end_um, is_beyond in (
         (lowest_um, ends_um[0], lowest_um < ends_um[0]),
         (highest_um, ends_um[1], highest_um > ends_um[1]),
     ):
         if is_beyond:
-            yield f"reaches {reached_um:g} µm, beyond the end of the sensor's range, {end_um:.4g} µm, which trips"
+            yield (
+                f"reaches {reached_um:g} µm, beyond the end of the sensor's range, {end_um:.4g} µm; the loop would trip"
+            )
     yield from _beyond_drive(axis, lowest_um, highest_um)
 
 

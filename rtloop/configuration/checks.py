@@ -303,7 +303,7 @@ def _check_shared(configuration: Configuration, axes: Sequence[AxisOptions], fin
     models = [_delayed_model(axis, delay) for axis, delay in zip(axes, delays, strict=True)]
     law = make_controller(axes[0], 1.0 / configuration.loop.rate_hz, models)
     if not isinstance(law, CoupledController):
-        raise TypeError(f"{key}: {law!r} is for one axis, but is given {', '.join(names)}")
+        raise TypeError(f"{key}: {law!r} controls one axis only, but the axes here are {', '.join(names)}")
     plant, loop = _coupled_plant(axes, delays, findings), None
     linear = _linear_part(law, key, findings, type(law).shipped)
     if linear is not None and plant is not None:

@@ -48,7 +48,9 @@ class ExtraOutputOptions(Options):
         """Require `level_um` with mark = "position", and only there."""
         if (self.mark == "position") != (self.level_um is not None):
             value = "missing" if self.level_um is None else f"{self.level_um:g} µm"
-            raise ValueError(f"level_um: {value}; allowed: a number with mark = 'position', and no level_um otherwise")
+            raise ValueError(
+                f"level_um: {value}; allowed: a number if mark = 'position'; with any other mark, remove level_um"
+            )
         return self
 
 

@@ -35,7 +35,7 @@ MAX_LATENESS_SAMPLES = 4096
 LARGEST_LATENESS_US = 1e6
 """Largest simulated lateness of a tick: it bounds the time that the rig needs for the periods missed by one tick."""
 SPECIFICATION = (
-    "this file is a specification, and a configuration is needed, with [loop], [driver] and [[axis]]; specifications "
+    "this file is a specification; give a configuration, a file with [loop], [driver] and [[axis]]. Specifications "
     "are for `rtloop design synthesise`, `rtloop design robust` and the options --spec and --specs"
 )
 MAX_FAULTS, MAX_CHARACTERS = 40, 400

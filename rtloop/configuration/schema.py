@@ -25,7 +25,7 @@ from rtloop.laws.registry import find_law, law_class
 
 DIALECT = "https://json-schema.org/draft/2020-12/schema"
 Schema = dict[str, Any]
-KIND_TEXT = "Name of the driver, which decides the other keys of this table; `rtloop drivers` lists all."
+KIND_TEXT = "Name of the driver, which decides the other keys of this table; `rtloop drivers` lists all drivers."
 CHANNELS_TEXT = "Channels of each axis, by its name: [driver.channels.NAME]."
 DRIVER_TEXT = "The hardware, or the simulated rig in its place."
 """Texts of keys that no model has."""

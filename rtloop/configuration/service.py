@@ -90,10 +90,12 @@ class ServiceOptions(Options):
         """Return a sentence for each reason why `rtloop serve` refuses these options together with a [[schedule]]."""
         faults = []
         if self.prepares:
-            faults.append("schedule: not allowed with service.tare_s or service.depolarise, which use the first ticks")
+            faults.append(
+                "schedule: not allowed with service.tare_s or service.depolarise, because they use the first ticks"
+            )
         if self.recover is not None:
             faults.append(
-                "schedule: not allowed with service.recover, because the ticks of a schedule do not come again "
-                "after a trip"
+                "schedule: not allowed with service.recover, because a loop that recovers from a trip does not repeat "
+                "its schedule"
             )
         return faults

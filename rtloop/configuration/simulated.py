@@ -132,7 +132,10 @@ def _weights(configuration: Configuration, axis: AxisOptions) -> Iterator[str]:
     plant, limits = simulated_plant(configuration, axis.name), axis.interlocks
     ends = f"{key}: with these weights the drive's limits reach {reach_um:.4g} µm"
     if plant is not None and reach_um < plant.sensor.noise_um:
-        yield f"{ends}, within the simulated sensor's noise of {plant.sensor.noise_um:g} µm"
+        yield (
+            f"{ends}, less than the simulated sensor's noise of {plant.sensor.noise_um:g} µm; identify the weights on "
+            "this stage"
+        )
         return
     ratio = None if plant is None else _stroke_ratio(axis, plant_plays(plant))
     if ratio is not None and not 1 / LARGEST_STROKE_RATIO <= ratio <= LARGEST_STROKE_RATIO:
@@ -140,7 +143,7 @@ def _weights(configuration: Configuration, axis: AxisOptions) -> Iterator[str]:
         low_um, high_um = rig_um / LARGEST_STROKE_RATIO, rig_um * LARGEST_STROKE_RATIO
         sign = " in the opposite direction" if ratio < 0 else ""
         yield (
-            f"{ends}, with those of the simulated actuator {rig_um:.4g} µm{sign}; allowed: {low_um:.4g} … "
+            f"{ends}, with the weights of the simulated actuator {rig_um:.4g} µm{sign}; allowed: {low_um:.4g} … "
             f"{high_um:.4g} µm; identify the weights on this stage"
         )
         return

@@ -40,7 +40,9 @@ def measure_pair(drive_v: Real, reading_v: Real, settling_ticks: int) -> Channel
     step_index = np.searchsorted(changes, np.arange(drive_v.size), side="right")
     is_settled = np.arange(drive_v.size) - starts[step_index] >= settling_ticks
     if np.unique(drive_v[is_settled]).size < 2:
-        raise ValueError("the drive did not rest at two voltages, so no gain is known; use a larger --amplitude")
+        raise ValueError(
+            "the drive did not rest at two different voltages, which the gain needs; use a larger --amplitude"
+        )
     gain, offset_v = np.polyfit(drive_v[is_settled], reading_v[is_settled], 1)
     _, level = np.unique(step_index[is_settled], return_inverse=True)
     means = np.bincount(level, reading_v[is_settled]) / np.bincount(level)

@@ -34,7 +34,11 @@ def virtualisation(host: Host, pacing: Pacing) -> Finding:
     """Return the finding on a hypervisor, which may stop the whole machine: good if none is seen."""
     flags = next((line for line in (host.read("/proc/cpuinfo") or "").splitlines() if line.startswith("flags")), "")
     is_virtual = "hypervisor" in flags.split()
-    value = f"virtual machine, {host.stolen_s():.1f} s stolen since its start" if is_virtual else "none seen"
+    value = (
+        f"virtual machine, {host.stolen_s():.1f} s of processor time taken by the hypervisor since the start"
+        if is_virtual
+        else "none seen"
+    )
     return Finding(
         "virtualisation",
         value,
@@ -111,7 +115,7 @@ def frequency(host: Host, pacing: Pacing) -> Finding:
     governors = {path: text for path in paths if (text := host.read(path))}
     name, requirement = "frequency governor", "performance"
     if not governors:
-        return Finding(name, "not shown: firmware or host decides", requirement, None)
+        return Finding(name, "not shown: the firmware or the hypervisor sets the frequency", requirement, None)
     slow_paths = sorted(path for path, text in governors.items() if text != requirement)
     return Finding(
         name,
@@ -137,12 +141,12 @@ def idle_states(host: Host, pacing: Pacing) -> Finding:
     value = (
         "deep idle states prevented"
         if is_held_off
-        else f"up to {longest_us:g} µs to wake; /dev/cpu_dma_latency: {host.refusal_reason('pm_qos')}"
+        else f"a processor needs up to {longest_us:g} µs to wake; /dev/cpu_dma_latency: {host.refusal_reason('pm_qos')}"
     )
     return Finding(
         "idle states",
         value,
-        "/dev/cpu_dma_latency held at 0",
+        "/dev/cpu_dma_latency held at 0 µs",
         is_held_off or longest_us <= SHORT_IDLE_US,
         max(longest_us, 1.0),
         "waking from a deep idle state delays a tick",

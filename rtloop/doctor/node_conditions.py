@@ -83,7 +83,7 @@ def coalescing(line: NetworkLine) -> Finding:
     return Finding(
         "interrupt coalescing", f"{line.rx_usecs} µs{', adaptive' if line.is_adaptive else ''}", required,
         line.rx_usecs == 0 and not line.is_adaptive, max(float(line.rx_usecs), 1.0),
-        "the card collects packets before it interrupts, and the node's answer waits meanwhile",
+        "the node's answer waits, because the card collects several packets for one interrupt",
         f"sudo ethtool -C {line.interface} adaptive-rx off rx-usecs 0",
     )  # fmt: skip
 
@@ -96,7 +96,7 @@ def packet_merging(line: NetworkLine) -> Finding:
         return Finding("large receive offload", "not shown", "off", None)
     return Finding(
         "large receive offload", "on" if line.collects else "off", "off", not line.collects, 20.0,
-        "the card may wait for more packets before it hands one on", f"sudo ethtool -K {line.interface} lro off",
+        "a packet waits, because the card may join it with later packets", f"sudo ethtool -K {line.interface} lro off",
     )  # fmt: skip
 
 
@@ -116,7 +116,7 @@ def card_interrupts(line: NetworkLine, host: Host, pacing: Pacing) -> Finding:
     return Finding(
         "card's interrupts",
         f"{len(shared)} of {len(affinities)} may interrupt processor {format_cpus(loop_processors)}",
-        required, not shared, INTERRUPT_US, "the card interrupts the loop while it computes a tick",
+        required, not shared, INTERRUPT_US, "the card interrupts the loop while the loop computes a tick",
         "; ".join(f"echo {others or 0} | sudo tee {path}" for path in shared or affinities),
         dict.fromkeys(shared, others) if others else {},
     )  # fmt: skip
@@ -159,7 +159,8 @@ def low_latency(line: SerialLine, host: Host) -> Finding:
     is_set = bool(flags & LOW_LATENCY_FLAG)
     return Finding(
         "low latency", "low_latency" if is_set else "not set", "low_latency", is_set, 1000.0,
-        "the kernel hands received bytes on later, by a work queue", f"sudo setserial {line.device} low_latency",
+        "received bytes reach the loop late, because the kernel puts them into a work queue first",
+        f"sudo setserial {line.device} low_latency",
     )  # fmt: skip
 
 

@@ -17,7 +17,7 @@ def spinning_share(pacing: Pacing) -> float:
 
 def _grant_command(limit: str) -> str:
     """Return the shell command that grants `limit`, such as "rtprio 99", to the group rtloop."""
-    return f"echo '@rtloop - {limit}' | sudo tee -a {LIMITS}, and log in again as a member of rtloop"
+    return f"echo '@rtloop - {limit}' | sudo tee -a {LIMITS}, and log in again as a member of the group rtloop"
 
 
 def fifo(host: Host, pacing: Pacing) -> Finding:
@@ -46,16 +46,16 @@ def throttling(host: Host, pacing: Pacing) -> Finding:
     path = "/proc/sys/kernel/sched_rt_runtime_us"
     runtime, period = host.read(path), host.read("/proc/sys/kernel/sched_rt_period_us") or "1000000"
     if runtime is None:
-        return Finding("real-time throttling", "not shown", "off where the loop spins", None)
+        return Finding("real-time throttling", "not shown", "off if the loop spins", None)
     sleeps = spinning_share(pacing) < SPINNING_SHARE
     value = "off" if runtime == "-1" else f"{runtime} of each {period} µs"
     return Finding(
         "real-time throttling",
         value + (", the loop sleeps" if sleeps else ", the loop spins"),
-        "off where the loop spins",
+        "off if the loop spins",
         sleeps or runtime == "-1",
         50_000.0,
-        "a spinning loop loses the processor for 50 ms of every second",
+        "a loop that spins (waits without sleep) loses the processor for 50 ms of every second",
         "sudo sysctl kernel.sched_rt_runtime_us=-1",
         {path: "-1"},
     )
@@ -67,7 +67,7 @@ def fair_server(host: Host, pacing: Pacing) -> Finding:
 
     The loop sleeps if `spinning_share` is below SPINNING_SHARE.
     """
-    name, requirement = "fair server", "off where the loop spins"
+    name, requirement = "fair server", "off if the loop spins"
     if host.kernel_version < (6, 12):
         return Finding(name, f"not in kernel {host.release}", requirement, True)
     if spinning_share(pacing) < SPINNING_SHARE:
@@ -82,7 +82,7 @@ def fair_server(host: Host, pacing: Pacing) -> Finding:
         requirement,
         None if runtime is None else runtime == "0",
         50_000.0,
-        "a spinning loop loses the processor for 50 ms of every second",
+        "a loop that spins (waits without sleep) loses the processor for 50 ms of every second",
         f"echo 0 | sudo tee {path}",
         {path: "0"} if runtime else {},
     )
@@ -108,7 +108,7 @@ def real_time_groups(host: Host, pacing: Pacing) -> Finding:
         False,
         100_000.0,
         "the control group has no real-time runtime, so SCHED_FIFO is refused",
-        "echo 950000 | sudo tee /sys/fs/cgroup/cpu/GROUP/cpu.rt_runtime_us",
+        "echo 950000 | sudo tee /sys/fs/cgroup/cpu/GROUP/cpu.rt_runtime_us, where GROUP is the loop's control group",
     )
 
 

@@ -83,7 +83,7 @@ class SelfTest:
     def announcement(self) -> Iterator[str]:
         """Yield lines that say which outputs move, how far and for how long, to be printed before they do."""
         configuration = self._configuration
-        yield f"self-test of {configuration.name}, driver {configuration.driver_kind!r}: drives the outputs now"
+        yield f"self-test of {configuration.name}, driver {configuration.driver_kind!r}: the outputs move now"
         for staircase in self._staircases:
             axis, levels = staircase.axis, staircase.steps.levels
             channel = configuration.channels[axis.name]
@@ -257,7 +257,7 @@ def _run_and_load(prepared: Prepared) -> tuple[Recording, dict[str, Any]]:
             result = supervisor.run()
         if result.error or result.outcome != "done":
             raise LoopFault(
-                f"the self-test did not finish ({result.outcome}): {result.error or 'Ctrl-C or a signal ended it'}"
+                f"the self-test did not finish ({result.outcome}): {result.error or 'ended by Ctrl-C or a signal'}"
             )
         recording = load(result.recordings)
         for event in recording.events:

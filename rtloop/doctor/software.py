@@ -39,7 +39,7 @@ def compiled_code(host: Host, pacing: Pacing) -> Finding:
         CACHE_IS_PERSISTENT,
         0.0,
         "the first start after each restart of the machine compiles for half a minute",
-        "export XDG_CACHE_HOME=FOLDER, a folder that only you may write",
+        "export XDG_CACHE_HOME=FOLDER, a folder to which only you may write",
     )
 
 

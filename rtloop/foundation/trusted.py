@@ -316,7 +316,9 @@ def _walk_path(
             shared = bool(status.st_mode & stat.S_ISVTX and status.st_mode & _OTHERS_WRITE)
             location = Path(os.readlink(f"/proc/self/fd/{fd}"))
             if status.st_uid not in trusted_ids:
-                raise UntrustedPath(location, f"the folder {_foreign_owner_text(status)}; remove it, or use another")
+                raise UntrustedPath(
+                    location, f"the folder {_foreign_owner_text(status)}; remove it, or use another folder"
+                )
             if status.st_mode & _OTHERS_WRITE and not shared:
                 raise UntrustedPath(
                     location, "other users may write to this folder; allowed: only its owner (chmod go-w)"

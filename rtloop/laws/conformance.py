@@ -73,7 +73,9 @@ class LawConformance:
         built = build_record(self.law)
         for name in built.dtype.names or ():
             assert np.all(np.isfinite(built[name].astype(float))), f"coefficient {name} is not finite: {built[name]}"
-        assert built.tobytes() == build_record(self.law).tobytes(), "the same options gave other coefficients"
+        assert built.tobytes() == build_record(self.law).tobytes(), (
+            "two builds with the same options gave different coefficients"
+        )
 
     def test_whole_numbers_are_bounded(self) -> None:
         """Every whole number in the records has its range in `allowed_coefficients` or `allowed_state`."""
@@ -84,8 +86,8 @@ class LawConformance:
                 name for name in table.names if table[name].base.kind in "iu" and name not in ("unused", "reserved")
             }
             assert set(allowed) == integer_fields, (
-                f"allowed_{kind} has the keys {', '.join(sorted(allowed)) or 'none'}; allowed: "
-                f"{', '.join(sorted(integer_fields)) or 'none'}"
+                f"allowed_{kind} has the keys {', '.join(sorted(allowed)) or 'none'}; allowed: the integers of the "
+                f"record, {', '.join(sorted(integer_fields)) or 'none'}"
             )
 
     def test_compiled_and_uncompiled_give_the_same_bits(self, bench: Bench) -> None:
@@ -106,7 +108,9 @@ class LawConformance:
             saved_state = tested.state.copy()
             first = list(tested.run(TICKS, SEED + 1))
             tested.state[:] = saved_state
-            assert list(tested.run(TICKS, SEED + 1)) == first, "the same state and inputs gave other results"
+            assert list(tested.run(TICKS, SEED + 1)) == first, (
+                "two runs from the same state and inputs gave different results"
+            )
 
     def test_its_coefficients_are_read_only(self, bench: Bench) -> None:
         """No function writes to the coefficients: a recording describes the law by them."""
@@ -127,22 +131,22 @@ class LawConformance:
         bench.enter(*np.multiply.outer([3.0, 1.0, 5.0], np.ones(max(self.law.count, 1))))
         for number, (value, _) in enumerate(bench.run(TICKS, wild=False)):
             assert np.all(np.isfinite(value)), (
-                f"tick {number} after the entry: the output is {value}; allowed: finite numbers"
+                f"tick {number} after a call of `enter`: the output is {value}; allowed: finite numbers"
             )
 
     def test_enter_continues_from_the_command(self, bench: Bench) -> None:
         """`enter` leaves a bump of at most BUMP; a law without `enter` is skipped, as the loop adds an offset for
         it."""
         if not isinstance(self.law, Controller) or type(self.law).enter is None:
-            pytest.skip("the law has no enter of its own")
+            pytest.skip("the law does not define `enter`")
         random = np.random.default_rng(SEED)
         for _ in range(50):
             position_um, error_um, command_um = random.uniform(-REACH_UM, REACH_UM, (3, self.law.count))
             first_um = bench.enter(position_um, error_um, command_um)
             room = BUMP * (1 + np.abs(command_um) + np.abs(error_um))
             assert np.all(np.abs(first_um - command_um) <= room), (
-                f"after enter at a command of {command_um} µm the law gives {first_um} µm; allowed: about the same "
-                "command"
+                f"after `enter` with a command of {command_um} µm the first output is {first_um} µm; allowed: about "
+                "the same command"
             )
 
     def test_a_limited_command_does_not_wind_it_up(self, bench: Bench) -> None:
@@ -154,18 +158,19 @@ class LawConformance:
         free = bench.limited_loop(at_rest=True).unlimited_return()
         if free is None:
             pytest.skip(
-                "the loop of law and lag, with the gain of the model or 1, does not return even without a limit"
+                "the loop of the law and a lag, which has the gain of the law's model or 1, does not return to its "
+                "reference even without a limit"
             )
         most_ticks = int((1 + EXTRA_SHARE) * free.ticks) + EXTRA_TICKS
         saturated_ticks = max(SATURATED * free.ticks, self.saturated_ticks)
         limited = bench.limited_loop().limited_return(saturated_ticks, most_ticks)
         assert limited is not None, (
-            f"wound up: after {saturated_ticks} ticks at the limit the loop did not return in {most_ticks} ticks; "
-            f"without a limit it returns in {free.ticks}"
+            f"the law winds up: after {saturated_ticks} ticks at the command's limit, the loop did not return to its "
+            f"reference in {most_ticks} ticks; without a limit it returns in {free.ticks} ticks"
         )
         assert limited.overshoot <= free.overshoot + EXTRA_OVERSHOOT, (
-            f"wound up: after the limit the loop overshot by {100 * limited.overshoot:.1f} % of the way; "
-            f"without a limit by {100 * free.overshoot:.1f} %"
+            f"the law winds up: after the command's limit, the loop overshot by {100 * limited.overshoot:.1f} % of the "
+            f"way; without a limit it overshoots by {100 * free.overshoot:.1f} %"
         )
 
     def test_it_calls_nothing_that_waits_or_differs(self, bench: Bench) -> None:

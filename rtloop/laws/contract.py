@@ -215,11 +215,11 @@ def build_record(law: Law) -> Any:
         raise ValueError(f"{_build_location(law)} returns {built!r}; allowed: a dict with a value for each coefficient")
     if unknown := [name for name in built if name not in names]:
         raise ValueError(
-            f"{_build_location(law)} returns unknown {', '.join(unknown)}; the coefficients are {', '.join(names)}"
+            f"{_build_location(law)} returns the unknown coefficient {', '.join(unknown)}; allowed: {', '.join(names)}"
         )
     if not law.shipped and (missing := [name for name in names if name not in built]):
         raise ValueError(
-            f"{_build_location(law)} returns no {', '.join(missing)}; the coefficients are {', '.join(names)}"
+            f"{_build_location(law)} returns no value for {', '.join(missing)}; the coefficients are {', '.join(names)}"
         )
     for name, value in built.items():
         numbers, target = np.asarray(value), record[name]

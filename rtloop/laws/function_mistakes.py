@@ -22,7 +22,7 @@ REMEDIES = {
     "np": "; add `import numpy as np` at the top of the file",
     "numpy": "; add `import numpy` at the top of the file",
     "math": "; add `import math` at the top of the file",
-    "self": f"; {', '.join(PER_TICK)} have no self: `build` gives the numbers that they need as coefficients",
+    "self": f"; {', '.join(PER_TICK)} have no self: return their numbers from `build`, as coefficients",
 }
 """Remedy for a name that is often undefined."""
 HIDDEN = {"reserved", "scratch"}
@@ -100,7 +100,7 @@ def _wrong_fields(function: ast.FunctionDef, parameters: Mapping[str, _Parameter
             yield Mistake(node.lineno, f"{field}: a {noun} cannot be set; store the value in the state")
         elif node.attr in undefined:
             allowed = ", ".join(f"{record}.{name}" for name in fields if name not in (*undefined, "outputs"))
-            message = f"{field}: no value in {function.name}, only in update and enter; allowed here: {allowed}"
+            message = f"{field}: has no value in {function.name}, only in update and enter; allowed here: {allowed}"
             yield Mistake(node.lineno, message)
 
 

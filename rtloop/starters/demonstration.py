@@ -46,7 +46,9 @@ def demonstrate(port: int, announce: Callable[[str], None]) -> int:
         if is_first_start():
             announce(FIRST_START)
         with _configuration_file() as config, _board_process(config):
-            announce("a simulated stage: arm and start its loop on the panel; Ctrl-C parks it and ends all")
+            announce(
+                "this is a simulated stage: arm and start its loop on the panel; Ctrl-C parks the outputs and ends all"
+            )
             with run_panel_process(socket_path(load(config)), port):
                 code = serve(config)
             for path in (block_path(NAME), hardware_path(NAME)):  # for `rtloop park`; the outputs are parked

@@ -20,7 +20,10 @@ def write_new_files(folder: Path, texts: Mapping[str, str]) -> list[Path]:
     paths = [folder / name for name in texts]
     for path in paths:
         if os.path.lexists(path):
-            raise OutputError(f"{path}: the file exists already and is not overwritten", errno.EEXIST)
+            raise OutputError(
+                f"{path}: the file exists already and is not overwritten; remove the file, or use another folder",
+                errno.EEXIST,
+            )
     with output_errors(folder):
         folder.mkdir(parents=True, exist_ok=True)
         for path, text in zip(paths, texts.values(), strict=True):

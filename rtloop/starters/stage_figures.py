@@ -45,14 +45,13 @@ class StageFigures:
         _require("range-um", self.range_um, 0.01, 10_000.0, "µm")
         _require("drive-v", self.drive_v, 0.1, 10.0, "V")
         if self.drive_min_v is not None:
-            _require("drive-min-v", self.drive_min_v, -self.drive_v, 0.0, "V, the largest drive to the other side")
+            _require("drive-min-v", self.drive_min_v, -self.drive_v, 0.0, "V (minus --drive-v to 0)")
         if self.hysteresis_percent is not None:
             _require("hysteresis-percent", self.hysteresis_percent, 0.0, LARGEST_HYSTERESIS_PERCENT, "%")
         if self.sensor_um_per_v is not None:
             lowest, highest = self.range_um / 20, 10 * self.range_um
-            _require(
-                "sensor-um-per-v", self.sensor_um_per_v, lowest, highest, "µm/V: ±10 V show half of the travel or more"
-            )
+            unit = "µm/V, so that ±10 V at the sensor are half of the travel or more"
+            _require("sensor-um-per-v", self.sensor_um_per_v, lowest, highest, unit)
         if self.sensor_min_v is not None:
             _require("sensor-min-v", self.sensor_min_v, -10.0, 0.0, "V, as the stage rests at 0 V")
             if self.sensor_min_v > -10.0 and self.drive_min_v != 0.0:
@@ -68,7 +67,8 @@ class StageFigures:
                 _require(name, value, 0.0, self.range_um / 20, "µm, a twentieth of the travel")
         if self.rate_hz is not None:
             least_hz = LEAST_SAMPLES_PER_PERIOD * self.resonance_hz
-            _require("rate-hz", self.rate_hz, least_hz, RATES_HZ[-1], "Hz, from four samples in a period on")
+            unit = f"Hz, at least {LEAST_SAMPLES_PER_PERIOD} samples in a period of the resonance"
+            _require("rate-hz", self.rate_hz, least_hz, RATES_HZ[-1], unit)
 
 
 def stage_figures(values: Mapping[str, float]) -> StageFigures:

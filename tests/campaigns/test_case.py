@@ -188,7 +188,7 @@ def test_a_key_without_effect_or_sense_is_an_error(tmp_path, uncertain, named):
         ({"experiments": STEPS + STEPS}, "two experiments have the name 'steps'"),
         (
             {"experiments": STEPS.replace("[10.0]", "[0.0]")},
-            "each level different from the one before it, and the first from 0",
+            "a first level other than 0, and each further level different from the level before",
         ),
         ({"limits": '"steps.settling" = 3.0'}, "steps.settling; allowed: steps.overshoot_percent, steps.settling_ms"),
         ({"uncertain": ""}, "uncertain"),

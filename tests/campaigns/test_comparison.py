@@ -64,7 +64,7 @@ def test_other_rigs_are_refused(tmp_path):
     campaign = write_campaign(tmp_path)
     first = store((campaign, None), tmp_path / "first", [1, 2])
     other = store((write_campaign(tmp_path, keys="rigs = 9"), None), tmp_path / "b", [3, 4])
-    with pytest.raises(ConfigError, match="no rig is in both"):
+    with pytest.raises(ConfigError, match="the two campaigns have no rig in common"):
         compare_campaigns(first, other)
     path = write_campaign(tmp_path)
     path.write_text(path.read_text().replace("seed = 5", "seed = 6"))

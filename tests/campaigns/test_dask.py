@@ -79,7 +79,7 @@ def test_a_campaign_whose_scheduler_was_killed_continues_elsewhere(campaign, exp
         (scheduler,) = _process_ids(address, "print(c.run_on_scheduler(os.getpid))")
         code, errors = run_beside(campaign, folder, address, lambda: os.kill(scheduler, signal.SIGKILL), tmp_path)
     assert code == 69, errors
-    assert "the scheduler is gone; run the same command again to continue" in errors
+    assert "the connection to the scheduler is lost; run the same command again to continue" in errors
     assert "Traceback" not in errors, errors
     stored = {path.name: path.stat().st_ino for path in folder.glob("results/rigs-*.parquet")}
     process = rtloop("campaign", "run", campaign, "--out", folder, folder=tmp_path)
@@ -158,4 +158,4 @@ def test_a_scheduler_without_a_worker_is_named(campaign, tmp_path):
         process = rtloop("campaign", "run", campaign, "--scheduler", address, folder=tmp_path)
         _, errors = process.communicate(timeout=60)
     assert process.returncode == 69
-    assert "no worker; start one with `dask worker" in errors
+    assert "no worker is connected; start `dask worker" in errors

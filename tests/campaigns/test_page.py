@@ -254,7 +254,7 @@ def test_saltellis_design_shows_indices_and_counts_its_independent_rows(coarse_p
     require_whole(page)
     assert "8 of 8 rigs pass" in page.text
     assert 'With sampling = "saltelli" rigs depend on each other: the interval is only a guide.' in page.text
-    assert "Only the rigs of the independent rows of the design count, 8 of 20 rigs." in page.text
+    assert "The yield counts only rigs that are independent of each other: 8 of 20 rigs." in page.text
     assert "sensitivity indices by key" in page.attributes("img", "alt")
 
 

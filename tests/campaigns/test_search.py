@@ -147,7 +147,7 @@ def test_a_side_on_which_the_range_does_not_lie_is_not_searched(tmp_path):
     ("key", "distribution", "named"),
     [
         ("driver.latency_ticks", "choice = [0, 3]", "allowed: keys with a range"),
-        ("driver.plant.sensor.bandwidth_hz", "uniform = [2e3, 4e3]", "has no value in the configuration; set one"),
+        ("driver.plant.sensor.bandwidth_hz", "uniform = [2e3, 4e3]", "has no value in the configuration; set a value"),
     ],
 )
 def test_a_boundary_without_a_range_or_a_nominal_value_is_refused(tmp_path, key, distribution, named):

@@ -156,7 +156,9 @@ def test_a_kill_between_writing_and_removing_a_file_stores_no_rig_twice(runner, 
     content = short.read_bytes()
     store_rigs(runner, folder, UNIT, [3, 4])
     short.write_bytes(content)
-    with pytest.raises(InputFileError, match="rigs are stored twice, as after a kill; run the campaign again"):
+    with pytest.raises(
+        InputFileError, match="some rigs are stored twice, as after a run that was killed; run the campaign again"
+    ):
         summarise_campaign(folder)
     assert missing(runner, folder) == []
     assert summarise_campaign(folder).yield_of_rigs.rigs == 4

@@ -108,7 +108,7 @@ CASES = {
                         options={"devise": '"/dev/comedi1"'}),
     "shm: no board": shm("{device}: No such file or directory; start the board with `rtloop hil serve CONFIG`",
                          hardware=Path.unlink),
-    "shm: not a board": shm("{device}: not the memory of a board", hardware=write_text),
+    "shm: not a board": shm("{device}: this file is not the memory of a board", hardware=write_text),
     "shm: board ended": shm("{device}: no board is running; start the board with `rtloop hil serve CONFIG`",
                             hardware=switch_off),
     "shm: in use": shm("{device}: another controller drives this board; stop the other controller", hardware=open_shm),

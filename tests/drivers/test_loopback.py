@@ -70,7 +70,7 @@ def test_an_input_that_does_not_follow_has_no_delay(noise_v):
 
 
 def test_a_constant_drive_is_refused():
-    with pytest.raises(ValueError, match="the drive did not rest at two voltages"):
+    with pytest.raises(ValueError, match="the drive did not rest at two different voltages"):
         measure_pair(np.zeros(100), np.zeros(100), 10)
 
 

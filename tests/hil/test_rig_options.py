@@ -109,7 +109,7 @@ def test_defaults_are_the_papers():
             "plant.dynamics",
             r"factor: \[0.0, 1.0\]; allowed: a first number other than 0",
         ),
-        ("plant.creep.gains = [0.1]", "plant.creep", "gains has 1 and time_constants_s 0 numbers"),
+        ("plant.creep.gains = [0.1]", "plant.creep", "gains has 1 numbers, time_constants_s has 0"),
         (
             "plant.creep = {gains=[0.1], time_constants_s=[0]}",
             "plant.creep",

@@ -48,14 +48,14 @@ TYPOS = {
         "told.error_um + s.integral_um\n",
         "told.error_um + told.command_um\n",
         RETURN,
-        r"told\.command_um: no value in output, only in update and enter; "
+        r"told\.command_um: has no value in output, only in update and enter; "
         r"allowed here: told\.reference_um, told\.position_um, told\.error_um, told\.inputs$",
     ),
     "a drive that is not yet applied": (
         "told.error_um + s.integral_um\n",
         "(told.applied_um - s.integral_um)\n",
         RETURN,
-        r"told\.applied_um: no value in output, only in update and enter",
+        r"told\.applied_um: has no value in output, only in update and enter",
     ),
     "a coefficient": ("c.kp * told", "c.kpp * told", RETURN, r"c\.kpp: unknown coefficient; did you mean c\.kp\?"),
     "an undeclared state": (
@@ -130,8 +130,13 @@ TYPOS = {
         BUILD,
         "build returns None; allowed: a dict with a value for",
     ),
-    "what build gives": ('{"kp": 0.1', '{"kd": 0.1', BUILD, "build returns unknown kd; the coefficients are kp, ki"),
-    "what build leaves out": ('"kp": 0.1, ', "", BUILD, "build returns no kp; the coefficients are kp, ki"),
+    "what build gives": (
+        '{"kp": 0.1',
+        '{"kd": 0.1',
+        BUILD,
+        "build returns the unknown coefficient kd; allowed: kp, ki",
+    ),
+    "what build leaves out": ('"kp": 0.1, ', "", BUILD, "build returns no value for kp; the coefficients are kp, ki"),
     "a text": ('"kp": 0.1', '"kp": "much"', BUILD, "build returns kp = 'much'; allowed: numbers"),
     "NaN": ('"kp": 0.1', '"kp": float("nan")', BUILD, "build returns kp = nan; allowed: numbers other than NaN"),
     "an array": ('"kp": 0.1', '"kp": [0.1, 0.2]', BUILD, r"kp as an array of shape \(2,\); allowed: one number"),
@@ -162,7 +167,9 @@ def test_a_typo_is_one_sentence_with_its_line(name: str, tmp_path: Path) -> None
     assert re.search(sentence, faults[0]), faults[0]
 
 
-@pytest.mark.parametrize(("name", "message"), [("command_um", None), ("applied_um", "told.applied_um: no value in")])
+@pytest.mark.parametrize(
+    ("name", "message"), [("command_um", None), ("applied_um", "told.applied_um: has no value in")]
+)
 def test_a_coupled_output_may_use_the_commands_that_it_sets(name: str, message: str | None) -> None:
     class Pair(CoupledController):
         axes = 2

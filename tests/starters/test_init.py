@@ -82,7 +82,7 @@ def test_two_kinds_share_a_folder_and_its_schema(tmp_path: Path) -> None:
         (("--kind", "stage", "--rate-hz", "nan"), "--rate-hz: value is nan; allowed: 3200 … 100000 Hz"),
         (("--damping", 0.1), "--damping: not allowed with --kind paper; allowed with --kind stage"),
         (("--name", "mine"), "--name: not allowed with --kind paper; allowed with --kind law and --kind driver"),
-        (("--kind", "stage", "--drive-min-v", 1), "--drive-min-v: value is 1; allowed: -10 … 0 V, the largest drive"),
+        (("--kind", "stage", "--drive-min-v", 1), "--drive-min-v: value is 1; allowed: -10 … 0 V (minus --drive-v"),
         (("--kind", "stage", "--hysteresis-percent", 50), "--hysteresis-percent: value is 50; allowed: 0 … 30 %"),
         (("--kind", "stage", "--sensor-um-per-v", 0.5), "--sensor-um-per-v: value is 0.5; allowed: 1 … 200 µm/V"),
         (

@@ -162,7 +162,7 @@ class LimitedProcess:
         """Pipes to stdin and from stdout and stderr. Raises BrokenPipeError if no process runs."""
         process = self._process
         if process is None or process.stdin is None or process.stdout is None or process.stderr is None:
-            raise BrokenPipeError("the separate process that runs user laws first has ended; try again")
+            raise BrokenPipeError("the separate process that tries user laws before a run has ended; try again")
         return process.stdin, process.stdout, process.stderr
 
     def _outcome(self) -> tuple[str, Any]:

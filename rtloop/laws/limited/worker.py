@@ -155,7 +155,7 @@ def _error_text(error: BaseException) -> str:
     try:
         message = " ".join(str(error).split()) + _suggestion(error)
     except BaseException:
-        message = "its message cannot be shown"
+        message = "the message of this error cannot be shown"
     return f"{type(error).__name__}: {message}" if message else type(error).__name__
 
 

@@ -140,7 +140,7 @@ class CoupledOptions(ControllerOptions):
         for name, shape in {**shapes, "decoupling": (count, count)}.items():
             rows = getattr(self, name)
             if rows and (len(rows) != shape[0] or any(len(row) != shape[1] for row in rows)):
-                raise ValueError(f"{name}: the matrix has another size; allowed: {shape[0]} rows of {shape[1]} numbers")
+                raise ValueError(f"{name}: the matrix has a wrong size; allowed: {shape[0]} rows of {shape[1]} numbers")
         if order and not (self.b and self.c):
             raise ValueError("a: needs the matrices b and c; add the missing one")
         if self.decoupling and np.linalg.matrix_rank(np.array(self.decoupling)) < count:
