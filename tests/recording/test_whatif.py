@@ -86,7 +86,7 @@ def test_the_figures_of_another_law_on_the_rig_differ(path: Path, tmp_path: Path
 
 def test_a_configuration_that_does_not_fit_is_refused(path: Path, tmp_path: Path):
     faster = configuration(tmp_path, changed(("rate_hz = 10000", "rate_hz = 20000")))
-    with pytest.raises(ConfigError, match=r"loop\.rate_hz: 20000 Hz; allowed: the recording's rate, 10000 Hz"):
+    with pytest.raises(ConfigError, match=r"loop\.rate_hz: value is 20000 Hz; allowed: the recording's rate, 10000 Hz"):
         replay_with_other_law([path], faster)
-    with pytest.raises(ConfigError, match="axis: x, y; allowed: the recording's axes, x"):
+    with pytest.raises(ConfigError, match="axis: value is x, y; allowed: the recording's axes, x"):
         replay_on_the_rig([path], configuration(tmp_path, TWO_AXES))
