@@ -64,8 +64,8 @@ def _open_connection(path: Path) -> socket.socket:
         owner = path.lstat().st_uid
         if server_user not in trusted_users or owner != server_user:
             raise HostRefusal(
-                f"{path}: user {owner} owns the socket and user {server_user} serves it; allowed: the same user as "
-                "owner and server, and only you, root or the owner of the folder"
+                f"{path}: user ID {owner} owns the socket, and a process of user ID {server_user} serves it; allowed: "
+                "one user for both, namely you, root or the owner of the socket's folder"
             )
         return connection
     except BaseException:
@@ -173,14 +173,18 @@ class Client:
             return self.post(resource, body, timeout_s)
         except KeyboardInterrupt:
             if held_um is None:
-                raise LoopFault(f"interrupted; the old reference of axis {axis} is unknown and not restored") from None
+                raise LoopFault(
+                    f"the measurement was interrupted; the old reference of axis {axis} is unknown and was not "
+                    "restored; set a reference"
+                ) from None
             try:
                 self.post("/setpoint", {"axis": axis, "value": held_um})
             except RtloopError as error:
                 raise LoopFault(
-                    f"interrupted; the old reference of axis {axis} could not be restored, set it again: {error}"
+                    f"the measurement was interrupted; the old reference of axis {axis}, {held_um:g} µm, could not be "
+                    f"restored; set this reference again: {error}"
                 ) from None
-            raise LoopFault(f"interrupted; axis {axis} holds {held_um:g} µm as before") from None
+            raise LoopFault(f"the measurement was interrupted; axis {axis} holds {held_um:g} µm as before") from None
 
     def watch(self) -> Iterator[dict[str, Any]]:
         """Yield {state, faults, lock, measuring, recovery, tick, mode, trip, trip_reason, axes, condition}, each as in

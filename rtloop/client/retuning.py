@@ -193,8 +193,8 @@ def _require_near(quantity_text: str, percent: float, bound_percent: float) -> N
     """
     if abs(percent) > bound_percent:
         raise LoopFault(
-            f"retune: the {quantity_text}, {percent:+.2f} % from the model's; allowed: within ±{bound_percent:g} %; "
-            "the taps stay as they are"
+            f"retune: the measured {quantity_text}, {percent:+.2f} % from the model's; allowed: within "
+            f"±{bound_percent:g} % (bound_percent); the taps stay as they are; identify the model again"
         )
 
 

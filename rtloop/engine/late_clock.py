@@ -108,7 +108,8 @@ def virtual_clock(plan: Plan, facts: Facts, block: SharedBlock, pointers: Pointe
         return VirtualClock(clock, (context,))
     if plan.driver_kind != SimDriver.kind:
         raise ValueError(
-            f"loop.simulated_lateness_us is set, but the driver is {plan.driver_kind!r}; allowed: {SimDriver.kind!r}"
+            f"loop.simulated_lateness_us: set, but the driver is {plan.driver_kind!r}; allowed: only with the driver "
+            f"{SimDriver.kind!r}; remove this key"
         )
     table_ns = np.rint(np.array(pacing.simulated_lateness_us) * NS_PER_US).astype(np.int64)
     held_v, late = np.full(len(facts.outputs), np.nan), np.zeros(1, CONTEXT)

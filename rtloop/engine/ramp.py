@@ -47,8 +47,9 @@ def require_short_ramp(key: str, slew_v_per_s: float, output: Channel) -> None:
     if slew_v_per_s * LONGEST_RAMP_S < farthest_v:
         ramp_s, minimum_v_per_s = farthest_v / slew_v_per_s, farthest_v / LONGEST_RAMP_S
         raise ValueError(
-            f"{key}: {slew_v_per_s:g} V/s takes {ramp_s:.3g} s for the {farthest_v:g} V from the end of the channel's "
-            f"range to the safe value; allowed: at most {LONGEST_RAMP_S:g} s, so at least {minimum_v_per_s:g} V/s"
+            f"{key}: {slew_v_per_s:g} V/s; the ramp of {farthest_v:g} V from the end of the channel's range to the "
+            f"safe value takes {ramp_s:.3g} s; allowed: at most {LONGEST_RAMP_S:g} s, so at least "
+            f"{minimum_v_per_s:g} V/s"
         )
 
 
@@ -116,8 +117,8 @@ def ramp_to_safe(
             _wait_until(time.monotonic() + period_s)
         if status < 0:
             raise DriverError(
-                f"driver {driver.kind!r}: the card refused to write {row.tolist()} V on the way to the safe values; "
-                "the outputs may still carry voltage"
+                f"driver {driver.kind!r}: the card refused to write {row.tolist()} V during the ramp to the safe "
+                "values; the outputs may still carry voltage; check the amplifier"
             )
         on_step(row)
         _wait_until(time.monotonic() + period_s)

@@ -96,7 +96,7 @@ class ChannelServer:
     async def _show_lost(self, text: str) -> None:
         """Make all channels INVALID, and show the reason `text` in MESSAGE; a reason that is new is logged."""
         if text != self._lost_text:
-            self._log(f"{text}; the channels are INVALID until it answers")
+            self._log(f"{text}; the channels are INVALID until the service answers")
         self._lost_text = text
         for channel in self._channels.values():
             await channel.show_lost(text if channel.variable is self._message else channel.variable.lost)

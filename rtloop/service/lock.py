@@ -77,7 +77,9 @@ class Lock:
             raise Refusal("no emergency key is configured; set service.emergency_key_sha256")
         if not hmac.compare_digest(hashlib.sha256(key.encode(errors="replace")).hexdigest(), key_sha256):
             log.warning("%s gave a wrong emergency key", name)
-            raise Refusal("the given emergency key is not the one of service.emergency_key_sha256")
+            raise Refusal(
+                "the given emergency key is wrong; allowed: the key whose SHA-256 is service.emergency_key_sha256"
+            )
         with self._guard:
             holder = self._current_holder()
             if holder is not None and holder.name != name:

@@ -52,7 +52,7 @@ def status(service: Service) -> dict[str, Any]:
 def _reason_without_signals(service: Service) -> str:
     """Return why a status has no tick and no axes."""
     if service.results:
-        return "the loop before has ended, and the next loop has not executed a tick yet"
+        return "the last loop has ended, and the next loop has not executed a tick yet"
     return "the loop has not executed a tick yet"
 
 

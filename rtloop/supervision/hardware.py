@@ -89,7 +89,7 @@ def write_note(path: Path, hardware: Hardware) -> None:
 
     Raises OutputError if the system refuses, HostRefusal for a folder that another user owns or may change.
     """
-    target, new_path = "the note of the hardware", path.with_name(f"{path.name}.new")
+    target, new_path = "the note of the hardware for `rtloop park`", path.with_name(f"{path.name}.new")
     with output_errors(f"{path}: cannot write {target}"):
         with os.fdopen(create_file(new_path, target), "wb") as file:
             file.write(_ADAPTER.dump_json(hardware))
@@ -168,4 +168,7 @@ def _require_short_ramp(hardware: Hardware, driver: Driver) -> None:
 
 def _unusable_note(path: Path, reason: str) -> UnusableNote:
     """Return, without raising it, the error for a note at `path` that is ignored because of `reason`."""
-    return UnusableNote(f"{path}: the note of the hardware cannot be used and is ignored: {reason}")
+    return UnusableNote(
+        f"{path}: the note of the hardware, which names the board of the last run, cannot be used and is ignored: "
+        f"{reason}"
+    )

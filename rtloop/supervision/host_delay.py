@@ -62,12 +62,12 @@ class SpentMargin:
     def text(self) -> str:
         """The figures as one sentence."""
         percent = 100 * self.more_us / self.margin_us if self.margin_us else float("inf")
-        exchange_text = f", {self.exchange_us:.4g} µs for the exchange with the node" if self.exchange_us else ""
-        wire_text = f" and {self.wire_ticks} more ticks from output to input" if self.wire_ticks else ""
+        exchange_text = f", exchange with the node {self.exchange_us:.4g} µs" if self.exchange_us else ""
+        wire_text = f", {self.wire_ticks} more ticks from output to input" if self.wire_ticks else ""
         return (
-            f"measured on this host: {self.lateness_us:.4g} µs late (p99){exchange_text}{wire_text}, "
-            f"{self.more_us:.4g} µs = {self.more_ticks:.3g} ticks of added delay, "
-            f"{percent:.3g} % of the {self.margin_us:.4g} µs that the loop tolerates"
+            f"measured on this host: {self.more_us:.4g} µs = {self.more_ticks:.3g} ticks of added delay, "
+            f"{percent:.3g} % of the {self.margin_us:.4g} µs that the loop tolerates (lateness "
+            f"{self.lateness_us:.4g} µs at p99{exchange_text}{wire_text})"
         )
 
 

@@ -214,7 +214,10 @@ def _await_end(
         if block.load(Word.HEARTBEAT_NS) != beat_ns:
             raise UnavailableError(f"process {pid} drives the outputs and its service is alive; use `rtloop ctl stop`")
         if time.monotonic() > kill_time_s + KILL_S:
-            raise DriverError(f"process {pid} drives the outputs and cannot be killed")
+            raise DriverError(
+                f"process {pid} drives the outputs and cannot be killed; the outputs may still carry voltage; check "
+                "the amplifier"
+            )
         if time.monotonic() > kill_time_s:
             block.kill_driver()
         time.sleep(POLL_S)

@@ -211,7 +211,10 @@ class RecorderKeeper:
             self._enforce_quota(self.quota, FINAL_QUOTA_BUDGET_S)
             if self.quota.removed_files:
                 files, mib = count_text(self.quota.removed_files, "file"), self.quota.removed_bytes / 2**20
-                self.notes.append(f"{files} of recordings, {mib:.1f} MiB, removed to stay within recording.keep_gib")
+                self.notes.append(
+                    f"{files} of recordings ({mib:.1f} MiB) removed because of recording.keep_gib or "
+                    "recording.min_free_mib"
+                )
         totals["paths"] = [str(path) for path in run_files(self._path, ".mcap")]
         return totals
 

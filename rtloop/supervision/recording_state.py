@@ -12,8 +12,8 @@ from rtloop.errors import LOW_SPACE
 from rtloop.values import count_text
 
 REASONS = {
-    LOW_SPACE: "too little space is free on the disk; recording continues once recording.min_free_mib, a quarter of it "
-    "and 1 MiB are free"
+    LOW_SPACE: "the disk has too little free space; delete or move files; the recording continues once 1.25 times "
+    "recording.min_free_mib plus 1 MiB are free"
 }
 BEHIND_DIVISOR = 4
 """A recorder that is behind by more than a quarter of the ring (some seconds) is dead or stuck."""
@@ -64,7 +64,7 @@ class GapReporter:
             if reason in self._reasons:
                 return None
             self._reasons.add(reason)
-            return f"not recorded from tick {state['since_tick']} on: {reason}"
+            return f"ticks are not recorded from tick {state['since_tick']} on: {reason}"
         if self._reasons and now_s - self._last_fault_s < QUIET_S:
             return None
         lost_ticks, self._reported_lost_ticks = state["ticks_lost"] - self._reported_lost_ticks, state["ticks_lost"]
@@ -72,4 +72,4 @@ class GapReporter:
             return None
         self._reasons.clear()
         gap_s = self._last_fault_s - self._gap_begin_s
-        return f"recorded again after {gap_s:.1f} s; {count_text(lost_ticks, 'tick')} lost"
+        return f"ticks are recorded again after {gap_s:.1f} s; {count_text(lost_ticks, 'tick')} lost"

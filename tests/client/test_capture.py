@@ -217,7 +217,7 @@ def test_a_capture_without_a_recording_is_refused():
     full = Unrecorded(state="not recording", reason="No space left on device", since_tick=7, file="a", written_ticks=7)
     for client, words in (
         (full, "not recorded from tick 7 on: No space left on device"),
-        (Unrecorded(), "no loop is recorded; the state of the service is running"),
+        (Unrecorded(), "no loop is recorded now; the state of the service is running"),
     ):
         with pytest.raises(UnavailableError, match=words):
             Connection(client).capture(1.0)  # type: ignore[arg-type]

@@ -232,7 +232,9 @@ def test_other_drivers_than_the_simulated_rig_are_refused():
     ]
     plan: Plan = plan_of(late_text([1.0]))
     driver, block = plan.driver(), SharedBlock.create(plan.sizes)
-    with pytest.raises(ValueError, match="simulated_lateness_us is set, but the driver is 'shm'; allowed: 'sim'"):
+    with pytest.raises(
+        ValueError, match="simulated_lateness_us: set, but the driver is 'shm'; allowed: only with the driver 'sim'"
+    ):
         virtual_clock(replace(plan, driver_kind="shm"), driver.facts, block, driver.open(), 1)
 
 

@@ -254,7 +254,7 @@ def test_a_status_without_a_tick_says_why_it_has_no_axes(monkeypatch):
         service.run()
     report = status(service)
     assert (report["state"], "axes" in report) == ("tripped", False)
-    assert report["no_signals"] == "the loop before has ended, and the next loop has not executed a tick yet"
+    assert report["no_signals"] == "the last loop has ended, and the next loop has not executed a tick yet"
 
 
 def test_deaths_that_lie_far_apart_are_not_too_many(monkeypatch):

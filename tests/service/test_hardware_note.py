@@ -309,7 +309,7 @@ def test_a_slew_that_is_too_slow_is_named_by_its_key_in_the_configuration(lab: L
     lab.config.write_text(slow)
     code, message = lab.park()
     assert code == 78
-    assert "axis.x.limits.trip_slew_v_per_s: 0.5 V/s takes 20 s for the 10 V" in message
+    assert "axis.x.limits.trip_slew_v_per_s: 0.5 V/s; the ramp of 10 V from the end" in message
     assert "driver." not in message
 
 

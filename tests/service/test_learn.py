@@ -73,7 +73,7 @@ def test_a_scan_is_learned_and_goes_on(running: Bench, tmp_path: Path):
     [
         ({"cycles": 0}, "cycles"),
         ({"samples": [1.0, 2.0]}, "samples: "),
-        ({"samples": [99.0] * 8}, "reaches 99 µm, beyond"),
+        ({"samples": [99.0] * 8}, "reaches a magnitude of 99 µm; allowed"),
         ({"samples": [5.0] * 100_000, "cycles": 50}, "allowed: at most 300 s"),
         ({"axis": "z"}, "axis 'z': unknown; allowed: x"),
     ],

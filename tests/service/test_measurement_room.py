@@ -15,7 +15,7 @@ from tests.paper_configuration import PAPER
 
 
 @pytest.mark.parametrize(("hold_um", "allowed_um", "limit"), [
-    (5.0, 3.0, "sensor's range from 2 µm on"), (35.0, 5.0, "sensor's range up to 40 µm"),
+    (5.0, 3.0, "sensor's range begins at 2 µm"), (35.0, 5.0, "sensor's range ends at 40 µm"),
 ])  # fmt: skip
 def test_the_nearer_end_of_the_sensors_range_limits_a_motion(hold_um: float, allowed_um: float, limit: str) -> None:
     (axis,) = load(PAPER).axes

@@ -72,8 +72,8 @@ def test_a_recorder_that_is_behind_again_and_again_is_told_of_once_and_then_how_
         look(59_000, 70 + number, 0.8 * QUIET_S)
     look(59_000, 89, 0.3 * QUIET_S)
     assert [words for words in told if words] == [
-        "not recorded from tick 2000 on: the recorder has stopped or is too slow",
-        f"recorded again after {19 * (0.8 * QUIET_S + 0.005):.1f} s; 19 ticks lost",
+        "ticks are not recorded from tick 2000 on: the recorder has stopped or is too slow",
+        f"ticks are recorded again after {19 * (0.8 * QUIET_S + 0.005):.1f} s; 19 ticks lost",
     ]
     look(2_000, 89, 5.0)
     slow.store(Word.RECORDER_FAILURE, errno.ENOSPC)

@@ -57,11 +57,14 @@ def current_run(client: Client) -> RecordedRun:
     recording = status["recording"]
     if "file" not in recording or "rate_hz" not in status:
         raise UnavailableError(
-            f"{client.path}: nothing to capture, as no loop is recorded; the state of the service is {status['state']}"
+            f"{client.path}: cannot capture, because no loop is recorded now; the state of the service is "
+            f"{status['state']}; try again when the loop runs"
         )
     if recording["state"] != "recording":
-        since = f"not recorded from tick {recording['since_tick']} on: {recording['reason']}"
-        raise UnavailableError(f"{client.path}: nothing to capture, as the loop is {since}")
+        raise UnavailableError(
+            f"{client.path}: cannot capture, because the loop is not recorded from tick {recording['since_tick']} on: "
+            f"{recording['reason']}"
+        )
     written, rate_hz = int(recording["written_ticks"]), float(status["rate_hz"])
     return RecordedRun(Path(recording["file"]), int(status["tick"]), written, rate_hz)
 
@@ -153,8 +156,13 @@ def _replay_verdict(path: Path) -> str:
     if report.identical:
         return "identical"
     if (difference := report.first_difference) is not None:
-        return f"different: tick {difference['tick']}, {difference['signal']}"
-    return "; ".join(["no difference, but not verified as a whole", *(entry["why"] for entry in report.not_verified)])
+        return f"different: tick {difference['tick']}, signal {difference['signal']}"
+    return "; ".join(
+        [
+            "no difference, but the replay could not verify the whole recording",
+            *(entry["why"] for entry in report.not_verified),
+        ]
+    )
 
 
 def main() -> int:

@@ -81,8 +81,7 @@ class Reader:
         if len(columns) != width:
             raise UnavailableError(
                 f"{self._path}: ticks have {width} signals, but the service names {len(columns)} signals; if the "
-                "service was "
-                "just started again, try again; else use the same version of rtloop as the service"
+                "service was just started again, try again; else use the same version of rtloop as the service"
             )
         if self._mapping is None:
             self._cursor = max(int(ring.head[0]) - capacity + capacity // CLEARANCE, 0)

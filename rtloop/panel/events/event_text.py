@@ -99,7 +99,7 @@ def event_text(event: Event, unit: str = "") -> str:
         case "set_mode":
             return details["mode"].replace("_", " ")
         case "load_law":
-            return details.get("change") or ("another controller" if details["values"][0] else "other numbers")
+            return details.get("change") or ("another controller" if details["values"][0] else "other coefficients")
         case "tripped":
             return details["reason"] or ", ".join(details["causes"])
         case "recovery":

@@ -56,7 +56,7 @@ class Feed:
         self.past: TickHistory | None = None
         self.timing: Timing | None = None
         self.events = Events(service)
-        self.fault: str | None = "no tick is read yet"
+        self.fault: str | None = "the panel has not read a tick of the loop yet"
         """Reason why no ticks can be read; None while they can."""
         self._reader: Reader | None = None
         self._viewers: list[Follower] = []

@@ -127,7 +127,9 @@ class Timing:
         recent_us = quantile_us(_sum(second.late for second in seconds[-RECENT_S:]), 0.99) or 0.0
         limit_us = max(WORSE_RATIO * (quantile_us(lateness, 0.99) or np.inf), RELEVANT_PART * self._period_us)
         if len(seconds) > 2 * RECENT_S and recent_us > limit_us:
-            advice.append(f"lateness grows: one tick in 100 of the last {RECENT_S} s was {recent_us:.0f} µs late")
+            advice.append(
+                f"lateness grows: in the last {RECENT_S} s, one tick in 100 was at least {recent_us:.0f} µs late"
+            )
         if advice:
             advice.append("to find the cause on this host and a remedy, run `rtloop doctor CONFIG`")
         return advice

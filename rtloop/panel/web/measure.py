@@ -37,7 +37,9 @@ def signal_figures(feed: Feed, run: int, first: int, end: int, signals: list[str
     span = f"ticks {first} to {end - 1}"
     if not np.isfinite(ticks).any():
         raise RequestRefused(
-            410, f"{span}: lost before the panel read them; a recording is not affected. Select another range"
+            410,
+            f"{span}: lost before the panel read these ticks; a recording of the run is not affected; select another "
+            "range",
         )
     results = {}
     for name, row in zip(signals, values, strict=True):

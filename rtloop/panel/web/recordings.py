@@ -151,7 +151,8 @@ class Recordings:
             return max(run.tick + 1 - round((body.seconds or 0.0) * rate_hz), 0), run.tick + 1
         if body.end - body.first > LONGEST_S * rate_hz:
             raise ValueError(
-                f"ticks {body.first} to {body.end - 1}: too many; allowed: at most {LONGEST_S:g} s at once"
+                f"ticks {body.first} to {body.end - 1}: {(body.end - body.first) / rate_hz:.4g} s; allowed: at "
+                f"most {LONGEST_S:g} s"
             )
         if body.end > run.tick + AHEAD_S * rate_hz:
             raise ValueError(f"end: tick {body.end}; allowed: at most {AHEAD_S:g} s after the newest tick, {run.tick}")

@@ -14,7 +14,7 @@ from prometheus_client.utils import floatToGoString
 from rtloop.service.measuring.condition import Condition
 from rtloop.service.measuring.quality import LATENESS_US, Quality
 from rtloop.service.service import Service, State
-from rtloop.service.status import newest_signals, timing
+from rtloop.service.status import WINDOW_TICKS, newest_signals, timing
 from rtloop.supervision.recording_state import recording_state
 
 US_PER_S = 1e6
@@ -58,7 +58,12 @@ class ServiceCollector(Collector):
         conditions and newest signals; without a loop, only some of these have samples.
         """
         service, supervisor, state = self._service, self._service.supervisor, self._service.state
-        yield "rtloop_state", "1 for the state in force", ("state",), [(one.value, state is one) for one in State]
+        yield (
+            "rtloop_state",
+            "1 for the present state of the service, 0 for the others",
+            ("state",),
+            [(one.value, state is one) for one in State],
+        )
         ticks = 0 if supervisor is None else supervisor.ticks
         yield "rtloop_ticks", "Ticks executed by the present loop", (), [(ticks,)]
         yield "rtloop_restarts", "Loops that ended before the present one", (), [(len(service.results),)]
@@ -69,26 +74,32 @@ class ServiceCollector(Collector):
             yield "rtloop_ticks_not_recorded", "Ticks of the present loop without a record", (), [(lost_ticks,)]
             if quota is not None:
                 yield "rtloop_recordings_bytes", "Size of this configuration's recordings", (), [(quota.total_bytes,)]
-                yield "rtloop_recordings_removed", "Files removed by the quota", (), [(quota.removed_files,)]
+                yield (
+                    "rtloop_recordings_removed",
+                    "Recording files removed because of keep_gib or min_free_mib",
+                    (),
+                    [(quota.removed_files,)],
+                )
         if timings := timing(service):
-            yield "rtloop_rate_hz", "Rate over the last ticks", (), [(timings["rate_hz"],)]
-            yield "rtloop_overruns", "Overruns in the last ticks", (), [(timings["overruns"],)]
-            yield "rtloop_periods_missed", "Periods missed in the last ticks", (), [(timings["periods_missed"],)]
+            newest = f", over the newest {WINDOW_TICKS} ticks at most"
+            yield "rtloop_rate_hz", f"Ticks per second{newest}", (), [(timings["rate_hz"],)]
+            yield "rtloop_overruns", f"Ticks that ended after the next deadline{newest}", (), [(timings["overruns"],)]
+            yield "rtloop_periods_missed", f"Periods without a tick{newest}", (), [(timings["periods_missed"],)]
             lateness = [(name, value_us / US_PER_S) for name, value_us in timings["lateness_us"].items()]
-            yield "rtloop_lateness_seconds", "Lateness over the last ticks: p50, p99, max", ("statistic",), lateness
+            yield "rtloop_lateness_seconds", f"Lateness: p50, p99, max{newest}", ("statistic",), lateness
         if (live := service.live) is not None:
             plan, ends = live.prepared.plan, {"lowest": "drive_min_v", "highest": "drive_max_v"}
             limits = [(axis, end, float(coefficients[key])) for end, key in ends.items()
                       for axis, coefficients in zip(plan.axes, plan.coefficients, strict=True)]  # fmt: skip
-            yield "rtloop_drive_limit_v", "Limits of the drive", ("axis", "end"), limits
+            yield "rtloop_drive_limit_v", "Limits of the drive, V", ("axis", "end"), limits
         newest = newest_signals(service)
         causes = [(cause, 1) for cause in newest.get("trip", ())]
-        yield "rtloop_trip", "1 for each cause of the trip in force", ("cause",), causes
+        yield "rtloop_trip", "1 for each cause of the present trip", ("cause",), causes
         conditions = [(axis, member.value, condition is member) for axis, condition in
                       newest.get("condition", {}).items() for member in Condition]  # fmt: skip
         yield (
             "rtloop_condition",
-            "1 for the present condition of an axis in closed loop",
+            "1 for the present condition of an axis in closed loop, 0 for the others",
             ("axis", "condition"),
             conditions,
         )
@@ -105,16 +116,26 @@ class ServiceCollector(Collector):
         if not newest:
             return
         times = [(axis, figures["unix_time_s"]) for axis, figures in newest.items()]
-        yield "rtloop_measured_unixtime_seconds", "Time of the last measurement", ("axis",), times
+        yield (
+            "rtloop_measured_unixtime_seconds",
+            "Time of the last measurement of the axis, s since 1970",
+            ("axis",),
+            times,
+        )
         for suffix, key, note in (("", "value", " as last measured"), ("_std", "std", ", standard deviation")):
             margins = [(axis, name, margin[key]) for axis, figures in newest.items()
                        for name, margin in figures["margins"].items() if margin["value"] is not None]  # fmt: skip
             yield f"rtloop_margin{suffix}", f"Margin of the loop{note}", ("axis", "margin"), margins
             resonances = [(axis, name, figures["resonance"][name + suffix]) for axis, figures in newest.items()
                           for name in ("hz", "damping") if figures["resonance"]]  # fmt: skip
-            yield f"rtloop_resonance{suffix}", f"Resonance: hz, damping{note}", ("axis", "of"), resonances
+            yield (
+                f"rtloop_resonance{suffix}",
+                f"Frequency (hz) and damping ratio (damping) of the resonance{note}",
+                ("axis", "of"),
+                resonances,
+            )
             gains = [(axis, figures["gain"][key]) for axis, figures in newest.items() if figures["gain"]]
-            yield f"rtloop_gain{suffix}", f"Position per command at rest{note}", ("axis",), gains
+            yield f"rtloop_gain{suffix}", f"Gain at rest, position per command{note}", ("axis",), gains
 
 
 class QualityCollector(Collector):
@@ -134,11 +155,16 @@ class QualityCollector(Collector):
         for name, text, labels, samples in (
             (
                 "rtloop_ticks_summed",
-                "Ticks in the sums, over all loops since the start of the service",
+                "Ticks that the service has read and summed, in all loops since its start",
                 (),
                 [(sums.ticks,)],
             ),
-            ("rtloop_ticks_unseen", "Ticks that were overwritten before they were read", (), [(sums.unread_ticks,)]),
+            (
+                "rtloop_ticks_unseen",
+                "Ticks that the loop overwrote before the service read them",
+                (),
+                [(sums.unread_ticks,)],
+            ),
             ("rtloop_tick_overruns", "Ticks that ended after the next deadline", (), [(sums.overruns,)]),
             ("rtloop_tick_periods_missed", "Periods without a tick", (), [(sums.periods_missed,)]),
             ("rtloop_ticks_limited", "Ticks at a limit", ("limit",), sums.limited_ticks.items()),
@@ -158,15 +184,16 @@ class QualityCollector(Collector):
         axes = self._quality.axes
         for name, text, field in (
             ("rtloop_closed_loop_ticks", "Ticks in closed loop", "closed_ticks"),
-            ("rtloop_error_square_um2", "Sum of the squared error in closed loop", "error_um2"),
-            ("rtloop_drive_square_v2", "Sum of the squared drive", "drive_v2"),
+            ("rtloop_error_square_um2", "Sum of the squared error over all ticks in closed loop, µm²", "error_um2"),
+            ("rtloop_drive_square_v2", "Sum of the squared drive over all ticks, V²", "drive_v2"),
         ):
             samples = [(axis, getattr(sums, field)) for axis, sums in axes.items()]
             yield _family(CounterMetricFamily, name, text, samples, ("axis",))
         peaks = {axis: tuple(zip(*sums.peaks, strict=True)) for axis, sums in axes.items() if sums.peaks}
-        yield _family(GaugeMetricFamily, "rtloop_error_peak_um", "Largest error in closed loop in a minute",
+        text = "Largest |error| in closed loop in the last minute, µm"
+        yield _family(GaugeMetricFamily, "rtloop_error_peak_um", text,
                       [(axis, max(errors)) for axis, (errors, _, _) in peaks.items()], ("axis",))  # fmt: skip
         ends = [(axis, end, value) for axis, (_, lows, highs) in peaks.items()
                 for end, value in (("lowest", min(lows)), ("highest", max(highs)))]  # fmt: skip
-        text = "Smallest and largest drive in a minute"
+        text = "Lowest and highest drive in the last minute, V"
         yield _family(GaugeMetricFamily, "rtloop_drive_peak_v", text, ends, ("axis", "end"))

@@ -25,7 +25,7 @@ def requester_name(connection: HTTPConnection) -> str:
         text = connection.scope.get("query_string", b"").decode("ascii")
         query = parse_qs(text, keep_blank_values=True, errors="strict")
     except ValueError:
-        raise ConfigError("request", ["as: the name is not text; allowed: UTF-8"]) from None
+        raise ConfigError("request", ["as: the name is not valid text; allowed: UTF-8, percent-encoded"]) from None
     names = query.get("as", [OPERATOR])
     if len(names) > 1:
         raise ConfigError("request", [f"as: {len(names)} names; allowed: 1"])

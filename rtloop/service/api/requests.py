@@ -220,14 +220,16 @@ REQUESTS = (
     ApiRequest("GET", "/configuration", "Return the running configuration with all changes, the columns of a record, "
                "and the paths of shared block and recordings.", lambda s, _: running_configuration(s),
                **_STATE_READ),
-    ApiRequest("GET", "/asked_by", "Return the requester of a command and its change of a law, by the `identity` of "
-               "its event; null if unknown.", _command_origin, IdentityQuery, page_bytes=None,
+    ApiRequest("GET", "/asked_by", "Return the name of the client that sent a command, and the change of a law that "
+               "the command made; the `identity` in the command's event selects it. Null if unknown.",
+               _command_origin, IdentityQuery, page_bytes=None,
                **_QUERY_READ),
     ApiRequest("GET", "/metrics", "Return metrics in Prometheus' text format.", lambda s, _: metrics_text(s),
                media_type="text/plain; version=0.0.4; charset=utf-8", **_READ),
     ApiRequest("POST", "/arm", "Allow the outputs to be driven.", _arm),
     ApiRequest("POST", "/start", "Set the configured mode.", _tick(lambda s, _: s.start())),
-    ApiRequest("POST", "/stop", "Ramp the outputs to safe; waits for no other request.", _tick(lambda s, _: s.stop()),
+    ApiRequest("POST", "/stop", "Ramp the outputs to their safe values; a stop does not wait for other requests.",
+               _tick(lambda s, _: s.stop()),
                sender=Sender.STOPPER, **_SAFETY),
     ApiRequest("POST", "/reset", "Clear latched trips; the outputs stay off.", _tick(lambda s, _: s.reset()),
                **_SAFETY),
@@ -240,7 +242,8 @@ REQUESTS = (
                page_bytes=MAX_BODY_BYTES),
     ApiRequest("POST", "/response", "Measure the response of the closed loop about its setpoint.", _measure_response,
                ResponseBody, Lane.MEASUREMENT),
-    ApiRequest("POST", "/learn", "Play a period and learn it; the table continues to play unless `keep` is false.",
+    ApiRequest("POST", "/learn", "Play one period of a reference repeatedly and learn a table with less error; the "
+               "table continues to play unless `keep` is false.",
                _learn, LearnBody, Lane.MEASUREMENT, page_bytes=MAX_BODY_BYTES),
     ApiRequest("POST", "/tune", "Change keys of controller, limits, interlocks, prefilter or model.",
                _tick(lambda s, body: s.require_live().tune(body.axis, body.section, body.values)), TuneBody,
@@ -248,11 +251,13 @@ REQUESTS = (
     ApiRequest("POST", "/controller", "Verify another controller and load it bumplessly.",
                _tick(lambda s, body: s.require_live().load_controller(body.axis, body.controller)),
                ControllerBody, **_BUILD),
-    ApiRequest("POST", "/preview", "Return margins and step before and after a `/tune`; changes nothing.",
+    ApiRequest("POST", "/preview", "Return margins and step response before and after a change as in `/tune`, without "
+               "making the change.",
                lambda s, body: s.require_live().preview(body.axis, body.section, body.values), TuneBody,
                sender=Sender.ANYONE, **_BUILD),
     ApiRequest("POST", "/undo", "Undo the last change of an axis.", _undo, UndoBody, **_BUILD),
-    ApiRequest("POST", "/lock", "Take the lock, from its holder with the emergency key.", _take_lock, LockBody,
+    ApiRequest("POST", "/lock", "Take the lock if it is free; with the emergency key, also from its holder.",
+               _take_lock, LockBody,
                body_optional=True, **_LOCK),
     ApiRequest("DELETE", "/lock", "Release the lock.", _release_lock, **_LOCK),
 )  # fmt: skip

@@ -233,8 +233,9 @@ class LiveLaw:
                 if not changed_axes:
                     raise
                 faults = error.faults if isinstance(error, ConfigError) else [str(error)]
+                names = ", ".join(dict.fromkeys(changed_axes))
                 raise Refusal(
-                    "; ".join([*faults, f"these axes are changed already: {', '.join(dict.fromkeys(changed_axes))}"])
+                    "; ".join([*faults, f"these axes are changed already: {names}; they stay changed"])
                 ) from None
             self.prepared = prepared
             if changed_axes:

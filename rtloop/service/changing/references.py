@@ -252,17 +252,19 @@ class LiveReferences:
         position interlock and for too many samples; Refusal within `reserved`; Refusal, UnconfirmedCommand.
         """
         if self._activity:
-            raise Refusal(f"reference: {self._activity}; send the request again when that is done")
+            raise Refusal(f"reference: {self._activity}; send the request again afterwards")
         options = self._prepared().configuration.axes[number]
         limits = options.limits
         lowest, highest = extent(values, samples)
         if self._staging.in_raw_mode:
             if not limits.lowest_v <= lowest <= highest <= limits.drive_v:
-                allowed = f"{limits.lowest_v:g} V … {limits.drive_v:g} V (limits.drive_v); raw references are in volts"
-                raise invalid_request(f"reference: {volts(lowest, highest)}, beyond the axis's {allowed}")
+                allowed = f"{limits.lowest_v:g} V … {limits.drive_v:g} V (limits.drive_min_v, limits.drive_v)"
+                raise invalid_request(
+                    f"reference: {volts(lowest, highest)}; allowed: {allowed}; references in mode raw are in V"
+                )
         elif not (largest := max(-lowest, highest)) <= limits.command_um:
-            allowed = f"±{limits.command_um:g} µm (limits.command_um)"
-            raise invalid_request(f"reference: reaches {largest:g} µm, beyond the axis's {allowed}")
+            allowed = f"at most {limits.command_um:g} µm (limits.command_um)"
+            raise invalid_request(f"reference: reaches a magnitude of {largest:g} µm; allowed: {allowed}")
         elif not restores and (fault := _setpoint_fault(values, options.interlocks.position_um)) is not None:
             raise invalid_request(f"reference: {fault}")
         if samples.size:

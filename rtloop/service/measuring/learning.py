@@ -171,7 +171,7 @@ def _run_cycles(
         error_um = _mean_error_um(player, request.reference_um, table, settle_periods, judged_periods)
         trials.add(table, error_um)
         if trials.cycles[-1].rms_um > MAX_ERROR_GROWTH * trials.cycles[trials.best_cycle].rms_um:
-            return f"the error grew in cycle {cycle}; the best table is that of cycle {trials.best_cycle}"
+            return f"the error grew in cycle {cycle}; cycle {trials.best_cycle} has the best table"
         table = gains.improve(table, error_um)
     return f"after {request.cycles} cycles"
 

@@ -143,11 +143,13 @@ def require_room(axis: AxisOptions, ends_um: tuple[float, float], hold_um: float
     position_um, sensor = axis.interlocks.position_um, "interlocks.sensor_min_v and sensor_max_v"
     allowed_um, limit = min(
         (position_um - abs(hold_um), f"interlocks.position_um = {position_um:g}"),
-        (hold_um - ends_um[0], f"{sensor}, the sensor's range from {ends_um[0]:.4g} µm on"),
-        (ends_um[1] - hold_um, f"{sensor}, the sensor's range up to {ends_um[1]:.4g} µm"),
+        (hold_um - ends_um[0], f"{sensor}, the sensor's range begins at {ends_um[0]:.4g} µm"),
+        (ends_um[1] - hold_um, f"{sensor}, the sensor's range ends at {ends_um[1]:.4g} µm"),
     )
     if amplitude_um > allowed_um:
-        fault = f"amplitude_um: {amplitude_um:g} µm about the held {hold_um:g} µm; allowed: up to {allowed_um:.4g} µm"
+        fault = (
+            f"amplitude_um: {amplitude_um:g} µm about the setpoint {hold_um:g} µm; allowed: up to {allowed_um:.4g} µm"
+        )
         raise ConfigError("request", [f"response: {fault}, limited by axis.{axis.name}.{limit}"])
 
 

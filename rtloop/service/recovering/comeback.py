@@ -144,4 +144,7 @@ def _await_record(supervisor: Supervisor, tick: int) -> Real:
         if len(match):
             return match[0]
         time.sleep(POLL_S)
-    raise Refusal(f"the record of tick {tick} was not found; the loop stands still, or the service was held up")
+    raise Refusal(
+        f"the service found no record of tick {tick} within {RECORD_TIMEOUT_S:g} s; the loop stands still, or the host "
+        "is overloaded; see `rtloop doctor`"
+    )

@@ -26,7 +26,7 @@ from rtloop.signals import Flag, Mode
         (Kind.SET_REFERENCE, (Generator.INPUT, 1.0), "an input"),
         (Kind.SET_MODE, (Mode.CLOSED_LOOP,), "closed loop"),
         (Kind.LOAD_LAW, (1.0,), "another controller"),
-        (Kind.LOAD_LAW, (0.0,), "other numbers"),
+        (Kind.LOAD_LAW, (0.0,), "other coefficients"),
         (Kind.TRIPPED, (float(Flag.TRIP_POSITION), 61.0, 60.0, float(Flag.TRIP_POSITION)),
          "x: position 61 µm, its limit 60 µm"),
         (Kind.PARKED, (), ""),

@@ -144,7 +144,7 @@ def test_a_measurement_ends_with_its_page(browser: Browser, bench: Bench, path: 
         ("retune", {"axis": "--help"}, 422, "axis: '--help' is unknown; allowed: x"),
         ("retune", {"axis": "\0"}, 422, "null byte"),
         ("swap", {"axis": "x", "replaces": {"taps": [1.0], "command_taps": []}}, 422, "command_taps"),
-        ("learn", {"axis": "x", "samples": [99.0] * 8}, 422, "reaches 99 µm, beyond"),
+        ("learn", {"axis": "x", "samples": [99.0] * 8}, 422, "reaches a magnitude of 99 µm; allowed"),
     ],
 )
 def test_a_refusal_names_the_reason(
