@@ -14,7 +14,7 @@ TEXTS = {
     WATCHDOG: "no drive reached the node for longer than watchdog_ms, and the node's watchdog has parked the outputs",
     SIZE: "driver.outputs differs from the number of the node's outputs; set driver.outputs to this number",
     RANGE: "the node refused a drive outside the range of the node's output",
-    FLAGS: "the node refused a drive with unknown flags",
+    FLAGS: "the node refused a drive with contradictory flags or without a hold time",
     RESTARTED: "the node has restarted, and the outputs are at the safe values",
     NOT_READY: "the node has parked its outputs",
     LINK: "too many ticks without an answer in time: the error level has reached driver.error_limit; check the line",

@@ -8,6 +8,8 @@ from rtloop.engine.plan import Pacing
 
 SPINNING_SHARE = 0.9
 LIMITS = "/etc/security/limits.d/rtloop.conf"
+DEFAULT_FAIR_RUNTIME_NS = 50_000_000
+"""Runtime of the fair server in each second, of a kernel that nobody has tuned."""
 
 
 def spinning_share(pacing: Pacing) -> float:
@@ -49,13 +51,14 @@ def throttling(host: Host, pacing: Pacing) -> Finding:
         return Finding("real-time throttling", "not shown", "off if the loop spins", None)
     sleeps = spinning_share(pacing) < SPINNING_SHARE
     value = "off" if runtime == "-1" else f"{runtime} of each {period} µs"
+    lost_us = 0.0 if runtime == "-1" else max(float(period) - float(runtime), 0.0)
     return Finding(
         "real-time throttling",
         value + (", the loop sleeps" if sleeps else ", the loop spins"),
         "off if the loop spins",
         sleeps or runtime == "-1",
-        50_000.0,
-        "a loop that spins (waits without sleep) loses the processor for 50 ms of every second",
+        lost_us,
+        f"a loop that spins (waits without sleep) loses the processor for {lost_us:g} of every {period} µs",
         "sudo sysctl kernel.sched_rt_runtime_us=-1",
         {path: "-1"},
     )
@@ -76,13 +79,14 @@ def fair_server(host: Host, pacing: Pacing) -> Finding:
     path = f"/sys/kernel/debug/sched/fair_server/cpu{cpu}/runtime"
     runtime = host.read(path)
     value = "not shown: debugfs cannot be read" if runtime is None else f"{runtime} ns of each second"
+    lost_ms = float(runtime or DEFAULT_FAIR_RUNTIME_NS) * 1e-6
     return Finding(
         name,
         value,
         requirement,
         None if runtime is None else runtime == "0",
-        50_000.0,
-        "a loop that spins (waits without sleep) loses the processor for 50 ms of every second",
+        1000.0 * lost_ms,
+        f"a loop that spins (waits without sleep) loses the processor for {lost_ms:g} ms of every second",
         f"echo 0 | sudo tee {path}",
         {path: "0"} if runtime else {},
     )

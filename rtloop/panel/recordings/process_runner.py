@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import json
 import os
+import shlex
 import sys
 from contextlib import suppress
 from typing import Any
@@ -74,9 +75,8 @@ async def _run_json(command: list[str], stdin: bytes, timeout_s: float) -> dict[
     try:
         output, _ = await asyncio.wait_for(process.communicate(stdin), timeout_s)
     except TimeoutError:
-        raise ProcessFailed(
-            f"the command did not finish within {timeout_s:g} s; run it in a terminal, where it has no time limit"
-        ) from None
+        remedy = "run it in a terminal, where it has no time limit"
+        raise ProcessFailed(f"`{_command_text(command)}` did not finish within {timeout_s:g} s; {remedy}") from None
     finally:
         if process.returncode is None:
             with suppress(ProcessLookupError):
@@ -86,9 +86,14 @@ async def _run_json(command: list[str], stdin: bytes, timeout_s: float) -> dict[
         result = json.loads(output)
     except ValueError:
         raise ProcessFailed(
-            f"{command[2]}: the process ended with exit code {process.returncode} and without a result; run the "
-            "command in a terminal, where its messages are shown"
+            f"`{_command_text(command)}` ended with exit code {process.returncode} and without a result; run it in a "
+            "terminal, which shows its messages"
         ) from None
     if "error" in result:
         raise ProcessFailed(result["error"], result.get("exit_code"))
     return result
+
+
+def _command_text(command: list[str]) -> str:
+    """Return the command as somebody types it, where it is `rtloop`; else with Python in front."""
+    return shlex.join(command[2:] if command[2] == "rtloop" else ["python", *command[1:]])

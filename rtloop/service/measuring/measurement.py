@@ -146,6 +146,9 @@ def require_room(axis: AxisOptions, ends_um: tuple[float, float], hold_um: float
         (hold_um - ends_um[0], f"{sensor}, the sensor's range begins at {ends_um[0]:.4g} µm"),
         (ends_um[1] - hold_um, f"{sensor}, the sensor's range ends at {ends_um[1]:.4g} µm"),
     )
+    if allowed_um <= 0:
+        fault = f"the setpoint {hold_um:g} µm leaves no room for a motion, limited by axis.{axis.name}.{limit}"
+        raise ConfigError("request", [f"response: {fault}; use another setpoint"])
     if amplitude_um > allowed_um:
         fault = (
             f"amplitude_um: {amplitude_um:g} µm about the setpoint {hold_um:g} µm; allowed: up to {allowed_um:.4g} µm"

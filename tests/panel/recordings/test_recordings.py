@@ -194,12 +194,24 @@ def test_sweeps_of_a_recording_have_its_samples(panel: Panel, captured: dict[str
 
 def test_processes_beyond_the_limit_are_refused():
     async def many() -> list[Any]:
-        aside = ProcessRunner(max_unfinished=2)
-        asked = [aside.run("rtloop.nowhere") for _ in range(5)]
-        return await asyncio.gather(*asked, return_exceptions=True)
+        runner = ProcessRunner(max_unfinished=2)
+        requests = [runner.run("rtloop.nowhere") for _ in range(5)]
+        return await asyncio.gather(*requests, return_exceptions=True)
 
-    said = [type(one) for one in asyncio.run(many())]
-    assert (said.count(TooManyRequests), said.count(ProcessFailed)) == (3, 2)
+    results = [type(result) for result in asyncio.run(many())]
+    assert (results.count(TooManyRequests), results.count(ProcessFailed)) == (3, 2)
+
+
+def test_a_command_that_fails_is_named_as_somebody_types_it():
+    async def failure(runner: ProcessRunner, module: str, *arguments: str) -> str:
+        with pytest.raises(ProcessFailed) as caught:
+            await runner.run(module, *arguments)
+        return str(caught.value)
+
+    said = asyncio.run(failure(ProcessRunner(), "rtloop", "--help"))
+    assert said.startswith("`rtloop --help` ended with exit code 0 and without a result; run it in a terminal")
+    said = asyncio.run(failure(ProcessRunner(timeout_s=0.01), "rtloop.nowhere", "my run.mcap"))
+    assert said.startswith("`python -m rtloop.nowhere 'my run.mcap'` did not finish within 0.01 s; run it")
 
 
 def test_recordings_are_served_without_the_service(panel: Panel, captured: dict[str, Any]):
