@@ -81,7 +81,9 @@ def test_what_simulated_steps_miss_is_said_where_it_does_not_count(tmp_path: Pat
     result = CliRunner().invoke(main, ["design", "verify", str(write_configuration(tmp_path))])
     assert result.exit_code == 0, result.output
     answer = result.stdout.strip().splitlines()[-1]
-    assert answer.startswith("as it will run, the linear loop meets its specification; simulated, not counted: misses ")
+    assert answer.startswith(
+        "as it will run, the linear loop meets its specification; the simulated steps, which do not count, miss "
+    )
     assert "overshoot of 1 µm steps" in answer
 
 

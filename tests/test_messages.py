@@ -215,9 +215,9 @@ def test_a_file_of_another_kind_is_named_with_its_commands(tmp_path: Path) -> No
         (
             ("design", "verify", PAPER, "--spec", PAPER),
             78,
-            "this file is a configuration, and a specification is needed",
+            "this file is a configuration; allowed: a specification",
         ),
-        (("design", "robust", PAPER), 78, "this file is a configuration, and a specification is needed"),
+        (("design", "robust", PAPER), 78, "this file is a configuration; allowed: a specification"),
     ):
         result = run(*arguments)
         assert result.exit_code == code, result.output

@@ -43,7 +43,9 @@ def test_plain_tustin_is_a_caution_and_not_judged_at_a_start():
     prepared = built(("prewarp_hz = 595.5\n", "\n"))
     assert (prepared.warnings, option_cautions(prepared)) == ((), [])
     warnings = cautions(prepared)
-    assert re.search(r"axis\.x\.controller: tustin at 10000 Hz moves the notch at 595\.5 Hz to 588\.7 Hz", warnings[0])
+    assert re.search(
+        r"axis\.x\.controller: method 'tustin' at 10000 Hz moves the notch from 595\.5 Hz to 588\.7 Hz", warnings[0]
+    )
 
 
 def test_a_start_computes_no_margins(monkeypatch):

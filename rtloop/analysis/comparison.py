@@ -137,12 +137,15 @@ def _is_tolerable(shift: RootShift, largest_shift: float, largest_part: float) -
 
 def _warning(shift: RootShift, discrete: DiscreteController) -> str:
     """Return the warning for a pair that moved too far or that C(z) lacks."""
-    name = f"{discrete.method} at {1 / discrete.period_s:g} Hz"
+    name = f"method {discrete.method!r} at {1 / discrete.period_s:g} Hz"
     if math.isnan(shift.discrete_hz):
-        return f"{name} cannot keep the {shift.kind} at {shift.frequency_hz:.1f} Hz; use a higher sampling rate"
+        return (
+            f"{name} loses the {shift.kind} at {shift.frequency_hz:.1f} Hz: C(z) has no such {shift.kind}; use a "
+            "higher sampling rate"
+        )
     part = f", {abs(shift.relative) / shift.damping:.1f} times its half-width" if shift.damping > 1e-5 else ""
     return (
-        f"{name} moves the {shift.kind} at {shift.frequency_hz:.1f} Hz to {shift.discrete_hz:.1f} Hz "
+        f"{name} moves the {shift.kind} from {shift.frequency_hz:.1f} Hz to {shift.discrete_hz:.1f} Hz "
         f"(by {100 * shift.relative:+.2f} %{part}); use method 'tustin' with prewarp_hz = {shift.frequency_hz:.6g}, "
         "or method 'matched' or 'foh'"
     )

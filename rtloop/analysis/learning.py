@@ -103,9 +103,9 @@ def learning_gains(loops: Sequence[tuple[str, Loop]], period_ticks: int) -> Lear
         harmonic = int(np.argmax(~result.is_learned[:2]))
         worst_loop = loops[int(np.argmax(contractions[:, harmonic]))][0]
         raise ValueError(
-            f"with {worst_loop}, one cycle of learning leaves {result.contraction[harmonic]:.2f} times the error at "
-            f"{hz[harmonic]:g} Hz; allowed: below {LARGEST_CONTRACTION}. Use a smaller resonance_percent, or another "
-            "period"
+            f"learning converges too slowly, or not at all, with {worst_loop}: one cycle multiplies the error at "
+            f"{hz[harmonic]:g} Hz by {result.contraction[harmonic]:.2f}; allowed: below {LARGEST_CONTRACTION}. Use a "
+            "smaller resonance_percent, or a reference with another period"
         )
     return result
 

@@ -152,7 +152,7 @@ def least_damped_pole(plant: Transfer) -> complex:
     """
     upper = plant.poles[plant.poles.imag > 0]
     if not upper.size:
-        raise ValueError("plant: no complex poles; needs at least one resonance")
+        raise ValueError("plant: all poles are real; allowed: at least one pair of complex poles (a resonance)")
     return complex(upper[np.argmin(-upper.real / np.abs(upper))])
 
 

@@ -99,8 +99,8 @@ def identify_stage(hysteresis: AxisRecording, step: AxisRecording, order: int | 
         if not jumps(hysteresis) or jumps(step):
             raise
         raise UnsuitableData(
-            f"the two recordings seem to be swapped: {hysteresis.name} has steps of the drive, {step.name} has none; "
-            f"the slow sine comes first, then the step ({error})"
+            f"the two recordings seem to be swapped: {hysteresis.name} has steps of the drive, {step.name} has none. "
+            f"Give the recording of the slow sine first, then the recording of the step. Error in this order: {error}"
         ) from None
 
 
@@ -108,9 +108,9 @@ def _identify_stage(hysteresis: AxisRecording, step: AxisRecording, order: int |
     """Identify the stage, and raise errors, as `identify_stage` does, but never call the recordings swapped."""
     if not step.configuration:
         raise UnsuitableData(
-            f"{step.name}: an imported recording has no configuration, from which driver and limits of the new loop "
-            "would be taken. Record the step with `rtloop run`, or design from the imported recordings with "
-            "`rtloop identify hysteresis`, `rtloop identify dynamics` and `rtloop design synthesise`"
+            f"{step.name}: an imported recording has no configuration; the design takes driver and limits of the new "
+            "loop from the configuration. Record the step with `rtloop run`, or design from the imported recordings "
+            "with `rtloop identify hysteresis`, `rtloop identify dynamics` and `rtloop design synthesise`"
         )
     if not step.is_even:
         raise UnsuitableData(
@@ -140,8 +140,8 @@ def _require_explained(step: AxisRecording, dynamics: DynamicsFit, noise_um: flo
     allowed_um = LARGEST_NOISE_RATIO * noise_um
     if dynamics.rms_error_um > allowed_um:
         raise UnsuitableData(
-            f"{step.name}: no model explains the step. The best, of order {dynamics.model.order} with "
-            f"{count_text(dynamics.delay_ticks, 'sample')} of delay, has an error of {dynamics.rms_error_um:.3g} µm "
+            f"{step.name}: no model explains the step. The best model has order {dynamics.model.order}, "
+            f"{count_text(dynamics.delay_ticks, 'sample')} of delay and an error of {dynamics.rms_error_um:.3g} µm "
             f"rms; allowed: up to {allowed_um:.3g} µm, about {LARGEST_NOISE_RATIO:g} times the noise. Use a step up "
             "and down, a larger step, or a longer recording"
         )

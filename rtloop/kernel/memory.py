@@ -188,7 +188,7 @@ def _rules(record: np.dtype[Any], allowed: Rules) -> npt.NDArray[Any]:
     for rule, (name, limits) in zip(rules, allowed.items(), strict=True):
         if isinstance(limits, Bits):
             raise ValueError(
-                f"coefficient {name}: its rule is a set of bits ({limits}); use a range, of class Allowed, as its rule"
+                f"coefficient {name}: the rule is a set of bits ({limits}); allowed: a range, of class Allowed"
             )
         kind, offset, *_ = record.fields[str(name)]  # type: ignore[index]
         rule["offset"], rule["octets"], rule["count"] = offset, kind.base.itemsize, max(int(np.prod(kind.shape)), 1)

@@ -74,7 +74,9 @@ def tustin(system: CoupledSystem, period_s: float, prewarp_hz: float | None = No
     try:
         inverse = np.linalg.inv(w * states - system.a)
     except np.linalg.LinAlgError:
-        raise ValueError(f"a: the conversion moves the pole s = {w:g} rad/s to infinity; use another rate") from None
+        raise ValueError(
+            f"a: the matrix has a pole at s = {w:g} rad/s, which the bilinear rule moves to infinity; use another rate"
+        ) from None
     return CoupledSystem(
         inverse @ (w * states + system.a),
         np.sqrt(2 * w) * inverse @ system.b,

@@ -196,8 +196,8 @@ def _map_matched(transfer: Transfer, period_s: float) -> tuple[Complex, Complex,
     """
     if np.any(transfer.poles.real * period_s > MAX_EXPONENT):
         raise ValueError(
-            f"poles: real part of {transfer.poles.real.max():g} rad/s; allowed at a period of {period_s:g} s: "
-            f"up to {MAX_EXPONENT / period_s:g} rad/s"
+            f"poles: the largest real part is {transfer.poles.real.max():g} rad/s; allowed at a period of "
+            f"{period_s:g} s: up to {MAX_EXPONENT / period_s:g} rad/s"
         )
     is_representable = transfer.zeros.real * period_s <= MAX_EXPONENT
     zeros, poles = (

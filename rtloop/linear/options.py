@@ -84,7 +84,8 @@ class TransferOptions(Options):
         if self.form == "transfer_function":
             if any(nested):
                 raise ValueError(
-                    "numerator, denominator: nested lists; with form = 'transfer_function', each is one list of numbers"
+                    "numerator, denominator: nested lists; allowed in form 'transfer_function': "
+                    "one list of numbers for each"
                 )
             return Transfer.from_transfer_function(self.numerator, self.denominator)
         if not all(nested):

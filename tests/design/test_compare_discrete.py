@@ -47,7 +47,7 @@ def test_deviation_is_small_where_the_sampling_is_fast() -> None:
 
 def test_a_notch_above_half_the_sampling_rate_is_lost() -> None:
     comparison = compare_controllers(PAPER_C, discretise_controller(PAPER_C, 1e-3, "matched"))
-    assert any("cannot keep the notch at 595.5 Hz" in text for text in comparison.warnings)
+    assert any("loses the notch at 595.5 Hz" in text for text in comparison.warnings)
     assert json.loads(json.dumps(comparison.as_dict(), allow_nan=False))["shifts"][0]["discrete_hz"] is None
 
 

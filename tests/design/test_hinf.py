@@ -132,10 +132,14 @@ INTEGRATING = PAPER_WEIGHTS._replace(tracking=Transfer.from_zpk([-1000.0], [0.0]
 @pytest.mark.parametrize(
     ("plant", "gamma", "says"),
     [
-        (changed(b2=[[0]]), None, r"stabilisability: u does not move the mode at s = 1 rad/s"),
-        (changed(c2=[[0]]), None, r"detectability: y does not show the mode at s = 1 rad/s"),
-        (changed(d12=[[0], [0]]), None, r"rank: D12 has rank 0 of 1.*needs full column rank, by a weight on every u"),
-        (changed(d21=[[0, 0]]), None, r"rank: D21 has rank 0 of 1.*needs full row rank, by a disturbance of every y"),
+        (changed(b2=[[0]]), None, r"stabilisability: the command u does not move the mode at s = 1 rad/s"),
+        (changed(c2=[[0]]), None, r"detectability: the measurement y does not show the mode at s = 1 rad/s"),
+        (changed(d12=[[0], [0]]), None, r"rank: D12 has rank 0 of 1.*full column rank. Give every command u a weight"),
+        (
+            changed(d21=[[0, 0]]),
+            None,
+            r"rank: D21 has rank 0 of 1.*full row rank. Give every measurement y a disturbance",
+        ),
         (changed(b2=[[0]], c2=[[0]]), None, r"stabilisability.*; detectability"),
         (scalar_plant(0.0)._replace(c1=np.zeros((2, 1))), None, r"zero: the path from u to z .* ω = 0 rad/s"),
         (scalar_plant(0.0)._replace(b1=np.zeros((1, 2))), None, r"zero: the path from w to y .* ω = 0 rad/s"),
@@ -151,7 +155,7 @@ INTEGRATING = PAPER_WEIGHTS._replace(tracking=Transfer.from_zpk([-1000.0], [0.0]
             1.676,
             r"gamma: 1.676 cannot be reached; allowed: at least 1.676.*\. coupling",
         ),
-        (augment(PAPER_D, INTEGRATING), None, "detectability: y does not show the mode at s = 0 rad/s"),
+        (augment(PAPER_D, INTEGRATING), None, "detectability: the measurement y does not show the mode at s = 0 rad/s"),
     ],
 )
 def test_the_condition_that_fails_is_named(plant, gamma, says) -> None:

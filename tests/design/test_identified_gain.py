@@ -69,7 +69,7 @@ def test_the_gain_of_a_drive_without_hysteresis_is_written_as_the_feedforward(fo
     assert feedforward["thresholds_v"] == [0.0]
     assert feedforward["weights_um_per_v"] == pytest.approx([GAIN_UM_PER_V], rel=1e-3)
     said = (folder / "first.txt").read_text(encoding="utf-8")
-    assert "µm/V is the weight of [axis.feedforward], which has no hysteresis" in said
+    assert "µm/V is the only weight of [axis.feedforward], which then has no hysteresis" in said
     assert "hysteresis model" not in said
 
 

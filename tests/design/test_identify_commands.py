@@ -278,7 +278,7 @@ def test_a_drive_that_is_no_slow_sine_is_named(tmp_path: Path, sine: Path, step:
     assert f"the two recordings seem to be swapped: {step} has steps of the drive, {sine} has none" in swapped.stderr
     assert not out.exists()
     closed = recorded(DEPLOY / "paper.toml", 1, tmp_path)
-    for recording, cause in ((closed, "a controller made the drive"), (step, "the drive has steps"), (sine, None)):
+    for recording, cause in ((closed, "a controller computed the drive"), (step, "the drive has steps"), (sine, None)):
         identified = command("identify", "hysteresis", recording)
         warnings = [line for line in identified.stderr.splitlines() if line.startswith("warning: ")]
         assert [line for line in warnings if f"{cause}" in line] == warnings

@@ -61,7 +61,9 @@ def test_a_stage_that_moves_against_its_drive_is_named(signs: tuple[float, float
     rig = drawn(204)
     run = excited(type(EQ_4)(rig.thresholds, rig.weights), rig.measure(step_drive(), FAST_S))
     wrong = Excitation(run.name, signs[0] * run.input, signs[1] * run.position_um, run.period_s)
-    with pytest.raises(UnsuitableData, match=r"the sign is wrong: .* falls where the drive rises\. .* um_per_v"):
+    with pytest.raises(
+        UnsuitableData, match=r"the sign of drive or position is wrong: .* falls where the drive rises\. .* um_per_v"
+    ):
         identify_dynamics(wrong, largest_order=4)
 
 
@@ -216,7 +218,9 @@ def test_a_slow_sine_is_too_little_for_dynamics() -> None:
     slow = 10 * np.sin(2 * np.pi * 0.5 * time_s)
     run = Excitation("slow", slow, 4 * slow + np.random.default_rng(1).normal(0, 0.01, slow.size), FAST_S)
     assert excited_order(run) <= 2
-    with pytest.raises(UnsuitableData, match=r"too little excitation: the input identifies .* Use a step, or a chirp"):
+    with pytest.raises(
+        UnsuitableData, match=r"too little excitation: this input identifies at most .* Use a step, or a chirp"
+    ):
         identify_dynamics(run, order=4)
     with pytest.raises(UnsuitableData, match="too little excitation"):
         identify_dynamics(run)

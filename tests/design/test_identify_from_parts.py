@@ -74,7 +74,9 @@ def test_a_recording_whose_memory_is_never_known_is_not_judged() -> None:
 
 def test_a_drive_that_never_turns_back_is_told_what_it_misses() -> None:
     drive = np.linspace(-2.0, 8.0, SAMPLES)
-    with pytest.raises(UnsuitableData, match=r"not recorded: a stroke from 8 V to -2 V \(the drive reached 8 V only\)"):
+    with pytest.raises(
+        UnsuitableData, match=r"a stroke from 8 V to -2 V is not recorded \(the drive reached only 8 V\)"
+    ):
         identify_from_parts([run_of(drive, sum_of_plays(drive))])
 
 
@@ -86,9 +88,9 @@ def test_plays_that_no_stroke_has_shown_are_left_out_and_named() -> None:
     assert found.stroke_v == pytest.approx(6.0, abs=0.1)
     assert found.hysteresis.model.thresholds.max() < 3.0
     assert found.missing_drive.startswith(
-        "not recorded: a stroke from -7.973 V to 7.973 V (the drive reached -2 V only)"
+        "a stroke from -7.973 V to 7.973 V is not recorded (the drive reached only -2 V)"
     )
-    with pytest.raises(UnsuitableData, match=r"thresholds from 4 V on cannot be identified.*not recorded"):
+    with pytest.raises(UnsuitableData, match=r"thresholds: value is 4 V; allowed: below .* is not recorded"):
         identify_from_parts([run], thresholds_v=[0.0, 1.0, 4.0])
 
 

@@ -120,7 +120,11 @@ def test_a_section_reads_back_to_the_same_bits() -> None:
 @pytest.mark.parametrize(
     ("drive", "thresholds_v", "says"),
     [
-        (np.linspace(0, 10, 5000), None, "too little excitation: the drive turns back 0 times; needs at least 2"),
+        (
+            np.linspace(0, 10, 5000),
+            None,
+            "too little excitation: the drive turns back 0 times; allowed: at least 2 times",
+        ),
         (10 * np.cos(np.linspace(0, 15, 5000)), None, r"starts at 10 V.*memory is not known"),
         (slow_sine(5.0), [0.0, 3.0, 6.0, 9.0], r"from 6 V on are never reached by a drive of at most 5 V"),
         (np.array([0.0, *[10.0, -10.0] * 60]), None, "these drives do not determine 15 weights"),
@@ -187,8 +191,14 @@ def test_a_wrong_sign_and_a_position_that_does_not_follow_are_named() -> None:
     run = made_of(EQ_4, drive)
     other_axis_um = 30.0 * np.sin(4 * np.pi * 0.1 * SLOW_S * np.arange(drive.size))
     for wrong, says in (
-        (run_of(drive, -run.position_um), r"the sign is wrong: .* falls by [34]\.\d+ µm per volt of drive"),
-        (run_of(-drive, run.position_um), r"the sign is wrong: .* falls by [34]\.\d+ µm per volt of drive"),
+        (
+            run_of(drive, -run.position_um),
+            r"the sign of drive or position is wrong: .* falls by [34]\.\d+ µm per volt of drive",
+        ),
+        (
+            run_of(-drive, run.position_um),
+            r"the sign of drive or position is wrong: .* falls by [34]\.\d+ µm per volt of drive",
+        ),
         (
             run_of(drive, other_axis_um),
             r"no sum of play operators .* error of \d+ % of the position's range; .* up to 15 %",
@@ -216,5 +226,5 @@ def test_a_copy_of_a_recording_is_no_independent_evidence() -> None:
     other = replace(run, name="other", position_um=run.position_um + 1.0)
     runs, sentences = distinct([run, replace(run, name="copy", digest="another"), other])
     assert [one.name for one in runs] == [run.name, "other"]
-    assert sentences == [f"copy: left out, because it has the same ticks as {run.name}"]
+    assert sentences == [f"copy: not used, because it is a copy of {run.name}, with the same ticks"]
     assert distinct([replace(run, name="copy")], [run])[0] == []

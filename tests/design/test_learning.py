@@ -84,5 +84,5 @@ def test_a_loop_that_is_unstable_somewhere_is_named():
 
 def test_a_period_whose_error_would_not_shrink_is_refused():
     """Resonances far below and far above the scan: the answer has either sign, whatever the table."""
-    with pytest.raises(ValueError, match=r"leaves \d.* times the error at 50 Hz; allowed: below 0\.8"):
+    with pytest.raises(ValueError, match=r"multiplies the error at 50 Hz by \d.*; allowed: below 0\.8"):
         learning_gains([("low", loop(20.0, 0.001)), ("high", loop(600.0, 0.001))], TICKS)

@@ -145,7 +145,9 @@ def test_lines_are_odd_and_some_are_silent(period_s: float, from_hz: float, octa
 
 @pytest.mark.parametrize(("from_hz", "to_hz"), [(0.0, 100.0), (100.0, 50.0), (10.0, 4501.0), (10.0, 12.0)])
 def test_a_band_without_lines_is_refused(from_hz: float, to_hz: float) -> None:
-    with pytest.raises(ValueError, match=r"allowed: 0 < from_hz < to_hz ≤|odd multiples of 2 Hz; needs at least 3"):
+    with pytest.raises(
+        ValueError, match=r"allowed: 0 < from_hz < to_hz ≤|odd multiples of 2 Hz \(1/period_s\); allowed: at least 3"
+    ):
         make_grid(RATE_HZ, 0.5, from_hz, to_hz)
 
 

@@ -114,6 +114,6 @@ def _experiments_speak_of_the_stage_alone(made: Configuration, folder: Path) -> 
 def test_no_loop_is_designed_on_a_model_that_explains_nothing(tmp_path) -> None:
     """Two modes by one pole."""
     with pytest.raises(
-        UnsuitableData, match=r"no model explains the step. The best, of order 1 .* Use a step up and down"
+        UnsuitableData, match=r"no model explains the step. The best model has order 1, .* Use a step up and down"
     ):
         designed_for(modal_rig(TWO_MODES_LATE_BY_1), tmp_path, order=1)

@@ -98,7 +98,9 @@ def test_taps_step_in_the_middle_of_the_range() -> None:
     assert lowest == pytest.approx((REMANENCE_UM - bounds.lowest_um) / 30.0)
     half = MODEL_OPTIONS.model_copy(update={"gain": 2.0})  # D(0) = 0.5: the command is twice the position
     assert step_bounds(axis, half, required(15.0)).lowest_um == pytest.approx(bounds.lowest_um / 2)
-    with pytest.raises(ValueError, match=rf"value is 41 µm; allowed: up to {HIGH_UM - REMANENCE_UM:.4g} µm, for a"):
+    with pytest.raises(
+        ValueError, match=rf"value is 41 µm; allowed: up to {HIGH_UM - REMANENCE_UM:.4g} µm, because the"
+    ):
         step_bounds(axis, MODEL_OPTIONS, required(41.0))
 
 
@@ -133,7 +135,7 @@ def test_a_static_error_of_the_position_is_named(percent, height_um, measured_pe
     step = SimulatedStep(height_um, 0.0, 1.0, measured_percent, (0.0, 1.0, measured_percent), 5.0, (), (), (23.0, 24.0))
     rows = [SimpleNamespace(name="static_error_percent", running=percent)]
     notes = simulation_notes(SimpleNamespace(simulated=result(step), rows=rows))  # type: ignore[arg-type]
-    assert any("0.024 µm at 24 µm, which is 2.4 % of a step of 1 µm" in note for note in notes) == is_named
+    assert any("At 24 µm, this is 0.024 µm, or 2.4 % of a step of 1 µm" in note for note in notes) == is_named
 
 
 @pytest.mark.parametrize(("clipped", "limited"), [(slice(0, 100), ()), (slice(250, 251), ("drive",))])

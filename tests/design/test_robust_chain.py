@@ -204,7 +204,7 @@ def test_an_actuator_that_is_no_sum_of_plays_gets_no_promise(tmp_path) -> None:
     steps = record(tmp_path / "steps.mcap", rig.configuration(sine=False), round(STEPS_S * RATE_HZ))[0]
     result = automatically([str(sine), str(steps)], tmp_path, SPEC.format(percent=3.0))
     assert result.exit_code == 1
-    assert "the actuator is not a sum of plays" in result.stderr
+    assert "no sum of play operators describes the actuator" in result.stderr
     assert "simulation.residual_percent" in result.stderr
     assert not (tmp_path / "made.toml").exists()
     said = CliRunner().invoke(main, ["identify", "hysteresis", str(sine)]).stdout

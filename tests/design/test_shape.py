@@ -136,11 +136,12 @@ def test_more_time_makes_a_quieter_command(found) -> None:
 def test_what_cannot_be_says_what_binds_and_the_fastest() -> None:
     asked = Subject(CONTROLLER, STAGE, 1, BOUNDS, 0.004, OPTIONS.model_copy(update={"settling_ms": 0.4}))
     with pytest.raises(
-        NoDesign, match=r"settling_ms: 0.4 ms cannot be .* the fastest is .*no limit on v .* Most helpful: "
+        NoDesign,
+        match=r"settling_ms: 0.4 ms cannot be .* the fastest settling time is .*no limit on v .* Most helpful: ",
     ):
         design_taps(asked)
     wide = OPTIONS.scenarios.model_copy(update={"gain_percent": 4.0})
-    with pytest.raises(NoDesign, match=r"overshoot_percent: 0.0001 % cannot be kept .* the least is"):
+    with pytest.raises(NoDesign, match=r"overshoot_percent: 0.0001 % cannot be kept .* the least overshoot is"):
         design_taps(Subject(CONTROLLER, STAGE, 1, BOUNDS, 1e-6, OPTIONS.model_copy(update={"scenarios": wide})))
 
 
@@ -243,7 +244,12 @@ def test_the_command_prints_figures_and_the_written_file_on_stdout(tmp_path) -> 
         ("[specification.command]\nreference_um = 40.0\ncommand_um = 46.0\n", "", 78, "reference_um: missing"),
         ("taps = 20", "taps = 1", 78, "greater than or equal to 2"),
         ("reference_um = 40.0", "reference_um = 46.5", 78, "reference_um: value is 46.5 µm; allowed: up to 46 µm"),
-        ("taps = 20", "taps = 2", 1, "no taps settle within 0.1 ms, the longest settling that shape.taps = 2 allow at"),
+        (
+            "taps = 20",
+            "taps = 2",
+            1,
+            "no taps settle within 0.1 ms, the longest settling time possible with shape.taps = 2 at",
+        ),
         ("resonance_percent = 4.0", "resonance_percent = nan", 78, "resonance_percent"),
         ("command_um = 60.0", "command_um = 60.0\nslew_v_per_s = 1e4", 78, "limits.slew_v_per_s"),
         ("[axis.limits]", f"[axis.prefilter]\nsections = {SECTIONS}\n[axis.limits]", 78, "prefilter.sections"),
@@ -273,8 +279,11 @@ def test_a_linear_programme_that_no_solver_finishes_is_refused_in_a_sentence(tmp
 @pytest.mark.parametrize(
     ("missed", "said"),
     [
-        ({"overshoot": 0.02}, "fail on 9 plants .* overshoot by 2 %, and v stays within its limits"),
-        ({"excess": 0.01}, "fail on 9 plants .* and v exceeds its limits by 1 % of a step"),
+        (
+            {"overshoot": 0.02},
+            "fail the proof on 9 plants: .* overshoot up to 2 %, and the command v stays within its limits",
+        ),
+        ({"excess": 0.01}, "fail the proof on 9 plants: .* and the command v exceeds its limits by 1 % of a step"),
     ],
 )
 def test_taps_that_their_proof_does_not_bear_out_are_refused(monkeypatch, missed, said) -> None:

@@ -216,7 +216,7 @@ def test_a_model_stands_for_hardware() -> None:
         simulate(Bench(card, {"x": one}), card.axes[0], 0.031, design)
         for one in (stand, stand._replace(residual_percent=3.75))
     ]
-    assert {one.truth for one in found} == {"a rig after the axis's models"}
+    assert {one.truth for one in found} == {"a rig built from the axis's models"}
     assert found[1].steps[0].overshoot_percent > found[0].steps[0].overshoot_percent
     with pytest.raises(ValueError, match=r"axis.x.model: missing; the simulation of the hardware"):
         Bench(card, {"x": stand._replace(model=None)})

@@ -111,10 +111,10 @@ def test_the_command_writes_a_section_that_a_configuration_reads(tmp_path) -> No
 @pytest.mark.parametrize(
     ("old", "new", "code", "says"),
     [
-        ('rule = "printed"', 'rule = "implied"', 1, "Relax the hardest, disturbance"),
+        ('rule = "printed"', 'rule = "implied"', 1, "Relax the hardest requirement: disturbance"),
         ("command_um = 40.0", "command_um = 30.0", 1, "allowed: at least 39.5305 µm, or a smaller reference_um"),
         ("settling_ms = 3.0  ", "settling_ms = 0.003  ", 1, "tracking (ten times slower)"),
-        ("order = 5 ", "order = 4 ", 78, "an unstable loop or one with max |S| above 3; use a higher order"),
+        ("order = 5 ", "order = 4 ", 78, "the loop is unstable or has max |S| above 3; use a higher order"),
         ("order = 5 ", "order = 12 ", 78, "0 modes that are not stable: 0 to 11"),
         ("static_error_percent = 0.1", "static_error_percent = 0.0", 78, "greater than 0"),
         ("settling_ms = 3.0  ", "settling_mS = 3.0  ", 78, "did you mean settling_ms?"),

@@ -113,7 +113,7 @@ def test_omitted_steps_are_told_with_both_ends_of_the_range() -> None:
         command_range=reachable_range(MODEL, LOWEST_V, HIGHEST_V),
     )  # fmt: skip
     (_, note) = simulation_notes(SimpleNamespace(simulated=result, rows=[]))  # type: ignore[arg-type]
-    assert note == f"Left out: steps of 46 µm; the command's range is {low_um:.4g} … {high_um:.4g} µm."
+    assert note == f"Steps of 46 µm were left out: the command's range is {low_um:.4g} … {high_um:.4g} µm."
 
 
 def required(reference_um: float, command_um: float) -> DesignOptions:
@@ -151,7 +151,7 @@ def test_equal_sides_keep_steps_to_both() -> None:
 def test_a_reference_beyond_the_drive_is_refused_with_key_value_and_what_is_possible() -> None:
     (axis,) = stage().axes
     key = r"specification\.command\.reference_um"
-    message = rf"{key}: value is 50 µm; allowed: up to 40 µm, for a command .*limits\.drive_min_v = -2"
+    message = rf"{key}: value is 50 µm; allowed: up to 40 µm, because the command .*limits\.drive_min_v = -2"
     with pytest.raises(ValueError, match=message):
         step_bounds(axis, MODEL_OPTIONS, required(50.0, 55.0))
     half = MODEL_OPTIONS.model_copy(update={"gain": 2.0})  # D(0) = 0.5: the command is twice the position

@@ -129,7 +129,7 @@ def test_the_terminal_shows_required_achieved_verdict_and_claim() -> None:
         "settling (5 %)", "≤ 3 ms", "4.13851 ms", "4.06032 ms", "MISSED", "< 2 ms",
     ]  # fmt: skip
     assert re.search(r"required\s+C\(s\), not judged\s+as it runs C\(z\)", result.stdout)
-    assert "without taps, hold and delay: shown for comparison, it never runs" in result.stdout
+    assert "without taps, hold and delay. C(s) is shown for comparison and never runs" in result.stdout
     assert "at 10000 Hz, 2 samples of delay" in result.stdout
     assert "the loop misses static error" in result.stdout
 
@@ -207,10 +207,10 @@ delay_ticks = {delay}
     ("change", "said"),
     [
         ({}, None),
-        ({"gain": -20.7 / 1.01086}, "gain at 0 Hz 1.01086, in the specification 1. The model"),
+        ({"gain": -20.7 / 1.01086}, "gain at 0 Hz 1.01086, in the specification 1. The verification"),
         ({"stiffness": 1.5e7, "gain": -20.7 * 1.5 / 1.4}, "resonance in Hz 595.5.*, in the specification 616.4"),
-        ({"delay": 2}, "delay_ticks 0, in the specification 2. The model"),
-        ({"damping": 40.0}, "response at 595.5 Hz, by 27.* %. The model"),
+        ({"delay": 2}, "delay_ticks 0, in the specification 2. The verification"),
+        ({"damping": 40.0}, "response at 595.5 Hz, by 27.* %. The verification"),
     ],
 )
 def test_a_plant_of_the_specification_that_is_not_the_judged_model_is_named(change, said, tmp_path) -> None:
@@ -276,7 +276,7 @@ def test_simulated_steps_are_shown_and_judged_where_they_are_asked_for(tmp_path)
     assert shown.simulated is not None
     assert shown.simulated.is_met(shown.simulated.steps[0], "overshoot_percent") is False
     assert shown.simulated.omitted_heights_um == (60.0,)
-    assert any("Left out: steps of 60 µm" in note for note in text.simulation_notes(shown))
+    assert any("Steps of 60 µm were left out" in note for note in text.simulation_notes(shown))
     found = judged(tmp_path, MODEST + "[simulation]\nsteps_um = [2.0]\njudged = true\n", simulated=True)
     assert not found.meets_specification
     assert "simulated, settling (5 %) of 2 µm steps" in answer(found)

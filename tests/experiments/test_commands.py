@@ -120,7 +120,10 @@ def test_impossible_experiments_name_the_reason(tmp_path: Path) -> None:
     ("setting", "message"),
     [
         ("from_hz=6000.0", "response: from_hz = 6000 and to_hz = 4500; allowed: 0 < from_hz < to_hz ≤ "),
-        ("to_hz=3.0", "response: the band from 2 to 3 Hz contains 1 odd multiples of 1 Hz; needs at least 3"),
+        (
+            "to_hz=3.0",
+            "response: the band from 2 to 3 Hz contains 1 odd multiples of 1 Hz (1/period_s); allowed: at least 3",
+        ),
         ("period_s=1e-5", "response: the band from 2 to 4500 Hz contains 0 odd multiples of 10000 Hz"),
     ],
 )

@@ -388,7 +388,7 @@ def test_the_measured_margins_are_those_of_the_model_on_a_rig_that_is_as_the_mod
     path, options = linear_response
     (section,) = make_report(load_runs([path])).content["experiments"]
     assert section["problem"] is None
-    assert "hysteresis is left" not in " ".join(section["notes"])
+    assert "hysteresis remains" not in " ".join(section["notes"])
     found = {row["quantity"]: row["run"] for row in section["rows"]}
     assert found["gain margin"] == pytest.approx(2.566, rel=0.02)
     assert found["phase margin"] == pytest.approx(73.05, abs=2.0)
@@ -441,9 +441,9 @@ def test_hysteresis_that_is_left_is_said_of_measured_margins(tmp_path: Path) -> 
     (section,) = make_report(load_runs([path])).content["experiments"]
     found = {row["quantity"]: row["run"] for row in section["rows"]}
     assert abs(found["gain margin"] / 2.566 - 1) > 0.1
-    assert "hysteresis is left, so that the stage is not linear at this motion" in " ".join(section["notes"])
+    assert "hysteresis remains, so that the stage is not linear in this motion" in " ".join(section["notes"])
     result = CliRunner().invoke(main, ["identify", "response", str(path)])
-    assert "hysteresis is left" in " ".join(result.stdout.split())
+    assert "hysteresis remains" in " ".join(result.stdout.split())
 
 
 def test_a_position_that_moves_further_than_stated_is_refused(linear_response: tuple[Path, ResponseOptions]) -> None:

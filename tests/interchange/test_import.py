@@ -100,7 +100,7 @@ def test_a_response_of_an_unknown_loop_is_refused(scan: Path):
     run("import", scan, "--map", "x_drive_v=drive_mV", "--map", "x_position_um=pos_nm")
     result = run("identify", "response", "scan.mcap")
     assert result.exit_code == 1
-    assert "an imported recording does not say which loop was closed" in result.stderr
+    assert "an imported recording has no configuration of its closed loop" in result.stderr
 
 
 @pytest.mark.parametrize("axis", [(), ("--axis", "x")])

@@ -26,8 +26,8 @@ LARGEST_MISFIT = 2.0
 """Residuals over the uncertainty up to which the stage counts as linear. Simulated stages: 1.3 at most after an exact
 inverse, 2.3 at least where hysteresis is left."""
 NOT_LINEAR = (
-    "hysteresis is left, so that the stage is not linear at this motion. The figures and standard deviations hold "
-    "for a repetition of this motion alone; they are not the margins of a linear loop"
+    "hysteresis remains, so that the stage is not linear in this motion. The figures and standard deviations hold "
+    "only for a repetition of this motion; they are not the margins of a linear loop"
 )
 """Warning for users of a measurement whose misfit exceeds LARGEST_MISFIT."""
 MIN_IMPROVEMENT = 25.0

@@ -75,7 +75,7 @@ def make_grid(
     if odd.size < 3:
         raise ValueError(
             f"the band from {from_hz:g} to {to_hz:g} Hz contains {odd.size} odd multiples of "
-            f"{rate_hz / max(samples, 1):g} Hz; needs at least 3. Use a wider band or a longer period_s"
+            f"{rate_hz / max(samples, 1):g} Hz (1/period_s); allowed: at least 3. Use a wider band or a longer period_s"
         )
     decades = np.log10(odd[-1] / odd[0])
     targets = np.geomspace(odd[0], odd[-1], max(2, round(PER_DECADE * decades)))

@@ -46,15 +46,14 @@ class PeriodicPart(NamedTuple):
         excited = np.flatnonzero(sizes > EXCITED_PART * sizes.max())
         if excited.size < LEAST_LINES:
             raise ValueError(
-                f"reference: contains {excited.size} frequencies; needs a multisine of at least {LEAST_LINES} "
-                "frequencies"
+                f"reference: the recorded reference has {excited.size} frequencies; allowed: at least {LEAST_LINES}. "
+                "Record a multisine with more frequencies"
             )
         silent = np.setdiff1d(np.arange(max(1, excited[0] - 1), excited[-1] + 2), excited)
         if not silent.size:
             raise ValueError(
                 "reference: the multisine excites every frequency of the band; leave some frequencies out, because "
-                "noise "
-                "and nonlinearity show only at frequencies without excitation"
+                "noise and nonlinearity show only at frequencies without excitation"
             )
         return LineGrid(self.samples, rate_hz, excited, silent)
 

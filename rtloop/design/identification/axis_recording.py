@@ -27,7 +27,7 @@ JUMP_SHARE = 0.2
 PLATEAU_DRIVE = 0.02
 """A reading constant at its extreme while the drive moves by more than this fraction of its span is clipped."""
 _TRIP_REMEDIES = {
-    "sensor_range": "The sensor was at the end of its range: use a smaller drive, or a smaller step, which a lightly "
+    "sensor_range": "The sensor was at the end of its range: use a smaller drive, or a smaller step, because a lightly "
     "damped stage overshoots. Wider interlocks.sensor_min_v and sensor_max_v help only inside the converter's range.",
     "position": "Use a smaller drive or step, or a larger interlocks.position_um if the stage may move so far.",
     "oscillation": "Use a smaller drive or step, or a larger interlocks.oscillation_um if the stage may ring so far.",
@@ -137,7 +137,7 @@ def distinct(
     for run in runs:
         digest = _tick_digest(run)
         if digest in names:
-            sentences.append(f"{run.name}: left out, because it has the same ticks as {names[digest]}")
+            sentences.append(f"{run.name}: not used, because it is a copy of {names[digest]}, with the same ticks")
         else:
             names[digest] = run.name
             retained.append(run)
@@ -168,9 +168,7 @@ def require_usable(name: str, drive_v: Real, position_um: Real, adc_v: Real | No
     position is searched for clipping.
     """
     if not (np.all(np.isfinite(drive_v)) and np.all(np.isfinite(position_um))):
-        raise UnsuitableData(
-            f"{name}: drive or position contains NaN or infinite values; identification needs finite ones"
-        )
+        raise UnsuitableData(f"{name}: drive or position contains NaN or infinite values; allowed: finite values")
     noise, span = noise_std(position_um), float(np.ptp(position_um))
     if np.ptp(drive_v) == 0:
         raise UnsuitableData(
@@ -209,8 +207,10 @@ def excitation_warnings(runs: Sequence[AxisRecording]) -> list[str]:
     sentences = list[str]()
     for run in runs:
         if run.is_closed_loop:
-            cause = "a controller made the drive (mode closed_loop)"
-            effect = "The controller's response to noise and to the dynamics of the position counts as hysteresis here"
+            cause = "a controller computed the drive (mode closed_loop)"
+            effect = (
+                "Identification takes the controller's response to noise and to the stage's dynamics for hysteresis"
+            )
             sentences.append(f"{run.name}: {cause}. {effect}. {remedy}")
         elif jumps(run):
             cause = "the drive has steps, after which the stage rings"
@@ -235,9 +235,9 @@ def wrong_sign(name: str, observation: str) -> UnsuitableData:
     `observation` is a clause that tells how this was seen.
     """
     return UnsuitableData(
-        f"{name}: the sign is wrong: {observation}. A loop with this sign is unstable. Change the sign of the "
-        "channel's um_per_v ([driver.channels], or the mapping of an import), or reverse the wires of sensor or drive, "
-        "and record again"
+        f"{name}: the sign of drive or position is wrong: {observation}. A loop with this sign is unstable. Change "
+        "the sign of the channel's um_per_v ([driver.channels], or the mapping of an import), or reverse the wires of "
+        "sensor or drive, and record again"
     )
 
 

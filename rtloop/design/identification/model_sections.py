@@ -28,7 +28,7 @@ from rtloop.recording.errors import RecordingError
 from rtloop.values import count_text
 from rtloop.version import __version__
 
-SAMPLED_TOGETHER = "as drive and position of a row count as sampled at the same time"
+SAMPLED_TOGETHER = "because drive and position of a row count as sampled at the same time"
 """Convention of the delay of an imported recording."""
 Section = TypeVar("Section", bound=Options)
 
@@ -69,10 +69,11 @@ def hysteresis_provenance(fit: HysteresisFit, runs: Sequence[AxisRecording]) -> 
     """Return three comment lines, without #, on the origin of the hysteresis model: recordings, plays, errors."""
     return [
         f"Hysteresis, identified by rtloop {__version__} from {describe_sources(runs)}",
-        f"{fit.model.thresholds.size} play operators, thresholds {fit.placement}, weights {fit.weights}; "
+        f"{fit.model.thresholds.size} play operators (thresholds: {fit.placement}, weights: {fit.weights}); "
         f"drive up to {fit.drive_v:.6g} V",
-        f"error {fit.rms_error_um:.3g} µm rms, at most {100 * fit.max_error_um / fit.range_um:.3g} % "
-        f"of {fit.range_um:.4g} µm; h/H {fit.measured_loop.percent:.2f} %, of the model {fit.model_loop.percent:.2f} %",
+        f"error {fit.rms_error_um:.3g} µm rms, at most {100 * fit.max_error_um / fit.range_um:.3g} % of the range of "
+        f"{fit.range_um:.4g} µm; loop height over range h/H: measured {fit.measured_loop.percent:.2f} %, model "
+        f"{fit.model_loop.percent:.2f} %",
     ]
 
 
@@ -84,7 +85,7 @@ def dynamics_provenance(fit: DynamicsFit, run: AxisRecording, input_kind: str) -
     modes = (
         f"{mode.frequency_hz:.2f} ± {mode.frequency_std_hz:.2g} Hz (1σ; ζ {mode.damping:.5f})"
         if math.isfinite(mode.frequency_std_hz)
-        else "one that decays within a sample"
+        else "a mode that decays within one sample"
         for mode in fit.modes
     )
     return [
@@ -105,12 +106,12 @@ def static_gain_text(gain: float, input_kind: str, spread: str = "") -> str:
     """
     number = f"the identified static gain of {gain:.6g}{spread}"
     if input_kind == "hysteresis":
-        return f"{number} is included in the weights of the hysteresis"
+        return f"{number} is already included in the weights of the hysteresis"
     if input_kind == "command":
-        return f"{number} belongs to [axis.feedforward]: multiply weights_um_per_v by it"
+        return f"multiply weights_um_per_v of [axis.feedforward] by {number}"
     if gain <= 0:
         return f"{number} µm/V is negative: change the sign of the channel's um_per_v"
-    return f"{number} µm/V is the weight of [axis.feedforward], which has no hysteresis"
+    return f"{number} µm/V is the only weight of [axis.feedforward], which then has no hysteresis"
 
 
 def proportional_actuator(gain_um_per_v: float) -> PlayModel | None:

@@ -51,9 +51,13 @@ def draw_hysteresis(fit: HysteresisFit, judgements: Sequence[Judgement]) -> Figu
            f"{fit.model_loop.percent:.2f} % model")  # fmt: skip
     rms_um = float(np.sqrt(np.mean([judgement.rms_um**2 for judgement in judgements if judgement.known_share])))
     label_panel(
-        time_panel, "time / s", "measured − model / µm", f"held out: {rms_um:.3g} µm rms", legend=len(judgements) > 1
+        time_panel,
+        "time / s",
+        "measured − model / µm",
+        f"held-out error: {rms_um:.3g} µm rms",
+        legend=len(judgements) > 1,
     )
-    label_panel(drive_panel, "drive / V", "measured − model / µm", "the same over the drive", legend=False)
+    label_panel(drive_panel, "drive / V", "measured − model / µm", "held-out error over the drive", legend=False)
     return figure
 
 
@@ -89,8 +93,8 @@ def _draw_in_time(fit: DynamicsFit, run: Excitation, full: Any, zoom: Any, diffe
         panel.plot(time_s[part] / unit_s, run.position_um[part], color="tab:blue", linewidth=2, label="measured")
         panel.plot(time_s[part] / unit_s, modelled[part], color="0.15", linewidth=0.8, label="model")
     full.axvspan(time_s[start], time_s[end - 1], color="tab:orange", alpha=0.3, linewidth=0)
-    label_panel(full, "time / s", "position / µm", f"fit {fit.fit_percent:.2f} %; shaded: the part below")
-    label_panel(zoom, "time / ms", "position / µm", "part of it", legend=False)
+    label_panel(full, "time / s", "position / µm", f"fit {fit.fit_percent:.2f} %; the shaded part is enlarged below")
+    label_panel(zoom, "time / ms", "position / µm", "shaded part", legend=False)
     difference.plot(time_s[:POINTS], residual_um[:POINTS], color="tab:red", linewidth=0.6)
     rms_um = float(np.sqrt(np.mean(residual_um**2)))
     title = f"output error, measured − simulated: {rms_um:.3g} µm rms"
@@ -131,7 +135,7 @@ def _draw_over_frequency(
     modes = ", ".join(f"{mode.frequency_hz:.1f} Hz (ζ {mode.damping:.4f})" for mode in fit.modes)
     resolution = "" if measured is None else f"; measured every {measured.resolution_hz:.3g} Hz"
     label_panel(magnitude, "frequency / Hz", f"|position / input| / (µm/{input_unit})", modes + resolution)
-    label_panel(phase, "frequency / Hz", "phase / °", "without the delay of whole samples", legend=False)
+    label_panel(phase, "frequency / Hz", "phase / °", "phase without the delay of whole samples", legend=False)
 
 
 def plot_compensation(residual: Residual, actuator: PlayModel, inverse: PlayModel, output: Path) -> None:

@@ -30,8 +30,8 @@ def recorded_measurement(path: Path, axis: str | None = None, near_hz: float | N
     recording = load(path)
     if "imported" in recording.header:
         raise UnsuitableData(
-            f"{path}: an imported recording does not say which loop was closed; use `rtloop identify hysteresis` or "
-            "`rtloop identify dynamics`"
+            f"{path}: an imported recording has no configuration of its closed loop, which a response needs; use "
+            "`rtloop identify hysteresis` or `rtloop identify dynamics`"
         )
     axis = select_axis(recording, axis, path)
     rate_hz = float(recording.header["rate_hz"])

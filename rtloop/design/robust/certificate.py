@@ -58,7 +58,7 @@ class Certificate(NamedTuple):
             ("max |S|", self.sensitivity, walls.sensitivity),
             (f"|S| at {walls.disturbance_hz:g} Hz", self.disturbance, walls.disturbance),
             ("noise gain into v", self.noise_gain, walls.noise_gain),
-            ("slowest mode around a resonance, in ms,", self.decay_ms, decay_ms or math.inf),
+            ("time constant in ms of the slowest mode around a resonance", self.decay_ms, decay_ms or math.inf),
         ]
         return [
             f"{name} is {case.value:.4g} with {case.scenario}; allowed: up to {limit:.4g}"

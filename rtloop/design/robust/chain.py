@@ -26,7 +26,12 @@ from rtloop.design.identification.hysteresis.creep import is_creep_likely
 from rtloop.design.identification.hysteresis.identify_hysteresis import unexplained_um
 from rtloop.design.robust.options import MOST_TAPS, ShapeOptions
 from rtloop.design.robust.scenarios import Family
-from rtloop.design.robust.search import Progress, RobustDesign, find_robust_controller
+from rtloop.design.robust.search import (
+    MISSING_DISTURBANCE_FREQUENCY,
+    Progress,
+    RobustDesign,
+    find_robust_controller,
+)
 from rtloop.design.robust.section import provenance, robust_values, taps_provenance, taps_values
 from rtloop.design.robust.shape import Subject, TapDesign, design_taps
 from rtloop.design.robust.subject import build_subject, missing_requirements, step_bounds
@@ -122,7 +127,7 @@ def require_specified(design: DesignOptions, source: str) -> None:
     specification = design.specification
     faults = missing_requirements(specification)
     if specification.disturbance is not None and specification.disturbance.up_to_hz is None:
-        faults.append("specification.disturbance.up_to_hz: missing; no loop rejects a disturbance at all frequencies")
+        faults.append(MISSING_DISTURBANCE_FREQUENCY)
     if faults:
         raise ConfigError(source, faults)
 
@@ -149,10 +154,10 @@ def _require_reachable_steps(
 
 
 CREEP_TEXT = (
-    "; a lag over time explains most of this error, which suggests creep. To measure creep, give "
+    ". A lag over time explains most of this error, which suggests creep. To measure creep, give "
     "`rtloop identify hysteresis` recordings at several speeds"
 )
-OTHER_SIZES_TEXT = ", and the recording does not show how steps of other sizes behave"
+OTHER_SIZES_TEXT = ". The recording does not show how steps of other sizes behave"
 
 
 def _require_play_model(stage: Stage, design: DesignOptions) -> None:
@@ -164,10 +169,10 @@ def _require_play_model(stage: Stage, design: DesignOptions) -> None:
     if left_um and "residual_percent" not in design.simulation.model_fields_set:
         why = CREEP_TEXT if is_creep_likely(stage.slow) else OTHER_SIZES_TEXT
         raise NoDesign(
-            f"{stage.slow.name}: the actuator is not a sum of plays: any number of plays leaves an error of "
-            f"{left_um:.3g} µm rms{why}. Set simulation.residual_percent to the hysteresis (% of the position's range) "
-            "that remains with the feedforward, as `rtloop experiment run compensation` measures it; the design "
-            "then continues, and is verified with this hysteresis"
+            f"{stage.slow.name}: no sum of play operators describes the actuator: with any number of operators, an "
+            f"error of {left_um:.3g} µm rms remains{why}. Set simulation.residual_percent to the hysteresis (% of the "
+            "position's range) that remains with the feedforward; `rtloop experiment run compensation` measures this "
+            "number. The design then continues, and is verified with this hysteresis"
         )
 
 
@@ -183,8 +188,8 @@ def _find_controller(design: DesignOptions, progress: Progress) -> tuple[DesignO
             return narrowed, _find_damped_controller(narrowed, progress)
         except NoController as error:
             progress(
-                f"no controller for resonances within ±{narrowed.scenarios.resonance_percent:g} % of the model's: "
-                f"{error}"
+                f"no controller was found for resonances within ±{narrowed.scenarios.resonance_percent:g} % of the "
+                f"model's: {error}"
             )
         except ValueError as error:  # a narrower range has the same plant and specification
             raise NoDesign(str(error)) from None
@@ -192,7 +197,7 @@ def _find_controller(design: DesignOptions, progress: Progress) -> tuple[DesignO
         return last, _find_damped_controller(last, progress)
     except (NoController, ValueError) as error:
         percent = last.scenarios.resonance_percent
-        prefix = f"no controller even for resonances within ±{percent:g} % of the model's: " if wider else ""
+        prefix = f"no controller was found even for resonances within ±{percent:g} % of the model's: " if wider else ""
         raise NoDesign(f"{prefix}{error}") from None
 
 
@@ -206,8 +211,8 @@ def _find_damped_controller(design: DesignOptions, progress: Progress) -> Robust
         hz, damping = _least_damped_mode(robust)
         if damping < LEAST_DAMPING:
             raise NoController(
-                f"robust: the closed loop's mode at {hz:.4g} Hz has a damping ratio of {damping:.2g}; needs at "
-                f"least {LEAST_DAMPING:g}, because residual hysteresis excites this mode in every step. Use another "
+                f"robust: the closed loop's mode at {hz:.4g} Hz has a damping ratio of {damping:.2g}; allowed: "
+                f"at least {LEAST_DAMPING:g}, because residual hysteresis excites this mode in every step. Use another "
                 "kind of controller, or accept a longer decay with robust.decay_ms"
             )
     return robust
@@ -298,5 +303,5 @@ def _find_taps(subject: Subject, is_range_fixed: bool, progress: Progress) -> tu
             return narrowed, design_taps(narrowed, progress=progress)
         except NoDesign as error:
             percent = narrowed.options.scenarios.resonance_percent
-            progress(f"no taps for resonances within ±{percent:g} % of the model's: {error}")
+            progress(f"no taps were found for resonances within ±{percent:g} % of the model's: {error}")
     return last, design_taps(last, progress=progress)

@@ -24,9 +24,11 @@ def draw_taps(tap_design: TapDesign, subject: Subject, title: str) -> bytes:
     trade.set(xlabel="settling time / ms, in every scenario", ylabel="overshoot / %")
     time, x, v = tap_design.step
     period_s = subject.controller.period_s
-    position.plot(1e3 * time, x, color=RUNNING_COLOR, label="x on the model, between ticks too")
+    position.plot(1e3 * time, x, color=RUNNING_COLOR, label="position x of the model, also between ticks")
     position.axhspan(1 - BAND, 1 + BAND, color="0.9", label=f"±{100 * BAND:g} %")
-    command.step(1e3 * period_s * np.arange(v.size), v, where="post", color=RUNNING_COLOR, label="v on the model")
+    command.step(
+        1e3 * period_s * np.arange(v.size), v, where="post", color=RUNNING_COLOR, label="command v of the model"
+    )
     range_ms = (0, 4 * tap_design.settling_ms)
     position.set(ylabel="x per unit step", xlim=range_ms)
     command.set(ylabel="v per unit step", xlabel="time / ms", xlim=range_ms)

@@ -29,6 +29,11 @@ scenarios.
 """
 LEAST_FACTOR = 0.9
 """Smallest factor by which one round lowers a limit."""
+MISSING_DISTURBANCE_FREQUENCY = (
+    "specification.disturbance.up_to_hz: missing; set the frequency in Hz up to which the loop must reject the "
+    "disturbance, because no loop rejects a disturbance at all frequencies"
+)
+"""Fault of a specification with a disturbance that has no largest frequency."""
 Progress = Callable[[str], None]
 
 
@@ -60,9 +65,9 @@ def find_robust_controller(design: DesignOptions, progress: Progress = lambda _:
     plant = design.sensor.add_sensor_lag(design.required_plant.transfer())
     if not plant.is_strictly_proper or plant.dc_gain <= 0 or not plant.is_stable:
         raise ValueError(
-            f"plant: with its sensor it is {'stable' if plant.is_stable else 'not stable'} and has {plant.zeros.size} "
-            f"zeros, {plant.order} poles and a gain at 0 Hz of {plant.dc_gain:g}; allowed: stable, fewer zeros than "
-            "poles, a gain at 0 Hz above 0"
+            f"plant: plant and sensor together are {'stable' if plant.is_stable else 'not stable'} and have "
+            f"{plant.zeros.size} zeros, {plant.order} poles and a gain at 0 Hz of {plant.dc_gain:g}; allowed: stable, "
+            "fewer zeros than poles, a gain at 0 Hz above 0"
         )
     options, period_s = design.robust, 1 / design.controller.rate_hz
     family = Family(plant, design.required_plant.delay_ticks, design.scenarios, period_s)
@@ -80,8 +85,8 @@ def find_robust_controller(design: DesignOptions, progress: Progress = lambda _:
         if minimum.cost >= UNSTABLE_COST:
             raise NoController(
                 f"robust: no controller of order {1 + 2 * options.biquads} found with a stable loop in all "
-                f"{len(scenarios)} scenarios; use a smaller scenarios.resonance_percent, fewer delay_ticks, or more "
-                "robust.restarts"
+                f"{len(scenarios)} scenarios; use a smaller scenarios.resonance_percent, fewer values of "
+                "scenarios.delay_ticks, or more robust.restarts"
             )
         point = np.clip(minimum.point, *point_bounds(options.biquads))
         controller = point_transfer(point, period_s)
@@ -138,9 +143,7 @@ def design_walls(design: DesignOptions) -> Walls:
     if disturbance is None:
         return Walls(options.largest_sensitivity, options.noise_gain, 1.0, 0.0)
     if disturbance.up_to_hz is None:
-        raise ValueError(
-            "specification.disturbance.up_to_hz: missing; no loop rejects a disturbance at all frequencies"
-        )
+        raise ValueError(MISSING_DISTURBANCE_FREQUENCY)
     if disturbance.up_to_hz >= design.controller.rate_hz / 2:
         raise ValueError(
             f"specification.disturbance.up_to_hz: {disturbance.up_to_hz:g} Hz; allowed: below half of "

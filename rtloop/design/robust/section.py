@@ -82,18 +82,22 @@ def taps_provenance(tap_design: TapDesign, subject: Subject, source: str) -> lis
     """
     options, proof = subject.options.scenarios, tap_design.proof
     return [
-        f"Taps by rtloop {__version__}, design shape, for the controller of {source} and resonances within "
-        f"±{options.resonance_percent:g} %",
-        f"on {tap_design.proved_count} plants: settling ≤ {proof.settling_ms:.4g} ms, overshoot ≤ "
-        f"{100 * proof.overshoot:.3g} %, "
-        f"v {proof.lowest_command:.4g} … {proof.highest_command:.4g} per unit step",
+        f"Taps by rtloop {__version__} (`rtloop design shape`) for the controller of {source} and resonances within "
+        f"±{options.resonance_percent:g} % of the model's",
+        f"on {tap_design.proved_count} plants: settling time ≤ {proof.settling_ms:.4g} ms, overshoot ≤ "
+        f"{100 * proof.overshoot:.3g} %, command v {proof.lowest_command:.4g} … {proof.highest_command:.4g} per unit "
+        "step",
     ]
 
 
 def certified_values(proof: Certificate) -> list[tuple[str, float, str]]:
     """Return label, worst value and scenario, as text, of each certified figure but the largest |pole|."""
     return [
-        ("slowest mode around a resonance, ms", proof.decay_ms.value, str(proof.decay_ms.scenario)),
+        (
+            "time constant of the slowest mode around a resonance, ms",
+            proof.decay_ms.value,
+            str(proof.decay_ms.scenario),
+        ),
         ("max |S|", proof.sensitivity.value, str(proof.sensitivity.scenario)),
         ("|S| at the disturbance's frequency", proof.disturbance.value, str(proof.disturbance.scenario)),
         ("noise gain into v", proof.noise_gain.value, str(proof.noise_gain.scenario)),
@@ -114,7 +118,8 @@ def provenance(robust: RobustDesign, design: DesignOptions, source: str, text: s
     """
     digest, options = hashlib.sha256(text.encode()).hexdigest(), design.robust
     return [
-        f"Found by rtloop {__version__}, design robust, from {source} (SHA-256 {digest[:16]}…), seed {options.seed}",
+        f"Found by rtloop {__version__} (`rtloop design robust`) from {source} (SHA-256 {digest[:16]}…), with seed "
+        f"{options.seed}",
         f"plant: {formula(design.required_plant.transfer())}",
         f"worst of {robust.certificate.plants} plants:",
         *(f"  {name} {value:.4g} ({scenario})" for name, value, scenario in certified_values(robust.certificate)),

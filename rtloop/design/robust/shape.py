@@ -123,7 +123,7 @@ def design_taps(
         if settling < fastest - 1e-9:
             raise NoDesign(
                 f"shape.settling_ms: {options.settling_ms:g} ms cannot be reached in all scenarios with overshoot ≤ "
-                f"{100 * subject.overshoot:g} %; the fastest is {fastest * tick_ms:.4g} ms. "
+                f"{100 * subject.overshoot:g} %; the fastest settling time is {fastest * tick_ms:.4g} ms. "
                 f"{_describe_relaxations(subject)}"
             )
         taps = programme.quietest_taps(settling, allowed_overshoot)
@@ -266,7 +266,7 @@ def _scenario_responses(subject: Subject, family: Family, scenario: Scenario, po
     try:
         return step_responses(subject.controller, family.plant(scenario), scenario.delay_ticks, points, ticks)
     except ValueError as error:
-        raise NoDesign(f"shape.scenarios: with {scenario} {error}; use a more robust controller") from None
+        raise NoDesign(f"shape.scenarios: with {scenario}, {error}; use a more robust controller") from None
 
 
 def _explain_no_taps(subject: Subject, programme: Programme) -> str:
@@ -276,12 +276,12 @@ def _explain_no_taps(subject: Subject, programme: Programme) -> str:
     if best_taps is not None:
         return (
             f"specification.overshoot_percent: {100 * subject.overshoot:g} % cannot be kept in all scenarios with "
-            f"{programme.taps} taps; the least is {100 * best_taps.overshoot:.4g} % at {longest * tick_ms:g} ms. "
-            "Allow more overshoot, or use smaller [shape.scenarios] or more taps"
+            f"{programme.taps} taps; the least overshoot is {100 * best_taps.overshoot:.4g} %, with a settling time of "
+            f"{longest * tick_ms:g} ms. Allow more overshoot, or use smaller [shape.scenarios] or more shape.taps"
         )
     return (
-        f"shape: no taps settle within {longest * tick_ms:g} ms, the longest settling that shape.taps = "
-        f"{programme.taps} allow at {1e3 / tick_ms:g} Hz. {_describe_relaxations(subject)}"
+        f"shape: no taps settle within {longest * tick_ms:g} ms, the longest settling time possible with shape.taps = "
+        f"{programme.taps} at {1e3 / tick_ms:g} Hz. {_describe_relaxations(subject)}"
     )
 
 
@@ -290,9 +290,10 @@ def _proof_failure(subject: Subject, settling_ms: float, proof: StepMeasures, pl
     is_beyond = proof.excess > ALLOWED_EXCESS
     excess = f"exceeds its limits by {100 * proof.excess:.2g} % of a step" if is_beyond else "stays within its limits"
     return (
-        f"shape: the taps for {settling_ms:.4g} ms and overshoot ≤ {100 * subject.overshoot:g} % fail on {plants} "
-        f"plants between the scenarios: steps settle in up to {proof.settling_ms:.4g} ms, overshoot by "
-        f"{100 * proof.overshoot:.4g} %, and v {excess}. Use a longer shape.settling_ms or smaller [shape.scenarios]"
+        f"shape: the taps for a settling time of {settling_ms:.4g} ms and overshoot ≤ {100 * subject.overshoot:g} % "
+        f"fail the proof on {plants} plants: the settling time is up to {proof.settling_ms:.4g} ms, the overshoot up "
+        f"to {100 * proof.overshoot:.4g} %, and the command v {excess}. Use a longer shape.settling_ms or smaller "
+        "[shape.scenarios]"
     )
 
 

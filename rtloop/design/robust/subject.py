@@ -74,7 +74,7 @@ def build_subject(axis: AxisOptions, check: AxisCheck, design: DesignOptions, la
     if check.linear is None:
         raise ValueError(f"controller: {_controller_fault(check)}; taps need a linear controller of one axis")
     if model is None:
-        raise ValueError("model: missing; set it, or [plant] in the specification")
+        raise ValueError("model: missing; set [axis.model], or [plant] in the specification")
     overshoot_percent, command, faults = (
         specification.overshoot_percent,
         specification.command,
@@ -112,9 +112,9 @@ def step_bounds(axis: AxisOptions, model: ModelOptions, design: DesignOptions) -
         limits = axis.limits
         raise ValueError(
             f"specification.command.reference_um: value is {step_um:g} µm; allowed: up to "
-            f"{largest_um / static:.4g} µm, for a command of {low_um:.4g} … {high_um:.4g} µm (limits.drive_min_v = "
-            f"{limits.lowest_v:g}, limits.drive_v = {limits.drive_v:g}, limits.command_um = {limits.command_um:g}). "
-            "Set a smaller reference_um; smaller steps can also be faster"
+            f"{largest_um / static:.4g} µm, because the command has a range of {low_um:.4g} … {high_um:.4g} µm "
+            f"(limits.drive_min_v = {limits.lowest_v:g}, limits.drive_v = {limits.drive_v:g}, limits.command_um = "
+            f"{limits.command_um:g}). Set a smaller reference_um; smaller steps can also settle faster"
         )
     has_equal_sides = math.isclose(-low_um, high_um, rel_tol=1e-6) and step_um * static <= -low_um
     if has_equal_sides or max(command.command_um, step_um * static) <= min(-low_um, high_um):

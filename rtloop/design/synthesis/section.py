@@ -67,11 +67,12 @@ def configuration_around(
     plant, delay_ticks = design.required_plant.transfer(), design.required_plant.delay_ticks
     feedforward = {"thresholds_v": [0.0], "weights_um_per_v": [RIG_UM_PER_V]}
     placeholders = (
-        f"Driver, feedforward and limits are placeholders: a simulated rig of the plant, {RIG_UM_PER_V} µm/V."
+        "Driver, feedforward and limits are placeholders. They describe a simulated rig: the plant behind an actuator "
+        f"of {RIG_UM_PER_V} µm/V."
     )
     if actuator is not None:
         feedforward = {key: values.tolist() for key, values in actuator.for_json().items()}
-        placeholders = "Driver and limits are placeholders: a simulated rig of the plant and its actuator."
+        placeholders = "Driver and limits are placeholders. They describe a simulated rig: the plant and its actuator."
     values = {
         "loop": {"rate_hz": design.controller.rate_hz},
         "driver": {
@@ -94,7 +95,8 @@ def configuration_around(
         *lines,
         "",
         placeholders,
-        f"Copy [axis.controller] into your configuration, or `rtloop ctl controller {axis} FILE` into a running loop.",
+        "To use the controller, copy [axis.controller] into your configuration, or load this file into a running loop: "
+        f"`rtloop ctl controller {axis} FILE`.",
     ]
     return write_section("", values, heading)
 
@@ -129,13 +131,13 @@ def provenance(synthesis: Synthesis, design: DesignOptions, source: str, text: s
         f"W2 = {formula(weights.command)}",
         f"W3 = {formula(weights.disturbance)}",
         f"H∞ (Glover & Doyle 1988): γ_opt = {hinf.gamma_opt:.6g}, γ = {hinf.gamma:.6g}, "
-        f"‖F_l(P, C)‖∞ {hinf.achieved:.6g} at order {full_order}",
-        "each specification is relaxed by up to γ",
+        f"‖F_l(P, C)‖∞ = {hinf.achieved:.6g} at order {full_order}",
+        "each requirement is relaxed by a factor of up to γ",
         "Hankel singular values: " + ", ".join(f"{value:.4g}" for value in synthesis.hankel),
     ]
     if order < full_order:
         method = _METHODS[design.synthesis.reduction]
-        lines.append(f"reduced to order {order} by {method}: ‖F_l(P, C)‖∞ {synthesis.achieved:.6g}")
+        lines.append(f"reduced to order {order} by {method}: ‖F_l(P, C)‖∞ = {synthesis.achieved:.6g}")
     return lines
 
 

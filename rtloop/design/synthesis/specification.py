@@ -116,7 +116,7 @@ QUANTITIES = {
     "settling_ms": ("settling (5 %)", "ms"),
     "overshoot_percent": ("overshoot", "%"),
     "peak_command": ("peak of v per unit step", ""),
-    "resonance_decay_ms": ("slowest mode near the resonance", "ms"),
+    "resonance_decay_ms": ("longest decay near the resonance", "ms"),
     "resonance_shift_percent": ("resonance may move by ±", "%"),
     "bandwidth_hz": ("bandwidth, |S| < 0.71", "Hz"),
     "disturbance_hz": ("disturbance held up to", "Hz"),
@@ -204,7 +204,7 @@ class SimulationOptions(Options):
     def _check(self) -> Self:
         """Raise ValueError unless all step heights are above 0."""
         if self.steps_um is not None and not all(height > 0 for height in self.steps_um):
-            raise ValueError(f"steps_um: {list(self.steps_um)}; allowed: heights above 0")
+            raise ValueError(f"steps_um: {list(self.steps_um)}; allowed: heights above 0 µm")
         return self
 
 
@@ -348,13 +348,19 @@ def _tracking_weight(specification: SpecificationOptions) -> Transfer:
     Raises ValueError if the static error is missing, or both bandwidth and settling time.
     """
     if specification.static_error_percent is None:
-        raise ValueError("specification.static_error_percent: missing; the tracking weight needs this number")
+        raise ValueError(
+            "specification.static_error_percent: missing; set this number, or the tracking weight W1 in "
+            "[weights.tracking]"
+        )
     if specification.bandwidth_hz is not None:
         rate = 2 * math.pi * specification.bandwidth_hz
     elif specification.settling_ms is not None:
         rate = 3 / (1e-3 * specification.settling_ms)
     else:
-        raise ValueError("specification.settling_ms, bandwidth_hz: both missing; the tracking weight needs one of them")
+        raise ValueError(
+            "specification.settling_ms, bandwidth_hz: both missing; set one of them, or the tracking weight W1 in "
+            "[weights.tracking]"
+        )
     return tracking_weight(
         specification.static_error_percent / 100, rate, (specification.overshoot_percent or 0.0) / 100
     )

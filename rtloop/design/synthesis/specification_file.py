@@ -13,8 +13,8 @@ from rtloop.design.synthesis.specification import DesignOptions
 from rtloop.errors import ConfigError
 
 CONFIGURATION = (
-    "this file is a configuration, and a specification is needed, with [specification] and [plant]; configurations are "
-    "for `rtloop check`, `rtloop run`, `rtloop design verify` and `rtloop design shape`"
+    "this file is a configuration; allowed: a specification, with the sections [specification] and [plant]. Use a "
+    "configuration with `rtloop check`, `rtloop run`, `rtloop design verify` or `rtloop design shape`"
 )
 
 

@@ -79,14 +79,14 @@ def synthesise(
         return Synthesis(controller, full, achieved, weights, hinf, hankel_singular_values(full))
     if order is not None:
         raise ValueError(
-            f"synthesis.order: {order} gives, with reduction {reduction!r}, an unstable loop or one with max |S| above "
-            f"{LARGEST_SENSITIVITY:g}; use a higher order, or remove synthesis.order, so that the lowest suitable one "
-            "is found"
+            f"synthesis.order: with order {order} and reduction {reduction!r}, the loop is unstable or has max |S| "
+            f"above {LARGEST_SENSITIVITY:g}; use a higher order, or remove synthesis.order, so that rtloop finds the "
+            "lowest suitable order"
         )
     raise NotRunnable(
         f"specification: γ = {hinf.gamma:.4g} can be reached in continuous time, but no controller of order {lowest} "
         f"to {full.order} gives a stable sampled loop with max |S| ≤ {LARGEST_SENSITIVITY:g}; use a longer "
-        "settling_ms, a smaller bandwidth_hz or a higher rate"
+        "settling_ms, a smaller bandwidth_hz or a higher controller.rate_hz"
     )
 
 
@@ -182,11 +182,15 @@ def _explain_contradiction(plant: Transfer, weights: Weights, gamma: float, larg
     gamma_list = ", ".join(f"{name} {value:.4g}" for name, value in gammas.items())
     zeros = plant.zeros[plant.zeros.real > 0]
     zero = zeros.real.min(initial=np.inf)
-    nearest = f"; the plant's zero at {zero:.4g} rad/s allows a bandwidth of about half of that" if zeros.size else ""
+    nearest = (
+        f"; the plant's zero at {zero:.4g} rad/s allows a bandwidth of about {0.5 * zero:.4g} rad/s"
+        if zeros.size
+        else ""
+    )
     return (
-        f"specification: γ_opt = {gamma:.4g}, so that each requirement would be missed by up to that factor; allowed "
+        f"specification: the best controller misses each requirement by a factor of up to γ_opt = {gamma:.4g}; allowed "
         f"by synthesis.largest_gamma: {largest:g}. The requirements contradict each other or the plant. γ_opt with "
-        f"one of them relaxed: {gamma_list}. Relax the hardest, {hardest}{nearest}"
+        f"one requirement relaxed: {gamma_list}. Relax the hardest requirement: {hardest}{nearest}"
     )
 
 

@@ -50,7 +50,9 @@ def verify_axis(
     design = DesignOptions() if spec is None else load_specification(spec).design
     model, key = axis.model or design.plant, f"axis.{axis.name}"
     if model is None:
-        raise ConfigError(configuration.source, [f"{key}.model: missing; set it, or [plant] in the specification"])
+        raise ConfigError(
+            configuration.source, [f"{key}.model: missing; set [axis.model], or [plant] in the specification"]
+        )
     margins = None if check.together is None else check.together.margins
     try:
         subject = VerifiedLoop(check.loop, check.controller, check.discrete)
@@ -96,8 +98,8 @@ def _plant_differences(axis: AxisOptions, design: DesignOptions) -> list[str]:
         return []
     differences_text = "; ".join(differences)
     return [
-        f"axis.{axis.name}.model: differs from [plant] of the specification: {differences_text}. The model is judged, "
-        "not [plant]"
+        f"axis.{axis.name}.model: differs from [plant] of the specification: {differences_text}. The verification "
+        f"judges axis.{axis.name}.model, not [plant]"
     ]
 
 

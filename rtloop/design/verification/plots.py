@@ -39,7 +39,7 @@ def draw_pictures(verification: Verification, specification: SpecificationOption
 def _loops(verification: Verification) -> list[tuple[str, Loop, str]]:
     """Return label, loop and colour of each loop: continuous, if there is one, then running."""
     rate = 1 / verification.running.period_s if verification.running.period_s else math.nan
-    running_label = f"as it runs: {rate:g} Hz, {count_text(verification.delay_ticks, 'sample')} of delay"
+    running_label = f"loop as it runs: {rate:g} Hz, {count_text(verification.delay_ticks, 'sample')} of delay"
     continuous_rows = (
         [] if verification.continuous is None else [("continuous", verification.continuous, CONTINUOUS_COLOR)]
     )

@@ -63,7 +63,7 @@ def simulate(bench: Bench, axis: AxisOptions, slowest_s: float, design: DesignOp
             steps += [_run_steps(bench, axis.name, levels, dwell_s, draw) for draw in range(DRAWS, MORE_DRAWS)]
             step = _summarise_steps(height, levels, steps)
         simulated_steps.append(step)
-    truth = "the configured rig" if bench.is_configured else "a rig after the axis's models"
+    truth = "the configured rig" if bench.is_configured else "a rig built from the axis's models"
     omitted = tuple(height for height, levels in levels_by_height.items() if levels is None)
     noise_x_nm, noise_v_nm = _noise_at_rest_nm(bench, axis.name, max(command_range, key=abs))
     required = required_limits(design.specification)

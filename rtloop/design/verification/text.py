@@ -14,9 +14,10 @@ CONTINUOUS_HEADING, RUNNING_HEADING = "C(s), not judged", "as it runs C(z)"
 LINEAR_HEADING = "linear"
 SHIFT_NAMES = {"resonance": "resonance, frequency", "damping": "resonance, damping", "gain": "gain, hysteresis weights"}
 CONTINUOUS_NOTE = (
-    "C(s) is the controller in continuous time, without taps, hold and delay: shown for comparison, it never runs."
+    "C(s) is the controller in continuous time, without taps, hold and delay. C(s) is shown for comparison and never "
+    "runs."
 )
-NOTE = "Gain stands for D(0), the sensor's scale and all hysteresis weights together."
+NOTE = "The row of the gain stands for D(0), the sensor's scale and all hysteresis weights together."
 
 
 def table(verification: Verification) -> list[tuple[str, ...]]:
@@ -76,7 +77,7 @@ def robustness(verification: Verification) -> list[tuple[str, ...]]:
     """
     on_paper = verification.continuous is not None
     limit_kinds = ("continuous", "running", "running_missed")[0 if on_paper else 1 :]
-    headings = ("continuous, until unstable", "as it runs, until unstable", "until a met requirement is missed")
+    headings = ("C(s), until unstable", "C(z), until unstable", "C(z), until a met requirement is missed")
     rows = [("may move by", *headings[-len(limit_kinds) :])]
     rows += [
         (SHIFT_NAMES[name], *(format_range(ranges[kind]) for kind in limit_kinds))
@@ -165,12 +166,12 @@ def simulation_notes(verification: Verification) -> list[str]:
         return []
     result = verification.simulated
     notes = [
-        f"Simulated by the law itself on {result.truth}, with hysteresis, limits, rounding and noise; at rest x "
-        f"moves by {result.noise_x_nm:.3g} nm rms, v by {result.noise_v_nm:.3g} nm rms."
+        f"The real control law was simulated on {result.truth}, with hysteresis, limits, rounding and noise. At rest, "
+        f"the position x moves by {result.noise_x_nm:.3g} nm rms, the command v by {result.noise_v_nm:.3g} nm rms."
     ]
     if result.omitted_heights_um:
         heights = ", ".join(f"{height:g}" for height in result.omitted_heights_um)
-        notes.append(f"Left out: steps of {heights} µm; the command's range is {result.command_range}.")
+        notes.append(f"Steps of {heights} µm were left out: the command's range is {result.command_range}.")
     notes += _static_error_notes(verification)
     if result.required and not result.is_judged:
         notes.append(
@@ -194,8 +195,8 @@ def _static_error_notes(verification: Verification) -> list[str]:
         step_percent = percent * farthest_um / step.height_um
         if result.is_met(step, "static_error_percent") is False and 2 * step_percent > step.static_error_percent:
             return [
-                f"The loop has no integrator: it leaves {percent:.3g} % of the position, "
-                f"{percent / 100 * farthest_um:.3g} µm at {farthest_um:.4g} µm, which is {step_percent:.3g} % of a "
+                f"The loop has no integrator: its static error is {percent:.3g} % of the position. At "
+                f"{farthest_um:.4g} µm, this is {percent / 100 * farthest_um:.3g} µm, or {step_percent:.3g} % of a "
                 f"step of {step.height_um:g} µm. `rtloop design auto --robust` designs a controller with an integrator."
             ]
     return []
@@ -282,5 +283,8 @@ def answer(verification: Verification, place: str = "as it will run") -> str:
         return "stable; nothing is specified"
     missed = [] if verification.simulated is None else verification.simulated.missed
     if missed:
-        return f"{place}, the linear loop meets its specification; simulated, not counted: misses {', '.join(missed)}"
+        return (
+            f"{place}, the linear loop meets its specification; the simulated steps, which do not count, miss "
+            f"{', '.join(missed)}"
+        )
     return f"{place}, the loop meets its specification"

@@ -102,7 +102,7 @@ def _identify_from_rest(
     needed_poles = order or LEAST_EXCITED_POLES
     if excited_poles < needed_poles:
         raise UnsuitableData(
-            f"{run.name}: too little excitation: the input identifies at most {excited_poles} poles; the model needs "
+            f"{run.name}: too little excitation: this input identifies at most {excited_poles} poles; the model needs "
             f"{needed_poles} or more. Use a step, or a chirp over all frequencies of interest"
         )
     recording, corrected = correct_levels(replace(run, position_um=run.position_um - run.position_um[0]))
@@ -141,7 +141,8 @@ def _require_settled(models: Sequence[Innovations], run: Excitation) -> list[Inn
         duration_s = run.input.size * run.period_s
         raise UnsuitableData(
             f"{run.name}: the position drifts or creeps: every model has a time constant longer than the recording, "
-            f"such as {slowest_s:.3g} s in {duration_s:.3g} s. Record longer, or let the stage settle before"
+            f"for example {slowest_s:.3g} s; the recording has {duration_s:.3g} s. Record longer, or let the stage "
+            "settle before the recording"
         )
     return settled
 

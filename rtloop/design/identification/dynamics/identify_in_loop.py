@@ -174,7 +174,8 @@ def _require_samples(run: LoopExcitation) -> None:
     """Raise UnsuitableData for fewer than LEAST_SAMPLES ticks."""
     if run.input.size < LEAST_SAMPLES:
         raise UnsuitableData(
-            f"{run.name}: too short: {run.input.size} ticks in closed loop; needs at least {LEAST_SAMPLES} ticks"
+            f"{run.name}: too short: {run.input.size} ticks in closed loop; allowed: at least {LEAST_SAMPLES} ticks. "
+            "Record longer"
         )
 
 
@@ -228,7 +229,8 @@ def _require_certain_mode(name: str, modes: tuple[Mode, ...]) -> None:
     most_certain = min(modes, key=lambda mode: mode.frequency_std_hz / mode.frequency_hz)
     if most_certain.frequency_std_hz > LARGEST_RELATIVE_STD * most_certain.frequency_hz:
         raise UnsuitableData(
-            f"{name}: too little external excitation: the most certain mode is at {most_certain.frequency_hz:.4g} ± "
-            f"{most_certain.frequency_std_hz:.2g} Hz (standard deviation). Use a reference with a larger amplitude "
-            "or more frequencies"
+            f"{name}: too little external excitation: no mode has a certain frequency. The most certain mode is at "
+            f"{most_certain.frequency_hz:.4g} ± {most_certain.frequency_std_hz:.2g} Hz (standard deviation); allowed: "
+            f"a standard deviation of up to {100 * LARGEST_RELATIVE_STD:g} %. Use a reference with a larger "
+            "amplitude or more frequencies"
         )

@@ -109,8 +109,8 @@ def _trial_of_user_thresholds(thresholds: Real, stroke_v: float, hint: str) -> T
     too_large = thresholds[thresholds >= 0.5 * stroke_v]
     if too_large.size:
         raise UnsuitableData(
-            f"thresholds from {too_large[0]:g} V on cannot be identified; allowed: below {0.5 * stroke_v:.4g} V, half "
-            f"of {stroke_v:.4g} V, the longest stroke of the drive over which the actuator's memory is known"
+            f"thresholds: value is {too_large[0]:g} V; allowed: below {0.5 * stroke_v:.4g} V, half of the longest "
+            f"stroke of the drive ({stroke_v:.4g} V) over which the actuator's memory is known"
             f"{f'; {hint}' if hint else ''}"
         )
     return Trial(thresholds, "given", ())
@@ -127,13 +127,13 @@ def _require_stroke(runs: Sequence[AxisRecording], work: RecordingSet) -> tuple[
     widest = max(work.runs, key=lambda run: float(np.ptp(run.full_v)))
     turn_v, reached_v, goal_v = missing_stroke(widest.full_v)
     hint = (
-        f"not recorded: a stroke from {turn_v:.4g} V to {goal_v:.4g} V (the drive reached {reached_v:.4g} V only), "
-        f"which would show thresholds from {0.5 * stroke_v:.4g} V up to {0.5 * work.largest_v:.4g} V"
+        f"a stroke from {turn_v:.4g} V to {goal_v:.4g} V is not recorded (the drive reached only {reached_v:.4g} V); "
+        f"this stroke would show thresholds from {0.5 * stroke_v:.4g} V up to {0.5 * work.largest_v:.4g} V"
     )
     if stroke_v < LEAST_KNOWN_SHARE * work.largest_v:
         raise UnsuitableData(
-            f"{', '.join(run.name for run in runs)}: too little excitation: the longest stroke of the drive over which "
-            f"the actuator's memory is known has {stroke_v:.4g} V; allowed: at least "
+            f"{', '.join(run.name for run in runs)}: too little excitation: the actuator's memory is known over "
+            f"strokes of the drive of up to {stroke_v:.4g} V; allowed: at least "
             f"{LEAST_KNOWN_SHARE * work.largest_v:.4g} V ({100 * LEAST_KNOWN_SHARE:g} % of the drive's range); {hint}. "
             "Record this stroke"
         )

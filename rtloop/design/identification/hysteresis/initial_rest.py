@@ -6,6 +6,7 @@ import numpy as np
 
 from rtloop.design.identification.axis_recording import AxisRecording, UnsuitableData, jumps
 from rtloop.hysteresis.plays import turning_points
+from rtloop.values import count_text
 
 REST_SHARE = 0.02
 """A recording starts from rest where its first drive is at most this fraction of the largest."""
@@ -32,7 +33,7 @@ def require_loop(run: AxisRecording) -> None:
     turns = turning_points(drive, 0.5 * float(np.ptp(drive)))
     if turns.size < 2:
         raise UnsuitableData(
-            f"{run.name}: too little excitation: the drive turns back {turns.size} times; needs at least 2 turns "
-            "(one and a half periods of a sine give the major loop)"
-            + ("; a step is for `rtloop identify dynamics`" if jumps(run) else "")
+            f"{run.name}: too little excitation: the drive turns back {count_text(turns.size, 'time')}; allowed: at "
+            "least 2 times (one and a half periods of a sine give the major loop)"
+            + (". For a step, use `rtloop identify dynamics`" if jumps(run) else "")
         )

@@ -123,8 +123,8 @@ class RecordingSet(NamedTuple):
         error_share = fit.rms_error_um / fit.range_um
         if error_share > LARGEST_RMS_SHARE:
             raise UnsuitableData(
-                f"{', '.join(run.name for run in self.recorded)}: no sum of play operators leads from the drive to the "
-                f"position: the best one has an rms error of {100 * error_share:.0f} % of the position's range; "
+                f"{', '.join(run.name for run in self.recorded)}: no sum of play operators predicts the position from "
+                f"the drive: the best sum has an rms error of {100 * error_share:.0f} % of the position's range; "
                 f"allowed: up to {100 * LARGEST_RMS_SHARE:.0f} %. Plot position over drive, and check that both "
                 "signals belong to this axis, that the drive is slow, and that the sensor's sign is right"
             )

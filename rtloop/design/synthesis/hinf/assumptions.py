@@ -25,8 +25,8 @@ class NoController(ValueError):
 def check_assumptions(plant: GeneralisedPlant) -> None:
     """Raise NoController with every assumption that does not hold; axis zeros are checked only if all others hold."""
     faults = [
-        *_unreachable_modes("stabilisability", "u does not move", plant.a, plant.b2),
-        *_unreachable_modes("detectability", "y does not show", plant.a.T, plant.c2.T),
+        *_unreachable_modes("stabilisability", "the command u does not move", plant.a, plant.b2),
+        *_unreachable_modes("detectability", "the measurement y does not show", plant.a.T, plant.c2.T),
         *_rank_faults(plant),
     ]
     if not faults:
@@ -47,8 +47,8 @@ def _unreachable_modes(condition: str, problem: str, a: Real, b: Real) -> list[s
             continue
         if _is_singular(np.hstack([a - value * np.eye(a.shape[0]), b.astype(complex)])):
             faults.append(
-                f"{condition}: {problem} the mode at s = {_root(value)} rad/s, which is not stable; if a weight has "
-                "this pole, move it to Re s < 0; if the plant has it, no controller stabilises the loop"
+                f"{condition}: {problem} the mode at s = {_root(value)} rad/s, which is not stable. If a weight has "
+                "this pole, move the pole to Re s < 0. If the plant has this pole, no controller stabilises the loop"
             )
     return faults
 
@@ -57,8 +57,8 @@ def _rank_faults(plant: GeneralisedPlant) -> list[str]:
     """Return a fault for each of D12 and D21 without full rank."""
     faults = []
     for name, matrix, requirement in (
-        ("D12", plant.d12, "needs full column rank, by a weight on every u at high frequencies"),
-        ("D21", plant.d21.T, "needs full row rank, by a disturbance of every y at high frequencies"),
+        ("D12", plant.d12, "allowed: full column rank. Give every command u a weight at high frequencies"),
+        ("D21", plant.d21.T, "allowed: full row rank. Give every measurement y a disturbance at high frequencies"),
     ):
         values = np.linalg.svd(matrix, compute_uv=False)
         rank = int(np.sum(values > SMALL * values.max(initial=0.0)))
@@ -83,7 +83,7 @@ def _axis_zeros(path_name: str, a: Real, b: Real, c: Real, d: Real) -> list[str]
             place = f"the path {path_name} has a zero at ω = {value.imag:.6g} rad/s"
             faults.append(
                 f"imaginary-axis zero: {place}; usual cause: a pole of the plant or a zero of a weight without "
-                "damping; add a little damping to it"
+                "damping. Add a little damping to this pole or zero"
             )
     return faults
 

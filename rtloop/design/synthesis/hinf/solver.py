@@ -73,7 +73,7 @@ def synthesise_hinf(
     achieved = hinf_norm(loop).norm
     if not achieved <= 1.01 * target_gamma:
         raise NoController(
-            f"the controller for γ = {target_gamma:.6g} reaches only {achieved:.6g}, because of rounding errors; "
+            f"the controller for γ = {target_gamma:.6g} reaches only γ = {achieved:.6g}, because of rounding errors; "
             "use a larger synthesis.backoff_percent, or weights with corner frequencies closer together"
         )
     return Hinf(controller, target_gamma, gamma_opt, achieved, limiting)
