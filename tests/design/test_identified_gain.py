@@ -77,8 +77,8 @@ def test_the_delay_of_an_import_follows_the_stated_order_of_position_and_drive(f
     """The rows were made without any delay; sampled together they would have had one sample."""
     together, first = (sections(folder / f"{name}.toml")["model"]["delay_ticks"] for name in ("together", "first"))
     assert (together, first) == (1, 0)
-    convention = "drive and position of a row count as sampled at the same time"
-    for ending in ("toml", "txt"):
+    for ending, verb in (("toml", "count as"), ("txt", "were")):
+        convention = f"drive and position of a row {verb} sampled at the same time"
         assert convention in (folder / f"together.{ending}").read_text(encoding="utf-8")
         assert convention not in (folder / f"first.{ending}").read_text(encoding="utf-8")
     assert "rtloop import --position-first" in (folder / "together.txt").read_text(encoding="utf-8")
@@ -157,7 +157,7 @@ def test_a_comparison_with_a_short_recording_states_its_resolution(folder: Path)
         "identify", "dynamics", folder / "first.mcap", "--input", "drive", "--order", "2", "--compare",
         folder / "first.mcap",
     ).stdout  # fmt: skip
-    assert "resolution 6.67 Hz (1.25 Hz needs 1.6 s of excitation)" in " ".join(printed.split())
+    assert "resolution 6.67 Hz (a resolution of 1.25 Hz needs 1.6 s of excitation)" in " ".join(printed.split())
 
 
 def test_the_advice_after_a_trip_fits_its_cause() -> None:

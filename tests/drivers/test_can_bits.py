@@ -87,7 +87,7 @@ def test_the_highest_rate(options, channels, rate_hz):
 
 def test_a_drive_frame_without_its_sample_frame_is_left_out():
     frames = {name: frame for name, frame in load_frames(BusOptions()).items() if name.startswith("Drive")}
-    with pytest.raises(ValueError, match="channels: 1 axes; the DBC file has no classic CAN frames"):
+    with pytest.raises(ValueError, match="channels: 1 axes; the DBC file has no pair of classic CAN frames"):
         choose_exchange(frames, 1, BusOptions())
 
 

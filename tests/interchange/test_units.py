@@ -169,7 +169,7 @@ def test_the_mapping_beside_the_data(tmp_path: Path):
         ("signals = 3", "signals: input should be a valid dict"),
         ("tiem = 't'", "tiem: extra inputs are not permitted"),
         ("rate_hz = 0.0", "rate_hz: input should be greater than or equal to 0.001"),
-        ("[signals]\n'x y' = 'a'", "signals: 'x y'; allowed: letters, digits and _"),
+        ("[signals]\n'x y' = 'a'", "signals: 'x y'; allowed: a name of up to 100 letters, digits and _"),
         ("[", "not valid TOML"),
     ],
 )

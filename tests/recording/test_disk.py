@@ -146,7 +146,7 @@ def test_recording_resumes_once_more_than_the_minimum_is_free(disk: Disk, tmp_pa
         disk.free_bytes = free_bytes
         run.run_to(tick)
     reason = recording_state(run.loop.block)["reason"]
-    assert "a quarter of it and 1 MiB are free" in reason  # The minimum itself is free.
+    assert "1.25 times recording.min_free_mib plus 1 MiB are free" in reason  # The minimum itself is free.
     disk.free_bytes = 128 * MIB
     totals = run.end(45_000)
     (gap,) = check(totals, 45_000)

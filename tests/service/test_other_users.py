@@ -161,7 +161,7 @@ def test_a_socket_with_another_owner_than_who_serves_it_is_not_believed(place: P
     with served(path, ATTACKER):
         place.chmod(0o755)
         os.chown(path, VICTIM, VICTIM)
-        assert f"user {ATTACKER}" in refused(VICTIM, lambda: Client(path).get("/status"), path)
+        assert f"user ID {ATTACKER}" in refused(VICTIM, lambda: Client(path).get("/status"), path)
 
 
 def test_the_service_of_a_folder_that_root_gave_is_believed(tmp_path_factory: pytest.TempPathFactory):
