@@ -157,7 +157,8 @@ def test_a_comparison_with_a_short_recording_states_its_resolution(folder: Path)
         "identify", "dynamics", folder / "first.mcap", "--input", "drive", "--order", "2", "--compare",
         folder / "first.mcap",
     ).stdout  # fmt: skip
-    assert "resolution 6.67 Hz (a resolution of 1.25 Hz needs 1.6 s of excitation)" in " ".join(printed.split())
+    resolution = "resolution 6.67 Hz (a resolution of 1.25 Hz needs 1.6 s of excitation)"
+    assert resolution in " ".join(printed.split())
 
 
 def test_the_advice_after_a_trip_fits_its_cause() -> None:

@@ -118,7 +118,8 @@ def test_a_stage_that_has_not_settled_by_the_end_is_refused() -> None:
         scale=1e-3, size=6000
     )
     with pytest.raises(
-        UnsuitableData, match=r"drifts or creeps.* longer than the recording, for example 2\.?\d* s; the recording has 0\.6 s"
+        UnsuitableData,
+        match=r"drifts or creeps.* longer than the recording, for example 2\.?\d* s; the recording has 0\.6 s",
     ):
         identify_dynamics(replace(run, position_um=position_um), order=1, delay_ticks=0)
 
