@@ -13,6 +13,7 @@ from rtloop.cli.exit_codes import report_errors
 from rtloop.cli.options import JSON, OUTPUT
 from rtloop.cli.output import print_result
 from rtloop.cli.output.progress import Counter
+from rtloop.cli.workers import choose_workers, worker_options
 from rtloop.errors import LoopFault
 from rtloop.values import count_text
 from rtloop.workbench.tables import console, escape, format_number, table
@@ -36,16 +37,7 @@ def _add_options(command: Any) -> Any:
             type=OUTPUT,
             help="Folder for the verdicts, from which the same command continues after a stop.  [default: none]",
         ),
-        click.option(
-            "--scheduler",
-            metavar="ADDRESS",
-            help="Address of a Dask scheduler, such as tcp://HOST:8786, whose workers replace the local processes.",
-        ),
-        click.option(
-            "--jobs",
-            type=click.IntRange(1, 1024),
-            help="Number of worker processes.  [default: one for each processor]",
-        ),
+        worker_options,
         click.argument("patterns", metavar="PATTERN...", type=OUTPUT, nargs=-1, required=True),
     ):
         command = option(command)
@@ -108,27 +100,16 @@ def _examine(
     stores the verdicts; each may be None. Raises UsageError for both `jobs` and `scheduler`, and the errors of
     `find_recordings`, `examine` and `DaskWorkers`.
     """
-    if jobs and scheduler:
-        raise click.UsageError(
-            "--jobs: not allowed with --scheduler, which sets the number of workers; leave --jobs out"
-        )
     from rtloop.supervision.interruption import Interruption
 
-    with Interruption() as interruption:
+    with Interruption() as interruption, choose_workers(jobs, scheduler, "rtloop.campaigns.archive_verdict") as workers:
         from rtloop.campaigns.archive import examine
         from rtloop.campaigns.archive_files import find_recordings
-        from rtloop.campaigns.workers import DaskWorkers, ProcessWorkers
 
         recordings = find_recordings(patterns)
-        workers = (
-            DaskWorkers(scheduler) if scheduler else ProcessWorkers(jobs, preload="rtloop.campaigns.archive_verdict")
-        )
         click.echo(f"{count_text(len(recordings), 'recording')} on {workers.name}", err=True)
-        try:
-            with Counter(f"of {len(recordings):,} recordings", sys.stderr) as counter:
-                report = examine(examination, recordings, workers, out, counter.show, lambda: interruption.requested)
-        finally:
-            workers.close()
+        with Counter(f"of {len(recordings):,} recordings", sys.stderr) as counter:
+            report = examine(examination, recordings, workers, out, counter.show, lambda: interruption.requested)
     print_result(report, as_json, lambda report: _print_report(report, examination.columns, examination.good_verdict))
     if report["pending"]:
         remedy = (

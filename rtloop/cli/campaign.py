@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -16,6 +14,7 @@ from rtloop.cli.exit_codes import report_errors, require_readable
 from rtloop.cli.options import JSON, OUTPUT
 from rtloop.cli.output import echo_json
 from rtloop.cli.output.progress import StatusLine
+from rtloop.cli.workers import choose_workers, worker_options
 from rtloop.errors import LoopFault
 from rtloop.values import count_text
 from rtloop.workbench.tables import console, escape, table
@@ -24,7 +23,6 @@ from rtloop.workbench.written_files import path_from, write_output
 if TYPE_CHECKING:
     from rtloop.campaigns.coordinator import Progress
     from rtloop.campaigns.summary import CampaignSummary
-    from rtloop.campaigns.workers import Workers
 
 CAMPAIGN = click.argument("campaign", type=OUTPUT)
 FOLDER = click.option("--out", type=OUTPUT, help="Folder of the results.  [default: campaigns/CAMPAIGN-CONFIG]")
@@ -35,44 +33,8 @@ RIGS = click.option(
     "--rigs", type=click.IntRange(1, 10_000_000), help="Number of sampled rigs.  [default: the number in CAMPAIGN]"
 )
 PAGE = click.option("--page", type=OUTPUT, help="Write the report to this file, too, as one HTML page.")
-WORKERS = (
-    click.option(
-        "--jobs", type=click.IntRange(1, 1024), help="Number of worker processes.  [default: one for each processor]"
-    ),
-    click.option(
-        "--scheduler",
-        metavar="ADDRESS",
-        help="Address of a Dask scheduler, such as tcp://HOST:8786, whose workers replace the local processes.",
-    ),
-)
 STOPPED = 130
 """Exit code of a campaign that Ctrl-C has stopped."""
-
-
-def worker_options(command: Callable[..., Any]) -> Callable[..., Any]:
-    """Add the options of WORKERS to a command. Returns the command."""
-    for option in reversed(WORKERS):
-        command = option(command)
-    return command
-
-
-@contextmanager
-def choose_workers(jobs: int | None, scheduler: str | None) -> Iterator[Workers]:
-    """Start `jobs` worker processes, None: one for each processor, or use the workers of a Dask scheduler, for a block.
-
-    The block receives the workers, which are closed at its end. Raises UsageError for both, and as `DaskWorkers`.
-    """
-    if jobs and scheduler:
-        raise click.UsageError(
-            "--jobs: not allowed with --scheduler, which sets the number of workers; leave --jobs out"
-        )
-    from rtloop.campaigns.workers import DaskWorkers, ProcessWorkers
-
-    workers = DaskWorkers(scheduler) if scheduler else ProcessWorkers(jobs)
-    try:
-        yield workers
-    finally:
-        workers.close()
 
 
 @click.group()

@@ -8,18 +8,12 @@ from typing import TYPE_CHECKING
 
 import click
 
-from rtloop.cli.campaign import (
-    CAMPAIGN,
-    CONFIGURATION,
-    FOLDER,
-    choose_workers,
-    value_text,
-    worker_options,
-)
+from rtloop.cli.campaign import CAMPAIGN, CONFIGURATION, FOLDER, value_text
 from rtloop.cli.exit_codes import report_errors, require_readable
 from rtloop.cli.options import JSON
 from rtloop.cli.output import echo_json
 from rtloop.cli.output.progress import StatusLine
+from rtloop.cli.workers import choose_workers, worker_options
 from rtloop.workbench.tables import console, escape, table
 
 if TYPE_CHECKING:

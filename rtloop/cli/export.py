@@ -17,26 +17,28 @@ from rtloop.values import count_text
 from rtloop.workbench.tables import console, escape, print_problems
 
 FORMAT = click.Choice(["csv", "parquet", "npz", "mat", "hdf5"])
-
-
-@click.command()
-@FILES
-@click.option("--to", type=FORMAT, required=True, help="Format of the file; parquet and hdf5 need rtloop[data].")
-@click.option("--out", type=OUTPUT, help="File to write.  [default: FILE with another ending]")
-@click.option(
+FROM = click.option(
     "--from",
     "start_s",
     type=Seconds(allows_zero=True),
     default=0.0,
     help="Beginning of the part, in s since the start of the run.  [default: 0]",
 )
-@click.option(
+UNTIL = click.option(
     "--until",
     "end_s",
     type=Seconds(),
     default=None,
     help="End of the part, in s since the start of the run.  [default: end of the run]",
 )
+
+
+@click.command()
+@FILES
+@click.option("--to", type=FORMAT, required=True, help="Format of the file; parquet and hdf5 need rtloop[data].")
+@click.option("--out", type=OUTPUT, help="File to write.  [default: FILE with another ending]")
+@FROM
+@UNTIL
 @click.option(
     "--every", type=click.IntRange(min=1), default=1, metavar="N", help="Write every N-th tick, without averaging."
 )
@@ -77,20 +79,8 @@ def export(
 @click.command()
 @FILES
 @click.option("--out", type=OUTPUT, help="Picture to write: .png, .pdf or .svg.  [default: FILE with .png]")
-@click.option(
-    "--from",
-    "start_s",
-    type=Seconds(allows_zero=True),
-    default=0.0,
-    help="Beginning of the part, in s since the start of the run.  [default: 0]",
-)
-@click.option(
-    "--until",
-    "end_s",
-    type=Seconds(),
-    default=None,
-    help="End of the part, in s since the start of the run.  [default: end of the run]",
-)
+@FROM
+@UNTIL
 @click.option("--html", is_flag=True, help="Write one HTML page with zoom and pan, instead of a PNG.")
 @JSON
 @report_errors
