@@ -124,11 +124,13 @@ class Repetitive(Controller):
         The memory of the next period is the error plus the smoothed memory of a period ago; if the command was limited,
         it is 0, and the integral is moved to the applied command as well.
         """
-        ahead, newest = s.at + c.ahead, s.at + c.count - 1
+        ahead, newest = (s.at + c.ahead) % c.places, (s.at + c.count - 1) % c.places
         led_um, repeated_um = 0.0, 0.0
         for j in range(c.count):
-            led_um += c.weights[j] * s.past_um[(ahead - j) % c.places]
-            repeated_um += c.weights[j] * s.past_um[(newest - j) % c.places]
+            led_um += c.weights[j] * s.past_um[ahead]
+            repeated_um += c.weights[j] * s.past_um[newest]
+            ahead = ahead - 1 if ahead > 0 else c.places - 1
+            newest = newest - 1 if newest > 0 else c.places - 1
         s.past_um[s.at] = told.error_um + repeated_um if told.applied_um == told.command_um else 0.0
         s.at = (s.at + 1) % c.places
         s.integral_um += c.ki * (told.error_um + led_um) + told.applied_um - told.command_um
