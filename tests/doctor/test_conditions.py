@@ -79,6 +79,18 @@ def test_a_broken_condition_is_named_and_mended(condition, tmp_path):
         assert condition not in bad(check_conditions(broken, SPINNING))
 
 
+@pytest.mark.parametrize(("condition", "path", "runtime", "lost_us", "text"), [
+    ("real-time throttling", "proc/sys/kernel/sched_rt_runtime_us", 950_000, 50_000, "50000 of every 1000000 µs"),
+    ("real-time throttling", "proc/sys/kernel/sched_rt_runtime_us", 900_000, 100_000, "100000 of every 1000000 µs"),
+    ("fair server", "sys/kernel/debug/sched/fair_server/cpu3/runtime", 50_000_000, 50_000, "50 ms of every second"),
+    ("fair server", "sys/kernel/debug/sched/fair_server/cpu3/runtime", 20_000_000, 20_000, "20 ms of every second"),
+])  # fmt: skip
+def test_the_lost_time_is_that_of_the_hosts_setting(tmp_path, condition, path, runtime, lost_us, text):
+    findings = check_conditions(host(tmp_path, {path: f"{runtime}\n"}), SPINNING)
+    (finding,) = (finding for finding in findings if finding.condition == condition)
+    assert (finding.late_us, finding.consequence.partition("processor for ")[2]) == (lost_us, text)
+
+
 def test_a_refused_write_is_reported(tmp_path):
     (tmp_path / CLOCK).mkdir(parents=True)
     findings = check_conditions(host(tmp_path / "other", {CLOCK: "hpet\n"}), SPINNING)

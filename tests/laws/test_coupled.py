@@ -182,6 +182,15 @@ def test_cross_talk_is_what_the_decoupling_takes_away():
     assert moved["single"] > 5 * moved["decoupled"], moved
 
 
+def test_the_models_of_a_shared_controller_have_the_delays_of_their_loops() -> None:
+    """The model of y states its delay; the one of x does not, and has the driver's."""
+    before, _, model_of_y = EXAMPLE.rpartition("[axis.model]")
+    text = f"{before}[axis.model]\ndelay_ticks = 2{model_of_y}".replace("seed = 1", "seed = 1\nlatency_ticks = 1")
+    for check in prepare_text(text).checks:
+        assert check.law is not None
+        assert [model.delay_ticks for model in check.law.model] == [1, 2]
+
+
 def test_the_loop_is_as_it_was_predicted(tmp_path):
     """S measured on the rig by sines in one reference and then in the other, beside the one that `check` computes."""
     found = prepare_text(EXAMPLE).checks[0].together

@@ -95,5 +95,5 @@ async def _run_json(command: list[str], stdin: bytes, timeout_s: float) -> dict[
 
 
 def _command_text(command: list[str]) -> str:
-    """Return the command as somebody types it, where it is `rtloop`; else with Python in front."""
+    """Return the command line for a terminal, quoted: `rtloop …`, or `python -m MODULE …` for another module."""
     return shlex.join(command[2:] if command[2] == "rtloop" else ["python", *command[1:]])
