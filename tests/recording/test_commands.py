@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import io
 import json
 import shutil
 from pathlib import Path
@@ -11,9 +12,12 @@ from typing import Any
 import numpy as np
 import pytest
 from mcap.reader import make_reader
+from rich.console import Console
 
 from rtloop.cli import main
 from rtloop.recording.load import load
+from rtloop.recording.replay.verdict import ReplayReport
+from rtloop.workbench.replay_text import print_replay
 from tests.asked import answer, run
 from tests.recording.conftest import EVENTFUL_TICKS
 from tests.recording.hand_made_loop import make_rows, write_recording
@@ -70,6 +74,19 @@ def test_replay_prints_identical_or_the_first_difference(eventful: Path, tmp_pat
     assert (verdict["identical"], difference.keys()) == (False, {"tick", "signal", "recorded", "replayed"})
     assert (difference["tick"], difference["signal"]) == (777, "x_drive_v")
     assert "tick 777, x_drive_v" in run("replay", path).stdout
+
+
+@pytest.mark.parametrize(("recorded", "replayed", "text"), [
+    (None, None, "tick 9, end of the run (1 tick and "), (1.5, None, "end of the run: recorded 1.5, replayed None (1 tick"),
+])  # fmt: skip
+def test_a_difference_without_values_prints_no_values(
+    recorded: float | None, replayed: float | None, text: str
+) -> None:
+    difference = {"tick": 9, "signal": "end of the run", "recorded": recorded, "replayed": replayed}
+    printed = io.StringIO()
+    report = ReplayReport(ticks=1, first_difference=difference, not_judged=["times"])
+    print_replay(Console(file=printed, width=200), Path("run.mcap"), report)
+    assert text in printed.getvalue()
 
 
 def test_replay_with_another_law_ends_with_0(eventful: Path, tmp_path: Path):
