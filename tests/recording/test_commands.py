@@ -77,7 +77,8 @@ def test_replay_prints_identical_or_the_first_difference(eventful: Path, tmp_pat
 
 
 @pytest.mark.parametrize(("recorded", "replayed", "text"), [
-    (None, None, "tick 9, end of the run (1 tick and "), (1.5, None, "end of the run: recorded 1.5, replayed None (1 tick"),
+    (None, None, "tick 9, end of the run (1 tick and "),
+    (1.5, None, "end of the run: recorded 1.5, replayed None (1 tick"),
 ])  # fmt: skip
 def test_a_difference_without_values_prints_no_values(
     recorded: float | None, replayed: float | None, text: str
