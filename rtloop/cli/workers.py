@@ -24,7 +24,7 @@ WORKERS = (
 
 
 def worker_options(command: Callable[..., Any]) -> Callable[..., Any]:
-    """Add the options of WORKERS to a command. Returns the command."""
+    """Add the options --jobs and --scheduler to a command. Returns the command."""
     for option in reversed(WORKERS):
         command = option(command)
     return command
@@ -34,10 +34,11 @@ def worker_options(command: Callable[..., Any]) -> Callable[..., Any]:
 def choose_workers(
     jobs: int | None, scheduler: str | None, preload: str = "rtloop.campaigns.unit"
 ) -> Iterator[Workers]:
-    """Start `jobs` worker processes for a block, None: one for each processor, or use the workers of a Dask scheduler.
+    """Yield the workers that run a command's functions, and close them at the end of the block.
 
-    The block receives the workers, which are closed at its end; local processes import the module `preload` once.
-    Raises UsageError for both `jobs` and `scheduler`, and errors as `DaskWorkers`.
+    They are `jobs` processes of this host (None: one for each processor), each of which has imported the module
+    `preload`, or the workers of the Dask scheduler at the address `scheduler`. Raises UsageError if both are given, and
+    the errors of `DaskWorkers`.
     """
     if jobs and scheduler:
         raise click.UsageError(

@@ -212,7 +212,7 @@ def loop_delay_ticks(model: ModelOptions | None, driver_delay_ticks: int) -> int
 
 
 def _delayed_model(axis: AxisOptions, delay: int) -> ModelOptions | None:
-    """Return the model of an axis with the `delay` of its loop in samples, which a law judges; None without a model."""
+    """Return the model of an axis with `delay`, that of its loop in samples, as `delay_ticks`; None without a model."""
     return None if axis.model is None else axis.model.model_copy(update={"delay_ticks": delay})
 
 
@@ -295,8 +295,8 @@ def _report_instability(loop: Loop, options: ControllerOptions, key: str, models
 def _check_shared(configuration: Configuration, axes: Sequence[AxisOptions], findings: Findings) -> list[AxisCheck]:
     """Return a check of each of `axes`, which share the controller of the first one, and append faults to `findings`.
 
-    Each axis's loop is broken alone, and all at once. A check has no law if a shipped law is not linear. Raises
-    TypeError for a law that is for one axis.
+    The loops are judged one axis at a time, with the other loops closed, and all axes at once. A check has no law if a
+    shipped law is not linear. Raises TypeError for a law that controls one axis only.
     """
     names, key = tuple(axis.name for axis in axes), f"axis.{axes[0].name}.controller"
     delays = [delay_ticks(configuration, axis) for axis in axes]

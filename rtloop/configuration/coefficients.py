@@ -27,8 +27,8 @@ def make_controller(
 ) -> Controller | None:
     """Return the controller of an axis; None without one. `axis_coefficients` builds, and may refuse, its coefficients.
 
-    `models` has one entry for each axis of the controller, with the delay of that axis's loop; empty: the axis's model
-    as the configuration states it.
+    `models` has one entry for each axis of the controller: its model with the delay of its loop, or None. If `models`
+    is empty, the controller gets the model of `axis` as the configuration states it.
     """
     if axis.controller is None:
         return None

@@ -119,10 +119,9 @@ class Repetitive(Controller):
 
     @staticmethod
     def update(c: Any, s: Any, told: Any) -> None:
-        """Add the smoothed memory, read L ticks ahead, to the error, and advance the integral by the result.
+        """Store u_k in the memory, and add ki T ê_k to the integral (equations of the module).
 
-        The memory of the next period is the error plus the smoothed memory of a period ago; if the command was limited,
-        it is 0, and the integral is moved to the applied command as well.
+        If the command was limited, 0 is stored in place of u_k, and the integral moves to the applied command as well.
         """
         ahead, newest = (s.at + c.ahead) % c.places, (s.at + c.count - 1) % c.places
         led_um, repeated_um = 0.0, 0.0
