@@ -212,7 +212,7 @@ def loop_delay_ticks(model: ModelOptions | None, driver_delay_ticks: int) -> int
 
 
 def _delayed_model(axis: AxisOptions, delay: int) -> ModelOptions | None:
-    """Return the model of an axis with `delay`, that of its loop in samples, as `delay_ticks`; None without a model."""
+    """Return the model of an axis with its loop's delay, `delay` samples, as `delay_ticks`; None without a model."""
     return None if axis.model is None else axis.model.model_copy(update={"delay_ticks": delay})
 
 

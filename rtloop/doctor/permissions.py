@@ -9,7 +9,7 @@ from rtloop.engine.plan import Pacing
 SPINNING_SHARE = 0.9
 LIMITS = "/etc/security/limits.d/rtloop.conf"
 DEFAULT_FAIR_RUNTIME_NS = 50_000_000
-"""Runtime of the fair server in each second, in ns, as the kernel sets it by itself."""
+"""Default of the kernel: time of the fair server in each second, in ns."""
 
 
 def spinning_share(pacing: Pacing) -> float:
