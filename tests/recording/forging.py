@@ -19,7 +19,7 @@ from rtloop.engine.commands import send
 from rtloop.engine.messages import Kind, message
 from rtloop.kernel.memory import slot_view
 from rtloop.laws.shipped import transfer
-from rtloop.recording.capture import session as session_module
+from rtloop.recording.capture.session import Session
 from rtloop.recording.file.mcap.container import CHUNK_HEAD, MAGIC, pack_chunk, pack_end, pack_message, pack_records
 from rtloop.recording.file.reader import Reader
 from rtloop.recording.file.topics import format
@@ -119,7 +119,7 @@ def _record(path: Path, text: str) -> Path:
     run = RecordedRun(path, text, paced=False)
     loop, session = run.loop, run.session
     loop.take_snapshots_every(SNAPSHOT_TICKS)
-    with patch.object(session_module, "FLUSH_S", -1.0):
+    with patch.object(Session, "write_due", Session._write_all):
         while loop.tick < TICKS:
             if loop.tick == SWAP_TICK:
                 changed_law = loop.prepared.plan.coefficients.copy()

@@ -56,52 +56,57 @@ class TickSpans:
 
 
 class TickBuffer:
-    """Buffer of at most one chunk of rows (n, columns) float64, ordered by tick."""
+    """Buffer of rows (n, columns) float64, ordered by tick, with room for a whole number of chunks."""
 
-    def __init__(self, columns: list[str], rate_hz: float) -> None:
-        """Make an empty buffer for ticks of `columns`; deadlines are extrapolated at `rate_hz`."""
-        self._rows = np.empty((format.chunk_rows(columns), len(columns)))
-        self._row_count, self._rate_hz = 0, rate_hz
+    def __init__(self, columns: list[str], rate_hz: float, chunks: int = 1) -> None:
+        """Make an empty buffer for `chunks` chunks of ticks of `columns`; deadlines are extrapolated at `rate_hz`."""
+        self.chunk_rows = format.chunk_rows(columns)
+        self._room = np.empty((chunks * self.chunk_rows, len(columns)))
+        self._begin = self._end = 0
+        self._rate_hz = rate_hz
         self._anchor = (0.0, 0.0)
 
     def __len__(self) -> int:
         """Number of ticks in the buffer."""
-        return self._row_count
+        return self._end - self._begin
+
+    @property
+    def rows(self) -> Real:
+        """All rows (n, columns): a view, valid until the next `take_from`."""
+        return self._room[self._begin : self._end]
 
     @property
     def end(self) -> int:
         """The tick after the last one; only defined if the buffer is not empty."""
-        return int(self._rows[self._row_count - 1, TICK]) + 1
+        return int(self._room[self._end - 1, TICK]) + 1
 
     @property
     def free_rows(self) -> int:
         """Number of ticks for which the buffer still has room."""
-        return len(self._rows) - self._row_count
+        return len(self._room) - len(self)
 
     def take_from(self, reader: RingReader) -> int:
         """Append ticks from the ring, as many as there is room for.
 
         Returns the number of ticks appended plus the number of ticks lost in the ring before them.
         """
-        copied, lost = reader.take_into(self._rows[self._row_count :])
-        self._row_count += copied
+        if self._begin:
+            remaining = self.rows.copy()
+            self._begin, self._end = 0, len(remaining)
+            self._room[: self._end] = remaining
+        copied, lost = reader.take_into(self._room[self._end :])
+        self._end += copied
         return copied + lost
-
-    def first_rows(self, count: int) -> Real:
-        """Return the first `count` rows, at most `len()`, as (count, columns): a view, valid until the next `drop`."""
-        return self._rows[:count]
 
     def count_before(self, tick: int) -> int:
         """Count the rows before `tick`."""
-        return int(np.searchsorted(self._rows[: self._row_count, TICK], tick))
+        return int(np.searchsorted(self.rows[:, TICK], tick))
 
     def drop(self, count: int) -> None:
         """Discard the first `count` rows, at most `len()`; `tick_time` still extrapolates from the last of them."""
         if count:
-            self._anchor = (self._rows[count - 1, TICK], self._rows[count - 1, DEADLINE])
-        remaining = self._row_count - count
-        self._rows[:remaining] = self._rows[count : self._row_count].copy()
-        self._row_count = remaining
+            self._begin += count
+            self._anchor = (self._room[self._begin - 1, TICK], self._room[self._begin - 1, DEADLINE])
 
     def tick_time(self, tick: int) -> TickTime:
         """Return `tick` with its deadline, taken from its row or extrapolated from the last row before it.
@@ -109,7 +114,8 @@ class TickBuffer:
         Without a row before it, the base is the last dropped row; before any was dropped, tick 0 with deadline 0.
         """
         base_tick, base_ns = self._anchor
-        row = int(np.searchsorted(self._rows[: self._row_count, TICK], tick, side="right")) - 1
+        rows = self.rows
+        row = int(np.searchsorted(rows[:, TICK], tick, side="right")) - 1
         if row >= 0:
-            base_tick, base_ns = self._rows[row, TICK], self._rows[row, DEADLINE]
+            base_tick, base_ns = rows[row, TICK], rows[row, DEADLINE]
         return TickTime(tick, round(base_ns + (tick - base_tick) * NS_PER_S / self._rate_hz))

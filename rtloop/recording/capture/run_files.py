@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import contextlib
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -117,6 +118,19 @@ class RunFiles:
     def switch(self, writer: Writer) -> None:
         """Make `writer` the present file, for the ticks from `end_place` on; the former file must be finished."""
         self.writer, self.file_begin = writer, self.end_place
+
+    @contextlib.contextmanager
+    def packing(self, rows: Real, start_unix_ns: int) -> Iterator[None]:
+        """Pack rows (n, columns) of ticks on all processors, while the block writes them by `write`, chunk by chunk.
+
+        `start_unix_ns` as in `write`. Without a present file nothing is packed.
+        """
+        if self.writer is None:
+            yield
+            return
+        self.writer.start_unix_ns = start_unix_ns
+        with self.writer.packing(rows):
+            yield
 
     def write(
         self, messages: Sequence[Message], rows: Real, intervals: Intervals | None, start_unix_ns: int, end: TickTime

@@ -73,7 +73,7 @@ class SelectiveSession(Session):
         A condition that begins a retained span adds an event RETENTION_BEGUN.
         """
         self._last_write_s = time.monotonic()
-        rows = self._buffer.first_rows(count).copy()
+        rows = self._buffer.rows[:count].copy()
         for hit in self._segments.find_hits(entries, rows):
             event = recorder_event(RETENTION_BEGUN, *self._buffer.tick_time(hit.first), {"on": hit.condition})
             entries.append(self._pending.make_entry(event))

@@ -8,6 +8,7 @@ drained, so that a file can be cut at it, however far the loop is ahead.
 from __future__ import annotations
 
 import errno
+import math
 import time
 from collections import deque
 from pathlib import Path
@@ -37,9 +38,13 @@ from rtloop.recording.file.topics.events import (
     recorder_event,
 )
 from rtloop.recording.file.topics.overview import Intervals
+from rtloop.signals import TICK
 
 FLUSH_S = 0.4
-"""Two polls of the recorder: at most half a second of ticks is not in the file."""
+"""Two polls of the recorder: at most half a second of ticks is not in the file. In virtual time there is no such limit,
+so that the bytes of the file do not depend on the speed of the machine."""
+UNPACED_CHUNKS = 8
+"""Number of chunks that wait for each other in virtual time, so that all processors pack them at once."""
 RESUME_FREE_BYTES = 1 << 20
 """Space that must be free, besides 5/4 of `min_free_bytes`, before a file is begun after a failure."""
 
@@ -68,7 +73,7 @@ class Session:
         self._names = names
         self._block, self._path, self._header, self._options = block, path, header, options
         self._laws = [law_label(law["name"], law.get("file", "")) for law in header.get("law", {}).get("laws", ())]
-        self._buffer = TickBuffer(header["columns"], header["rate_hz"])
+        self._buffer = TickBuffer(header["columns"], header["rate_hz"], self._buffer_chunks)
         self._last_write_s = time.monotonic()
         self._progress = RecorderProgress(block)
         self._predecessor_end = self._progress.predecessor_position(predecessor_file(path, options.sequence))
@@ -100,6 +105,11 @@ class Session:
         ticks_logged = position.ticks - position.lost
         self._files = RunFiles(self._path, self._header, self._options, begin, ticks_logged, end if repeats else None)
         self._cut_tick = position.ticks
+
+    @property
+    def _buffer_chunks(self) -> int:
+        """Number of chunks of ticks that are drained before they are written; a paced run also writes after FLUSH_S."""
+        return 1 if self._header["paced"] or self._header.get("around") else UNPACED_CHUNKS
 
     @property
     def cursor(self) -> int:
@@ -137,11 +147,12 @@ class Session:
         self._pending.add_event(recorder_event(FILE_REMOVED, *self._buffer.tick_time(self.cursor), details))
 
     def write_due(self) -> None:
-        """Write all drained data if the buffer is full or FLUSH_S has passed since the last write.
+        """Write all drained data if the buffer is full or, in a paced run, FLUSH_S has passed since the last write.
 
         A failed write sets `failure` and does not raise.
         """
-        if self.free_rows == 0 or time.monotonic() - self._last_write_s >= FLUSH_S:
+        is_late = self._header["paced"] and time.monotonic() - self._last_write_s >= FLUSH_S
+        if self.free_rows == 0 or is_late:
             self._write_all()
 
     def finish(self, result: str) -> dict[str, Any]:
@@ -194,7 +205,7 @@ class Session:
             if self._header["paced"]:
                 self._resume(tick)
         elif self._is_file_due(tick):
-            self._write(self._buffer.count_before(tick), self._pending.take_entries(before=tick))
+            self._write_chunks(self._buffer.count_before(tick), before=tick)
             if not self.failure:
                 self._rotate(tick)
 
@@ -305,7 +316,21 @@ class Session:
 
     def _write_all(self) -> None:
         """Write all drained ticks and waiting messages; a failed write sets `failure`, as in `_write`."""
-        self._write(len(self._buffer), self._pending.take_entries())
+        self._write_chunks(len(self._buffer))
+
+    def _write_chunks(self, count: int, before: float = math.inf) -> None:
+        """Write the first `count` drained ticks, chunk by chunk, and the waiting messages before tick `before`.
+
+        Each chunk of ticks comes after the messages before its last tick. A failed write sets `failure`, as in
+        `_write`.
+        """
+        buffer, chunk_rows = self._buffer, self._buffer.chunk_rows
+        with self._files.packing(buffer.rows[:count], self._start_unix_ns()):
+            while count > chunk_rows:
+                next_chunk_begin = int(buffer.rows[chunk_rows, TICK])
+                self._write(chunk_rows, self._pending.take_entries(before=next_chunk_begin))
+                count -= chunk_rows
+            self._write(count, self._pending.take_entries(before=before))
 
     def _write(self, count: int, entries: list[PendingEntry]) -> None:
         """Write `entries`, then the first `count` rows, and drop these rows from the buffer.
@@ -316,7 +341,7 @@ class Session:
         self._last_write_s = time.monotonic()
         if self.failure is None:
             try:
-                self._write_to_file(self._buffer.first_rows(count), entries)
+                self._write_to_file(self._buffer.rows[:count], entries)
             except OutputError as error:
                 self._fail(error)
         if self.failure:

@@ -5,20 +5,21 @@ from __future__ import annotations
 import contextlib
 import errno
 import hashlib
+import itertools
 import json
+import math
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from mcap.opcode import Opcode
 from mcap.records import Header, McapRecord
 
 from rtloop.errors import LOW_SPACE, OutputError, output_errors
 from rtloop.foundation.arrays import Real
-from rtloop.recording.file.mcap.chunkfile import ChunkContent, ChunkFile
-from rtloop.recording.file.mcap.container import PREFIX, pack_message, pack_records
+from rtloop.recording.file.mcap.chunkfile import ChunkContent, ChunkFile, PackedChunk, compress_chunk
+from rtloop.recording.file.mcap.container import pack_index, pack_message, pack_records
+from rtloop.recording.file.tick_packer import TickPacker
 from rtloop.recording.file.topics import format
 from rtloop.recording.file.topics.contents import Message
 from rtloop.recording.file.topics.overview import Intervals, OverviewLayout, overview_records, tick_ranges
@@ -54,8 +55,9 @@ class Writer:
         """Number of ticks written, and of ticks that overviews replace."""
         self._skipped_counts: list[int] = []
         self._columns: list[str] = header["columns"]
-        self._message_index, self._min_free_bytes = message_index, min_free_bytes
-        self._template = format.blank_ticks(self._columns, format.chunk_rows(self._columns))
+        self._min_free_bytes = min_free_bytes
+        self._packer = TickPacker(self._columns, message_index=message_index)
+        self._packed: Iterator[PackedChunk] | None = None
         self._check_space(room_bytes)
         repeated = [*format.schemas(self._columns), *format.channels()]
         if header.get("around"):
@@ -71,6 +73,19 @@ class Writer:
     def part(self) -> Path:
         """The file's name from its first chunk, the header, until it is finished."""
         return self.file.part
+
+    @contextlib.contextmanager
+    def packing(self, rows: Real) -> Iterator[None]:
+        """Pack rows (n, columns) of ticks on all processors, while the block writes them by `write`, chunk by chunk.
+
+        Each `write` in the block must have the next `format.chunk_rows` rows, and the last one the rest;
+        `start_unix_ns` must not change.
+        """
+        self._packed = self._packer.pack(rows, self.start_unix_ns)
+        try:
+            yield
+        finally:
+            self._packed = None
 
     def write(self, messages: Sequence[Message], rows: Real) -> None:
         """Write messages of topics other than /ticks, and rows (n, columns) of at most one chunk of ticks.
@@ -90,27 +105,14 @@ class Writer:
     def write_ticks(self, rows: Real) -> None:
         """Write rows (n, columns) float64 of ticks in order, as chunks of at most `format.chunk_rows` ticks.
 
-        Raises OutputError; the chunks before the failed one stay in the file.
+        Raises OutputError if the file was removed, the free space is too small, or a write fails; the chunks before the
+        failed one stay in the file.
         """
-        for start in range(0, len(rows), len(self._template)):
-            self._write_chunk(rows[start : start + len(self._template)])
-
-    def _write_chunk(self, rows: Real) -> None:
-        """Write rows (n, columns) of ticks, n ≤ `format.chunk_rows`, as one chunk, and add n to `ticks`.
-
-        Raises OutputError if the file was removed, the free space is too small, or the write fails.
-        """
-        self._check_writable()
-        count = len(rows)
-        records = self._template[:count]
-        format.fill_ticks(records, self._columns, rows, self.start_unix_ns)
-        times, index = records["_log_time"], {}
-        if self._message_index:
-            offsets = np.arange(count) * records.dtype.itemsize
-            index = {format.TICKS: _index_record(format.TICKS, times, offsets)}
-        data = records.view(np.uint8).data
-        self.file.append_chunk(ChunkContent(data, int(times[0]), int(times[-1]), {format.TICKS: count}, index))
-        self.ticks += count
+        packed = self._packed or self._packer.pack(rows, self.start_unix_ns)
+        for chunk in itertools.islice(packed, math.ceil(len(rows) / self._packer.chunk_rows)):
+            self._check_writable()
+            self.file.append_chunk(chunk)
+            self.ticks += chunk.counts[format.TICKS]
 
     def write_messages(self, messages: Sequence[Message]) -> None:
         """Write messages of topics other than /ticks as one chunk, indexed by topic; nothing for an empty sequence.
@@ -223,25 +225,19 @@ class Writer:
         raise OutputError(f"{self.path}: {free_bytes >> 20} MiB are free; {requirement}", LOW_SPACE)
 
 
-def _pack_messages(messages: Sequence[Message], leading_records: bytes = b"") -> ChunkContent:
-    """Return a chunk of `leading_records` and one or more messages, each in the index of its channel."""
+def _pack_messages(messages: Sequence[Message], leading_records: bytes = b"") -> PackedChunk:
+    """Pack a chunk of `leading_records` and one or more messages, each in the index of its channel."""
     records, index_entries = bytearray(leading_records), {}
     for message in messages:
         times, offsets = index_entries.setdefault(message.channel, ([], []))
         times.append(message.log_time)
         offsets.append(len(records))
         records += pack_message(*message)
-    return ChunkContent(
+    content = ChunkContent(
         bytes(records),
         min(message.log_time for message in messages),
         max(message.log_time for message in messages),
         {channel: len(place[0]) for channel, place in index_entries.items()},
-        {channel: _index_record(channel, *place) for channel, place in index_entries.items()},
+        {channel: pack_index(channel, *place) for channel, place in index_entries.items()},
     )
-
-
-def _index_record(channel: int, times: Any, offsets: Any) -> bytes:
-    """Return a message index record; `times` in ns, `offsets` in bytes into the chunk's content."""
-    pairs = np.column_stack([np.asarray(times, np.uint64), np.asarray(offsets, np.uint64)]).tobytes()
-    head = PREFIX.pack(Opcode.MESSAGE_INDEX, 6 + len(pairs)) + channel.to_bytes(2, "little")
-    return head + len(pairs).to_bytes(4, "little") + pairs
+    return compress_chunk(content)

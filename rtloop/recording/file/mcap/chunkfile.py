@@ -10,6 +10,7 @@ from __future__ import annotations
 import contextlib
 import errno
 import os
+import threading
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -55,6 +56,37 @@ class ChunkContent(NamedTuple):
     indexes: dict[int, bytes]
 
 
+class PackedChunk(NamedTuple):
+    """A chunk as it goes into a file: its record, compressed, and what the index of the file needs.
+
+    `uncompressed_bytes` is the size of its content; `start`, `end`, `counts` and `indexes` are those of ChunkContent.
+    """
+
+    record: bytes
+    uncompressed_bytes: int
+    start: int
+    end: int
+    counts: dict[int, int]
+    indexes: dict[int, bytes]
+
+
+class _Compressors(threading.local):
+    """The compressor of each thread, `of_thread`, which all its chunks share: threads cannot share one."""
+
+    def __init__(self) -> None:
+        """Make the compressor of a thread, at its first use there."""
+        self.of_thread = zstandard.ZstdCompressor(compression_params=COMPRESSION)
+
+
+_compressors = _Compressors()
+
+
+def compress_chunk(content: ChunkContent) -> PackedChunk:
+    """Compress a chunk; may run in several threads at once. The content may change after the return."""
+    record = pack_chunk(content.records, content.start, content.end, _compressors.of_thread)
+    return PackedChunk(record, len(content.records), *content[1:])
+
+
 class _WrittenChunk(NamedTuple):
     """Data stored in memory for every written chunk: its packed index record, and the data needed to drop it."""
 
@@ -76,7 +108,6 @@ class ChunkFile:
         self._name = path.with_name(f"{self.part.name}.new")
         self.size = 0
         self._repeated = repeated
-        self._compressor = zstandard.ZstdCompressor(compression_params=COMPRESSION)
         self._chunks: list[_WrittenChunk] = []
         self._distinct_counts: dict[tuple[tuple[int, int], ...], dict[int, int]] = {}
         self._crc = 0
@@ -108,32 +139,31 @@ class ChunkFile:
         except OSError:
             return True  # Unknown; the next write fails if the file is gone.
 
-    def append_chunk(self, content: ChunkContent) -> None:
-        """Compress and write one chunk and its index records, if it has any, as a whole or not at all.
+    def append_chunk(self, chunk: PackedChunk) -> None:
+        """Write one chunk and its index records, if it has any, as a whole or not at all.
 
         The first chunk gives the file the name PATH.part. Raises OutputError, with nothing written, if the write fails,
         and with the chunk written if the file cannot get that name.
         """
-        chunk = pack_chunk(content.records, content.start, content.end, self._compressor)
-        index_begin = self.size + len(chunk)
+        index_begin = self.size + len(chunk.record)
         position, index_offsets = index_begin, {}
-        for channel, record in content.indexes.items():
+        for channel, record in chunk.indexes.items():
             index_offsets[channel] = position
             position += len(record)
         entry = ChunkIndex(
-            chunk_length=len(chunk),
+            chunk_length=len(chunk.record),
             chunk_start_offset=self.size,
             compression="zstd",
-            compressed_size=len(chunk) - CHUNK_HEAD.size,
-            message_end_time=content.end,
+            compressed_size=len(chunk.record) - CHUNK_HEAD.size,
+            message_end_time=chunk.end,
             message_index_length=position - index_begin,
             message_index_offsets=index_offsets,
-            message_start_time=content.start,
-            uncompressed_size=len(content.records),
+            message_start_time=chunk.start,
+            uncompressed_size=chunk.uncompressed_bytes,
         )
-        counts = self._distinct_counts.setdefault(tuple(content.counts.items()), content.counts)
+        counts = self._distinct_counts.setdefault(tuple(chunk.counts.items()), chunk.counts)
         written_chunk = _WrittenChunk(pack_records([entry]), counts, self._crc)
-        self._append(chunk + b"".join(content.indexes.values()))
+        self._append(chunk.record + b"".join(chunk.indexes.values()))
         self._chunks.append(written_chunk)
         if self._name != self.part:
             self._rename_to_part()

@@ -12,6 +12,8 @@ from collections.abc import Iterable, Iterator, Sequence
 from functools import lru_cache
 from typing import NamedTuple
 
+import numpy as np
+import numpy.typing as npt
 import zstandard
 from mcap.data_stream import RecordBuilder
 from mcap.opcode import Opcode
@@ -107,6 +109,13 @@ def pack_chunk(records: bytes | memoryview, start: int, end: int, compressor: zs
     length = CHUNK_HEAD.size - PREFIX.size + len(data)
     crc = crc32(records)
     return CHUNK_HEAD.pack(Opcode.CHUNK, length, start, end, len(records), crc, 4, b"zstd", len(data)) + data
+
+
+def pack_index(channel: int, times: npt.ArrayLike, offsets: npt.ArrayLike) -> bytes:
+    """Pack a message index record; `times` in ns, `offsets` in bytes into the chunk's content."""
+    pairs = np.column_stack([np.asarray(times, np.uint64), np.asarray(offsets, np.uint64)]).tobytes()
+    head = PREFIX.pack(Opcode.MESSAGE_INDEX, 6 + len(pairs)) + channel.to_bytes(2, "little")
+    return head + len(pairs).to_bytes(4, "little") + pairs
 
 
 def parse_chunk_head(data: bytes) -> ChunkHead:

@@ -1,0 +1,68 @@
+"""Ticks that several threads pack make the same bytes as those that one packs, chunk by chunk."""
+
+from __future__ import annotations
+
+from itertools import chain
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from rtloop.recording.capture import session
+from rtloop.recording.file import tick_packer
+from rtloop.recording.file.reader import Reader
+from rtloop.recording.file.tick_packer import TickPacker
+from rtloop.recording.file.topics.format import LAW, TICKS
+from rtloop.signals import DEADLINE
+from tests.recording.hand_made_loop import COLUMNS, START_UNIX_NS, make_rows
+from tests.recording.real_loop import record, scheduled
+
+CHUNKS = 7
+
+
+@pytest.mark.parametrize("message_index", [False, True])
+@pytest.mark.parametrize("workers", [2, 5])
+def test_several_threads_pack_the_bytes_of_one(workers: int, message_index: bool):
+    single, several = (TickPacker(COLUMNS, message_index=message_index, workers=n) for n in (1, workers))
+    rows = make_rows(CHUNKS * single.chunk_rows - 100)
+    parts = np.array_split(rows, np.arange(1, CHUNKS) * single.chunk_rows)
+    alone = chain.from_iterable(single.pack(part, START_UNIX_NS) for part in parts)
+    together = list(several.pack(rows, START_UNIX_NS))
+    assert together == list(alone)
+    assert [chunk.counts for chunk in together] == [{TICKS: len(part)} for part in parts]
+    assert [bool(chunk.indexes) for chunk in together] == [message_index] * CHUNKS
+
+
+def test_a_run_in_virtual_time_has_the_same_bytes_for_any_threads_chunks_that_wait_and_pace(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    """The chunks of ticks are compared; the first chunk holds the time of the run."""
+    files = []
+    for workers, chunks, flush_s in ((1, 1, 0.4), (1, 8, 0.4), (2, 8, -1.0), (4, 3, 0.4)):
+        monkeypatch.setattr(tick_packer, "_default_workers", lambda count=workers: count)
+        monkeypatch.setattr(session, "UNPACED_CHUNKS", chunks)
+        monkeypatch.setattr(session, "FLUSH_S", flush_s)
+        (path,) = record(tmp_path / f"{workers}-{chunks}.mcap", scheduled(), 60_000)
+        files.append(chunks_of_ticks(path))
+    assert len(files[0]) == 15
+    assert all(file == files[0] for file in files)
+
+
+def test_a_snapshot_stands_before_the_chunk_of_its_tick_and_behind_the_chunk_before(tmp_path: Path):
+    (path,) = record(tmp_path / "run.mcap", scheduled(), 60_000)
+    end_ns, snapshots_ns, waiting_ns = -1.0, [], []
+    with Reader(path) as reader:
+        for rows, messages in reader.chunks():
+            waiting_ns += [message.log_time for message in messages if message.channel == LAW]
+            if rows is not None:
+                assert all(end_ns < time_ns <= rows[-1, DEADLINE] for time_ns in waiting_ns)
+                end_ns, snapshots_ns, waiting_ns = rows[-1, DEADLINE], snapshots_ns + waiting_ns, []
+    assert snapshots_ns == [second * 1_000_000_000 for second in range(6)]
+
+
+def chunks_of_ticks(path: Path) -> list[bytes]:
+    """Return the records of the chunks without a message index: those of ticks."""
+    data = path.read_bytes()
+    with Reader(path) as reader:
+        places = [entry.index for entry in reader.entries if entry.index and not entry.index.channels]
+        return [data[place.offset : place.offset + place.length] for place in places]
