@@ -123,7 +123,7 @@ class RunFiles:
     def packing(self, rows: Real, start_unix_ns: int) -> Iterator[None]:
         """Pack rows (n, columns) of ticks on all processors, while the block writes them by `write`, chunk by chunk.
 
-        `start_unix_ns` as in `write`. Without a present file nothing is packed.
+        `start_unix_ns` as in `write`. Without a present file the block runs all the same.
         """
         if self.writer is None:
             yield

@@ -57,7 +57,7 @@ class ChunkContent(NamedTuple):
 
 
 class PackedChunk(NamedTuple):
-    """A chunk as it goes into a file: its record, compressed, and what the index of the file needs.
+    """A chunk that is ready for the file: its compressed record, and the fields of its entry in the index.
 
     `uncompressed_bytes` is the size of its content; `start`, `end`, `counts` and `indexes` are those of ChunkContent.
     """
