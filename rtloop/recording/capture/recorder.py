@@ -34,8 +34,8 @@ from rtloop.recording.capture.selective import SelectiveSession
 from rtloop.recording.capture.session import Options, Session
 from rtloop.recording.errors import RecordingError
 
-POLL_S = 0.2
-"""Pause between two looks at the rings: what a look costs is mostly cold memory, so half as many cost half as much."""
+POLL_S = 0.4
+"""Pause between two looks at the rings: the cost of a look is mostly cold memory, so half as many cost half as much."""
 UNPACED_POLL_S = 0.0002
 ABANDONED_S = 5.0
 """Time without a new tick after which the loop counts as dead, if the supervisor has ended."""
