@@ -41,8 +41,8 @@ from rtloop.recording.file.topics.overview import Intervals
 from rtloop.signals import TICK
 
 FLUSH_S = 0.4
-"""Time after which drained ticks are written: the recorder's pause, so that at most half a second of ticks is not in the
-file. It does not count in virtual time, so that the bytes of the file do not depend on the speed of the machine."""
+"""Time after which drained ticks are written: the recorder's pause, so that at most half a second of ticks is not in
+the file. It does not count in virtual time: the bytes of the file do not depend on the speed of the machine."""
 UNPACED_CHUNKS = 8
 """Number of chunks that wait for each other in virtual time, so that all processors pack them at once."""
 RESUME_FREE_BYTES = 1 << 20
