@@ -8,8 +8,8 @@ from __future__ import annotations
 import os
 import threading
 from collections.abc import Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from functools import cache, partial
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -17,6 +17,9 @@ from rtloop.foundation.arrays import Real
 from rtloop.recording.file.mcap.chunkfile import ChunkContent, PackedChunk, compress_chunk
 from rtloop.recording.file.mcap.container import pack_index
 from rtloop.recording.file.topics import format
+
+if TYPE_CHECKING:
+    from concurrent.futures import ThreadPoolExecutor
 
 MAX_WORKERS = 4
 """More threads would wait for the recorder's first one, which takes the ticks out of the ring."""
@@ -77,4 +80,6 @@ def _default_workers() -> int:
 @cache
 def _threads(count: int) -> ThreadPoolExecutor:
     """Return the process's pool of `count` threads that pack ticks; no thread starts before its first chunk."""
+    from concurrent.futures import ThreadPoolExecutor  # A paced recorder starts without it.
+
     return ThreadPoolExecutor(count, "pack-ticks")
