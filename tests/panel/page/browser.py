@@ -29,6 +29,8 @@ FLAGS = (
 AXE = Path(sys.prefix) / "lib" / "node_modules" / "axe-core" / "axe.min.js"
 """Where `make tools` puts it."""
 WIDTH, HEIGHT = 1400, 900
+DRAW_LESS = "window.requestAnimationFrame = (draw) => setTimeout(() => draw(performance.now()), 100)"
+"""A page draws ten times a second in place of sixty: without a graphics card, drawing costs a processor."""
 PATIENCE_S = 150.0
 """For whatever is waited for: it says nothing of how long it takes."""
 
@@ -78,6 +80,7 @@ def opened(browser: Any, address: str, width: int = WIDTH, height: int = HEIGHT,
     page.faults = []
     page.on("pageerror", lambda error: page.faults.append(f"{error}: {error.stack}"))
     page.on("console", lambda said: page.faults.append(said.text) if "Content Security" in said.text else None)
+    page.add_init_script(DRAW_LESS)
     page.goto(address)
     page.wait_for_selector("body:not(.stale)", timeout=1000 * PATIENCE_S)
     return page
