@@ -89,7 +89,8 @@ def plot(
 ) -> None:
     """Draw signals, timing and events of a recording.
 
-    Writes a picture, or with --html a page, and prints its path; problems of the recording are printed on stderr.
+    Writes a picture, or with --html a page, over an existing one, and prints its path. Problems of the recording are
+    printed on stderr.
     """
     from rtloop.recording.load import load
     from rtloop.recording.views.page import write_page

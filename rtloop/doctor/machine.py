@@ -150,7 +150,8 @@ def idle_states(host: Host, pacing: Pacing) -> Finding:
         is_held_off or longest_us <= SHORT_IDLE_US,
         max(longest_us, 1.0),
         "waking from a deep idle state delays a tick",
-        "sudo cp deploy/systemd/60-rtloop.rules /etc/udev/rules.d/ && sudo udevadm trigger",
+        'echo "KERNEL==\\"cpu_dma_latency\\", GROUP=\\"$(id -gn)\\", MODE=\\"0660\\"" | '
+        "sudo tee /etc/udev/rules.d/61-rtloop-latency.rules && sudo udevadm trigger",
     )
 
 

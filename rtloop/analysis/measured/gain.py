@@ -60,6 +60,10 @@ def static_gain(reference: Real, position: Real, command: Real, rate_hz: float) 
     position_steps, command_steps = (np.delete(np.diff(means), [0, STEPS]) for means in (x, v))
     slopes = position_steps / np.where(command_steps == 0, np.nan, command_steps)
     from_um, to_um = float(reference[0]), float(reference.reshape(2 * STEPS + 1, -1)[STEPS, -1])
+    if np.all(slopes < 0):
+        raise ValueError(
+            "gain: the position falls at every step that raises the command; check the signs of sensor and drive"
+        )
     if not np.all(slopes > 0):
         raise ValueError(
             f"gain: position or command does not follow references of {from_um:g} … {to_um:g} µm; use larger "
