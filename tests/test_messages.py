@@ -131,6 +131,14 @@ def test_a_file_that_is_no_text_is_refused_in_a_sentence(tmp_path: Path) -> None
     assert run("ctl", "retune", "x", "--swap", file).exit_code
 
 
+def test_a_learned_table_is_not_learned_as_a_scan(tmp_path: Path) -> None:
+    file = tmp_path / "learned.csv"
+    file.write_text("1.0, 0.1\n2.0, 0.2\n")
+    result = run("ctl", "learn", "x", file)
+    assert result.exit_code == 2
+    assert f"{file}: two numbers in every line; allowed: one, the reference" in result.stderr
+
+
 def test_a_recording_of_several_axes_needs_the_option_axis(tmp_path: Path) -> None:
     (path,) = record(tmp_path / "run.mcap", TWO_AXES, 200)
     for arguments, fault in (

@@ -46,12 +46,18 @@ def learn(
     from rtloop.design.identification.model_sections import require_new, write_new_file
 
     require_new(out)
-    samples = [number for numbers in read_numbers(file) for number in numbers[:1]]
+    rows = read_numbers(file)
+    if rows and len(rows[0]) != 1:
+        raise click.UsageError(
+            f"{file.name}: two numbers in every line; allowed: one, the reference. A learned table holds the corrected "
+            "reference and a command: learn from the scan that it was made for"
+        )
+    samples = [number for (number,) in rows]
     body = {"axis": axis, "samples": samples, "cycles": cycles, "resonance_percent": resonance_percent}
     content = make_client(context).measure("/learn", body, LONGEST_MEASUREMENT_S)
     if out is not None:
-        rows = zip(content["reference_um"], content["command_um"], strict=True)
-        write_new_file(out, "".join(f"{reference!r}, {command!r}\n" for reference, command in rows))
+        table_rows = zip(content["reference_um"], content["command_um"], strict=True)
+        write_new_file(out, "".join(f"{reference!r}, {command!r}\n" for reference, command in table_rows))
     if as_json:
         echo_json(content)
         return
