@@ -52,9 +52,8 @@ class Options(BaseModel):
                 if abs(number) > LARGEST_INTEGER:
                     raise ValueError(f"an integer is out of range; allowed: integers within ±{LARGEST_INTEGER}")
             elif abs(number) > LARGEST or 0 < abs(number) < SMALLEST:
-                raise ValueError(
-                    f"number {number:g} is out of range; allowed: 0, and magnitudes from {SMALLEST:g} to {LARGEST:g}"
-                )
+                element = "" if number is value else f"{number:g} in the list: "
+                raise ValueError(f"{element}must be 0 or of a magnitude from {SMALLEST:g} to {LARGEST:g}")
         return value
 
     @classmethod
