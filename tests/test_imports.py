@@ -19,6 +19,7 @@ from rtloop.configuration.file import FileOptions
 from rtloop.foundation.native import cache
 from rtloop.foundation.options import Options
 from rtloop.hil.options import PlantOptions, RigOptions
+from tests.recording.real_loop import PAPER, record
 
 ROOT = Path(__file__).parents[1]
 HEAVY = ("scipy.signal", "scipy.stats", "scipy.optimize", "scipy.interpolate", "numba", "matplotlib", "pyarrow")
@@ -57,18 +58,28 @@ def test_nothing_heavy(module: str, others: tuple[str, ...]):
     assert not {*HEAVY, *others} & {*done.stdout.split()}
 
 
-@pytest.mark.parametrize(("arguments", "others"), [(("check", "deploy/paper.toml"), ("scipy", "control", "uvicorn"))])
-def test_nothing_heavy_while_a_command_runs(arguments: tuple[str, ...], others: tuple[str, ...]):
+@pytest.mark.parametrize(
+    ("arguments", "module", "others"),
+    [
+        (("check", "deploy/paper.toml"), "rtloop.workbench.check", ("scipy", "control", "uvicorn")),
+        (("info", "RECORDING", "--json"), "rtloop.recording.views.summary", ("scipy", "rich.console", "uvicorn")),
+        (("replay", "RECORDING", "--json"), "rtloop.workbench.replay", ("scipy", "rich.console", "uvicorn")),
+    ],
+)
+def test_nothing_heavy_while_a_command_runs(
+    arguments: tuple[str, ...], module: str, others: tuple[str, ...], tmp_path: Path
+):
+    (recording,) = record(tmp_path / "run.mcap", PAPER, 20_000)
     program = """
 import atexit, sys
 atexit.register(lambda: print(*sys.modules, file=sys.stderr))
 from rtloop.cli import main
 main(sys.argv[1:])
 """
-    command = [sys.executable, "-c", program, *arguments]
-    done = subprocess.run(command, capture_output=True, text=True, check=True, cwd=ROOT)
+    words = [str(recording) if word == "RECORDING" else word for word in arguments]
+    done = subprocess.run([sys.executable, "-c", program, *words], capture_output=True, text=True, check=True, cwd=ROOT)
     loaded = {*done.stderr.split()}
-    assert "rtloop.workbench.check" in loaded
+    assert module in loaded
     assert not {*HEAVY, *others} & loaded
 
 

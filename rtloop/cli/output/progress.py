@@ -10,10 +10,11 @@ class StatusLine:
 
     def __init__(self, text: str, stream: IO[str]) -> None:
         """Make the line, which a `with` block shows; without a terminal on `stream`, no line is shown."""
-        from rich.console import Console
+        self._status = None
+        if stream.isatty():
+            from rich.console import Console
 
-        console = Console(file=stream, highlight=False)
-        self._status = console.status(text) if console.is_terminal else None
+            self._status = Console(file=stream, highlight=False).status(text)
 
     def __enter__(self) -> Self:
         if self._status:
