@@ -20,7 +20,7 @@ TEXTS = {
     LINK: "too many ticks without an answer in time: the error level has reached driver.error_limit; check the line",
     SILENT: "the node does not answer, or the outputs do not reach the safe values; check the node and the line",
     LINE_GONE: "the serial line has ended: the node was unplugged or has restarted",
-    NOT_A_NUMBER: "a drive is not a number; nothing was sent",
+    NOT_A_NUMBER: "the loop gave a drive voltage that is not a number; the driver sent nothing",
 }
 
 

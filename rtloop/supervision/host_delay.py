@@ -148,7 +148,8 @@ def require_margins(prepared: Prepared) -> None:
             faults.append(f"{key}: the axis's margin is unknown; use a linear controller and a model")
         elif spent.is_spent:
             faults.append(
-                f"{key}: {spent.text}; no margin of stability is left; use a lower rate or a slower controller"
+                f"{key}: {spent.text}; no margin of stability is left; use a slower controller, or reduce the delay as "
+                "`rtloop doctor` says"
             )
     if faults:
         raise ConfigError(configuration.source, faults)

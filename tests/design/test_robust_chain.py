@@ -100,7 +100,7 @@ def test_what_cannot_be_had_is_refused_and_nothing_is_written(recordings, tmp_pa
     refused = automatically(recordings, tmp_path, text)
     assert refused.exit_code == 1, refused.output
     assert "allowed: up to 0.001" in refused.stderr
-    assert "Use wider limits, smaller [scenarios]" in refused.stderr
+    assert "Use wider limits, smaller ranges in [scenarios]" in refused.stderr
     assert not (tmp_path / "made.toml").exists()
 
 

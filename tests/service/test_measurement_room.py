@@ -15,12 +15,13 @@ from tests.paper_configuration import PAPER
 
 
 @pytest.mark.parametrize(("hold_um", "allowed_um", "limit"), [
-    (5.0, 3.0, "sensor's range begins at 2 µm"), (35.0, 5.0, "sensor's range ends at 40 µm"),
+    (5.0, 3.0, "2 µm"), (35.0, 5.0, "40 µm"),
 ])  # fmt: skip
 def test_the_nearer_end_of_the_sensors_range_limits_a_motion(hold_um: float, allowed_um: float, limit: str) -> None:
     (axis,) = load(PAPER).axes
     require_room(axis, (2.0, 40.0), hold_um, allowed_um)
-    with pytest.raises(ConfigError, match=f"allowed: up to {allowed_um:g} µm, limited by axis.x.interlocks.*{limit}"):
+    reason = rf"the distance to {limit}, where the sensor's range ends \(axis\.x\.interlocks\.sensor_min_v and"
+    with pytest.raises(ConfigError, match=f"allowed: up to {allowed_um:g} µm, {reason}"):
         require_room(axis, (2.0, 40.0), hold_um, allowed_um + 0.01)
 
 

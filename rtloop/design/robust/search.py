@@ -101,7 +101,7 @@ def find_robust_controller(design: DesignOptions, progress: Progress = lambda _:
         raise NoController(
             "robust: the best controller found misses limits: "
             + "; ".join(violations)
-            + ". Use wider limits, smaller [scenarios], or more robust.restarts or robust.biquads"
+            + ". Use wider limits, smaller ranges in [scenarios], or more robust.restarts or robust.biquads"
         )
     return RobustDesign(controller, family, walls, proof, len(scenarios))
 

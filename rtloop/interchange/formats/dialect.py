@@ -137,9 +137,8 @@ def _read_sample(path: Path) -> tuple[str, list[str], list[str]]:
     is_complete = len(blocks[0]) == size
     head = texts[0].splitlines()[: None if is_complete else -1]
     if not head:
-        raise UnreadableData(
-            f"{path}: {'empty' if not size else f'the first line is longer than {SAMPLE_BYTES} bytes'}"
-        )
+        fault = f"the first line is longer than {SAMPLE_BYTES} bytes" if size else "empty"
+        raise UnreadableData(f"{path}: {fault}; allowed: a text file with lines of numbers")
     return encoding, head, [line for text in texts[1:] for line in text.splitlines()[1:-1]]
 
 

@@ -131,7 +131,7 @@ def record_run(fd: int, names: RequesterNames | None = None) -> int:
         if (command := orders.next(None)) is None:
             raise RecordingError(
                 "the recorder received no instructions from the supervisor; allowed: one line of JSON with `path` and "
-                "`header` on stdin"
+                "`header` on stdin. `rtloop run` and `rtloop serve` start a recorder and give them"
             )
         header = command["header"]
         session_class = SelectiveSession if header.get("around") else Session

@@ -50,4 +50,4 @@ class TickAccount:
         """
         if self._ticks_logged in (None, self._tick_count):
             return None
-        return f"the file holds {self._tick_count} of the {self._ticks_logged} ticks that were written"
+        return f"the file holds {self._tick_count} ticks; the recorder wrote {self._ticks_logged}"

@@ -158,8 +158,8 @@ class Replay:
         if not self.report.ticks:
             path = self._recording.paths[0]
             raise RecordingError(
-                f"{path}: the recording has no tick after a snapshot of the law, where a replay starts; use a longer "
-                "recording"
+                f"{path}: the recording has no tick after a snapshot of the law (its whole state, once a second), "
+                "where a replay starts; record at least a second more"
             )
         self._check_totals(expected)
         return self.report

@@ -225,7 +225,10 @@ class LiveReferences:
             )
         if reference.kind is not Generator.HOLD:
             kind_name = reference.kind.name.lower()
-            raise Refusal(f"reference of axis {name}: kind is {kind_name}; allowed: hold; use {setpoint}")
+            raise Refusal(
+                f"reference of axis {name}: kind is {kind_name}; allowed: hold, a constant reference; set one with "
+                f"{setpoint}"
+            )
         return reference.value
 
     def generator(self, options: ReferenceOptions) -> tuple[list[Any], Samples]:

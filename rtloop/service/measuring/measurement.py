@@ -140,20 +140,21 @@ def require_room(axis: AxisOptions, ends_um: tuple[float, float], hold_um: float
     """Raise ConfigError for a motion by ±`amplitude_um` about the setpoint `hold_um` that would trip the position
     interlock or leave the sensor's range, `ends_um` (lowest, highest).
     """
-    position_um, sensor = axis.interlocks.position_um, "interlocks.sensor_min_v and sensor_max_v"
+    position_um, keys = axis.interlocks.position_um, f"axis.{axis.name}.interlocks"
+    sensor = f"the sensor's range ends ({keys}.sensor_min_v and sensor_max_v)"
     allowed_um, limit = min(
-        (position_um - abs(hold_um), f"interlocks.position_um = {position_um:g}"),
-        (hold_um - ends_um[0], f"{sensor}, the sensor's range begins at {ends_um[0]:.4g} µm"),
-        (ends_um[1] - hold_um, f"{sensor}, the sensor's range ends at {ends_um[1]:.4g} µm"),
+        (position_um - abs(hold_um), f"±{position_um:g} µm, where {keys}.position_um trips"),
+        (hold_um - ends_um[0], f"{ends_um[0]:.4g} µm, where {sensor}"),
+        (ends_um[1] - hold_um, f"{ends_um[1]:.4g} µm, where {sensor}"),
     )
     if allowed_um <= 0:
-        fault = f"the setpoint {hold_um:g} µm leaves no room for a motion, limited by axis.{axis.name}.{limit}"
+        fault = f"the setpoint {hold_um:g} µm leaves no room for a motion before {limit}"
         raise ConfigError("request", [f"response: {fault}; use another setpoint"])
     if amplitude_um > allowed_um:
-        fault = (
-            f"amplitude_um: {amplitude_um:g} µm about the setpoint {hold_um:g} µm; allowed: up to {allowed_um:.4g} µm"
+        fault = f"amplitude_um: {amplitude_um:g} µm about the setpoint {hold_um:g} µm"
+        raise ConfigError(
+            "request", [f"response: {fault}; allowed: up to {allowed_um:.4g} µm, the distance to {limit}"]
         )
-        raise ConfigError("request", [f"response: {fault}, limited by axis.{axis.name}.{limit}"])
 
 
 def _line_grid(request: ResponseRequest, rate_hz: float, near_hz: float | None, half_width_hz: float) -> LineGrid:
