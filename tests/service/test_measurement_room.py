@@ -28,7 +28,7 @@ def test_the_nearer_end_of_the_sensors_range_limits_a_motion(hold_um: float, all
 @pytest.mark.parametrize("hold_um", [1.0, 41.0, 45.0])
 def test_a_setpoint_beyond_an_end_leaves_no_room(hold_um: float) -> None:
     (axis,) = load(PAPER).axes
-    refusal = rf"response: the setpoint {hold_um:g} µm leaves no room .* axis\.x\.interlocks\..*; use another setpoint"
+    refusal = rf"response: the setpoint {hold_um:g} µm leaves no room .*axis\.x\.interlocks\..*; use another setpoint"
     with pytest.raises(ConfigError, match=refusal):
         require_room(axis, (2.0, 40.0), hold_um, 0.1)
 
