@@ -236,7 +236,10 @@ def _empty_file(fd: int, path: Path, folder: os.stat_result) -> int:
     if not _is_own(status):
         reason = _foreign_owner_text(status)
     elif stat.S_ISREG(status.st_mode) and status.st_nlink > 1 and folder.st_mode & _OTHERS_WRITE:
-        reason = "the file has several names (hard links) in a folder to which other users may write; remove the file"
+        reason = (
+            "the file has other names (hard links), and other users may write to its folder, so that one of them may "
+            "have put it there; remove this name of it: its other names keep the content"
+        )
     else:
         if stat.S_ISREG(status.st_mode):
             os.ftruncate(fd, 0)
