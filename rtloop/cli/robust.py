@@ -184,7 +184,9 @@ def _print_robust(robust: RobustDesign) -> None:
 
 
 def print_taps(tap_design: TapDesign, subject: Subject, *, to_stderr: bool = True) -> None:
-    """Print settling time, overshoot and range of v of the taps, and the trade-off if it was computed.
+    """Print settling time, overshoot and range of the command v of taps, for the plants and bounds of `subject`.
+
+    The least overshoot for each settling time is printed too, if it was computed.
 
     The lines go to stderr, which leaves stdout to another result, or to stdout if `to_stderr` is False.
     """

@@ -104,7 +104,10 @@ def _apply_schedule(loop):
 
 @jit_rare_checked
 def _apply_queue(loop):
-    """Take at most COMMANDS_PER_TICK commands from the queue, and apply those that were not withdrawn."""
+    """Take at most COMMANDS_PER_TICK commands from the queue, and apply those that were not withdrawn.
+
+    A command that is refused has an event.
+    """
     words, queue = control_words(loop), message_array(loop.commands, loop.command_count)
     marks = word_array(loop.commands_marks, loop.command_count)
     tail = words[TAIL]

@@ -235,8 +235,8 @@ def _control_axis(law, a):
 
 @jit_rare
 def _evaluate_coupled(law, first, count, loop, references):
-    """Set commands and drives of the `count` axes from `first` on, which share a controller; if its law fails, trip the
-    loop.
+    """Set the commands (controller's output, µm) and the drives (V) of the `count` axes from `first` on, which share a
+    controller; if its law fails, trip the loop.
     """
     if loop.mode == CLOSED_LOOP and not _control_coupled(law, first, count):
         _trip_on_law_failure(loop)

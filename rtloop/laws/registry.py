@@ -198,7 +198,7 @@ def _line(error: Exception, file: str) -> str:
 def _message(error: Exception) -> str:
     """Return type and words of an exception on one line.
 
-    For a name that cannot be imported, the other file's path is left out and a similar name suggested.
+    If a name cannot be imported from a module, the path of this module is left out, and a similar name is suggested.
     """
     words = error.msg if isinstance(error, SyntaxError | ImportError) else str(error)
     text = f"{type(error).__name__}: {' '.join(str(words).split())}"

@@ -64,8 +64,8 @@ def decaying_sine(options: DepolariseOptions, rate_hz: float) -> npt.NDArray[np.
 
 
 def await_ticks(supervisor: Supervisor, count: int, rate_hz: float, raw_from_tick: int | None = None) -> None:
-    """Wait until `count` more ticks were executed. Raises Refusal after a trip, and after TIMEOUT_FACTOR times their
-    nominal time plus 1 s.
+    """Wait until `count` more ticks were executed. Raises Refusal after a trip, and after 1 s plus TIMEOUT_FACTOR times
+    the time that the ticks take at `rate_hz`.
 
     With `raw_from_tick`, raises Refusal also if a tick after that one has another mode than raw: a client set it.
     """

@@ -157,9 +157,10 @@ def _wired_outputs(driver: Driver) -> dict[str, Channel]:
 
 
 def _require_short_ramp(hardware: Hardware, driver: Driver) -> None:
-    """Raise ValueError if even the shortest ramp of an output, from the end of its range to safe, takes too long.
+    """Raise ValueError if the slew rate in the hardware's note is too slow to ramp any output down in time.
 
-    The note of the hardware has one slew rate, the slowest axis's, and does not name this axis.
+    The output with the shortest way from an end of its range to its safe value is judged: the note has one slew rate,
+    the slowest axis's, and does not name this axis.
     """
     outputs = _wired_outputs(driver).values()
     nearest = min(outputs, key=lambda output: max(output.maximum_v - output.safe_v, output.safe_v - output.minimum_v))

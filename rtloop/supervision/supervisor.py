@@ -192,7 +192,7 @@ class Supervisor:
             self.close()
 
     def _report_progress(self, on_progress: Callable[[Supervisor], None] | None, end_event: threading.Event) -> None:
-        """Call `on_progress`, if there is one, every PROGRESS_PERIOD_S until `end_event`."""
+        """Call `on_progress` every PROGRESS_PERIOD_S until `end_event` is set; with None, return at once."""
         while on_progress is not None and not end_event.wait(PROGRESS_PERIOD_S):
             on_progress(self)
 

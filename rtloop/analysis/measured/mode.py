@@ -121,7 +121,9 @@ class _ModeFit:
         return self._residuals(np.hstack([mode, self._smooth]))
 
     def smooth_residuals(self) -> Complex:
-        """Return complex residuals (k,), in standard deviations, of the best fit without a mode."""
+        """Return complex residuals of the best fit without a resonant mode, one for each measured frequency (k,), in
+        standard deviations of the measurement.
+        """
         return self._residuals(self._smooth)
 
     def _residuals(self, rows: Complex) -> Complex:

@@ -232,7 +232,9 @@ def _least_damped_mode(robust: RobustDesign) -> tuple[float, float]:
 
 
 def _candidate_designs(design: DesignOptions) -> Iterator[DesignOptions]:
-    """Yield the requested design, or, without [scenarios], one design for each of RANGES_PERCENT, widest first."""
+    """Yield the requested design. If it has no [scenarios], yield it once for each range of the plant's resonance in
+    RANGES_PERCENT, widest first.
+    """
     if "scenarios" in design.model_fields_set:
         yield design
         return

@@ -119,8 +119,10 @@ class Programme:
         return None if solved is None else self._split_taps(solved)
 
     def quietest_taps(self, settling: float, overshoot: float) -> Taps | None:
-        """Return the taps of least variation of v on the model that settle in `settling` ticks, with an overshoot up to
-        USED_SHARE of `overshoot`; None if there are none. Raises NoDesign if no solver finishes.
+        """Return the taps whose step on the model settles in `settling` ticks, with an overshoot up to USED_SHARE of
+        `overshoot`, and with the least total variation of the command v; None if no taps do.
+
+        Raises NoDesign if no solver finishes.
         """
         rows = self._penalty_rows()
         weights = np.where(np.arange(rows.shape[0]) < rows.shape[0] - 2 * self.taps, 1.0, TAP_WEIGHT)

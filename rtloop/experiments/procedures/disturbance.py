@@ -58,7 +58,7 @@ def runs(options: DisturbanceOptions, setting: Setting) -> list[Run]:
 def _plan_run(
     label: str, change: dict[str, float], duration_s: float, setting: Setting, settle_s: float, **values: Any
 ) -> Run:
-    """Return a run with one disturbance, which begins after the rest, measured for `duration_s` after `settle_s`.
+    """Return a run with one disturbance: REST_S without it, `settle_s` with it, then `duration_s` that are measured.
 
     `change` are options of the rig's disturbance; `values` are stored with the segment for the analysis.
     """

@@ -132,7 +132,8 @@ def intrinsic(function: Callable[..., Any], uncompiled: Callable[..., Any] | Non
     """Make a name for kernels from a function that generates its LLVM code.
 
     The function's first parameter is the module `native.compiler`; kernels leave it out. It returns signature and code
-    generator, or None for argument types that it does not take. `uncompiled` is its Python equivalent, if any.
+    generator, or None for argument types that it does not take. `uncompiled` is its Python equivalent for kernels that
+    run without compilation; without one they cannot call the name.
     """
 
     def resolve_type(compiler: Any) -> Any:

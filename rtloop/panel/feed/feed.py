@@ -41,7 +41,7 @@ class Follower(Protocol):
         ...
 
     def end_run(self, past: TickHistory) -> None:
-        """End the run, whose last ticks are in `past`."""
+        """End the run, before `past`, which has its last ticks, holds another run."""
         ...
 
 

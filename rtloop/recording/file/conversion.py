@@ -78,7 +78,8 @@ def _copy(source: McapSource) -> int:
 
 
 def _convert(source: McapSource, conversion: _Conversion) -> int:
-    """Add all messages of a file to its conversion; return the descriptor of the finished copy.
+    """Add all messages of a file that another tool wrote to its conversion. Returns the descriptor of the finished
+    copy, a file in rtloop's own layout, which the caller closes.
 
     Raises RecordingError for a damaged file, and for one without a recording or with several; OutputError or OSError
     for a copy that cannot be written or opened.

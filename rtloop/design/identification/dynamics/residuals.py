@@ -43,10 +43,12 @@ class ResidualTests:
 
 
 def residual_tests(u: Real, errors: Real, unknowns: int, lags: int = LAGS) -> ResidualTests:
-    """Return tests of `errors` (N,) for whiteness and against the changes of the input `u` (N,), at lags 1 … `lags`.
+    """Return two tests of prediction errors (N,), at lags 1 … `lags`: for whiteness (Ljung-Box), and for correlation
+    with the changes of the input `u` (N,).
 
-    Changes of the input, because a level that lasts correlates with any slow drift. A third of `unknowns`, the number
-    of the model's unknowns, counts as the noise model's.
+    The changes are used because a level that lasts correlates with any slow drift. `unknowns` is the number of the
+    model's unknowns; a third of them, which the noise model has, lessens the degrees of freedom of the test for
+    whiteness.
     """
     change = np.diff(u, prepend=0.0)
     autocorrelation, input_correlation = _correlations(errors, errors, lags), _correlations(change, change, lags)
