@@ -214,17 +214,19 @@ class RecordingTotals:
         if "periods_missed" in column:
             self.periods_missed += int(column["periods_missed"].sum())
         flags = column["flags"].astype(np.int64) if "flags" in column else np.zeros(0, np.int64)
-        self.overruns += int(np.count_nonzero(flags & Flag.OVERRUN))
-        for name, flag in LIMIT_FLAGS.items():
-            self.limited_ticks[name] += int(np.count_nonzero(flags & flag))
+        has_flags = bool(flags.any())
+        if has_flags:
+            self.overruns += int(np.count_nonzero(flags & Flag.OVERRUN))
+            for name, flag in LIMIT_FLAGS.items():
+                self.limited_ticks[name] += int(np.count_nonzero(flags & flag))
         for name in self.histograms.keys() & column.keys():
             self.histograms[name].add(column[name])
         is_closed_loop = column["mode"] == Mode.CLOSED_LOOP if "mode" in column else None
         if is_closed_loop is not None and flags.size:
             self.closed_ticks += int(np.count_nonzero(is_closed_loop))
-            self.saturated_ticks += int(
-                np.count_nonzero(flags[is_closed_loop] & (Flag.COMMAND_LIMITED | Flag.DRIVE_LIMITED))
-            )
+            if has_flags:
+                saturated = flags[is_closed_loop] & (Flag.COMMAND_LIMITED | Flag.DRIVE_LIMITED)
+                self.saturated_ticks += int(np.count_nonzero(saturated))
         with np.errstate(over="ignore", invalid="ignore"):  # A recording may hold any double.
             for axis in self.axes:
                 axis.add(column, is_closed_loop)
@@ -357,7 +359,7 @@ def _sum_ticks(readers: Sequence[Reader], progress: ReportTicks | None) -> Recor
         names = [*readers[0].columns]
     for rows in (rows for reader in readers for rows in reader.blocks(names)):
         ticks_before = totals.ticks
-        totals.add(dict(zip(names, rows.T, strict=True)))
+        totals.add(dict(zip(names, np.ascontiguousarray(rows.T), strict=True)))
         if progress and ticks_before // PROGRESS_TICKS < totals.ticks // PROGRESS_TICKS:
             progress(totals.ticks)
     return totals
