@@ -359,7 +359,7 @@ def _sum_ticks(readers: Sequence[Reader], progress: ReportTicks | None) -> Recor
         names = [*readers[0].columns]
     for rows in (rows for reader in readers for rows in reader.blocks(names)):
         ticks_before = totals.ticks
-        totals.add(dict(zip(names, np.ascontiguousarray(rows.T), strict=True)))
+        totals.add(dict(zip(names, rows.T, strict=True)))
         if progress and ticks_before // PROGRESS_TICKS < totals.ticks // PROGRESS_TICKS:
             progress(totals.ticks)
     return totals
