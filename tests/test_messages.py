@@ -113,12 +113,19 @@ def test_a_configuration_without_the_controller_is_a_fault_of_it(axis: str, file
     assert message in result.stderr
 
 
-def test_a_usage_error_names_the_line_of_a_waveform(tmp_path: Path) -> None:
-    file = tmp_path / "wave.txt"
-    file.write_text("1.0\n\nabc\n")
-    result = run("ctl", "waveform", "x", file)
+@pytest.mark.parametrize(
+    ("command", "content", "fault"),
+    [
+        ("waveform", "1.0\n\nabc\n", ", line 3: 'abc'; allowed: numbers"),
+        ("learn", "1.0, 0.1\n2.0, 0.2\n", ": two numbers in every line; allowed: one, the reference"),
+    ],
+)
+def test_a_file_of_wrong_numbers_is_a_usage_error(command: str, content: str, fault: str, tmp_path: Path) -> None:
+    file = tmp_path / "numbers.txt"
+    file.write_text(content)
+    result = run("ctl", command, "x", file)
     assert result.exit_code == 2
-    assert f"{file}, line 3: 'abc'; allowed: numbers" in result.stderr
+    assert f"{file}{fault}" in result.stderr
 
 
 def test_a_file_that_is_no_text_is_refused_in_a_sentence(tmp_path: Path) -> None:
@@ -129,14 +136,6 @@ def test_a_file_that_is_no_text_is_refused_in_a_sentence(tmp_path: Path) -> None
         assert result.exit_code == 2, command
         assert f"{file}, line 2: '��2'; allowed: numbers" in result.stderr
     assert run("ctl", "retune", "x", "--swap", file).exit_code
-
-
-def test_a_learned_table_is_not_learned_as_a_scan(tmp_path: Path) -> None:
-    file = tmp_path / "learned.csv"
-    file.write_text("1.0, 0.1\n2.0, 0.2\n")
-    result = run("ctl", "learn", "x", file)
-    assert result.exit_code == 2
-    assert f"{file}: two numbers in every line; allowed: one, the reference" in result.stderr
 
 
 def test_a_recording_of_several_axes_needs_the_option_axis(tmp_path: Path) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import os
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -12,6 +11,7 @@ from typing import IO, Any
 import numpy as np
 
 from rtloop.foundation.arrays import Real
+from rtloop.foundation.processors import usable_processors
 
 COUNTS = frozenset({"tick", "deadline_ns", "periods_missed", "flags", "mode", "driver_status"})
 """Signals that are whole numbers."""
@@ -42,8 +42,7 @@ def _formatter() -> tuple[FormatRows, int]:
         import pyarrow.csv  # noqa: F401
     except ImportError:
         return _format_in_python, 1
-    usable = os.sched_getaffinity(0) if hasattr(os, "sched_getaffinity") else range(os.cpu_count() or 1)
-    return _format_in_pyarrow, len(usable)
+    return _format_in_pyarrow, usable_processors()
 
 
 def _format_in_order(

@@ -5,7 +5,6 @@ numpy and zstd release the interpreter's lock, so that several threads work at t
 
 from __future__ import annotations
 
-import os
 import threading
 from collections.abc import Iterator, Sequence
 from functools import cache, partial
@@ -14,6 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from rtloop.foundation.arrays import Real
+from rtloop.foundation.processors import usable_processors
 from rtloop.recording.file.mcap.chunkfile import ChunkContent, PackedChunk, compress_chunk
 from rtloop.recording.file.mcap.container import pack_index
 from rtloop.recording.file.topics import format
@@ -73,8 +73,7 @@ class TickPacker:
 
 def _default_workers() -> int:
     """Return the number of processors that this process may use, at most MAX_WORKERS."""
-    usable = os.sched_getaffinity(0) if hasattr(os, "sched_getaffinity") else range(os.cpu_count() or 1)
-    return min(len(usable), MAX_WORKERS)
+    return min(usable_processors(), MAX_WORKERS)
 
 
 @cache
