@@ -13,8 +13,9 @@ from rtloop.recording.file import tick_packer
 from rtloop.recording.file.reader import Reader
 from rtloop.recording.file.tick_packer import TickPacker
 from rtloop.recording.file.topics.format import LAW, TICKS
+from rtloop.recording.file.writer import Writer
 from rtloop.signals import DEADLINE
-from tests.recording.hand_made_loop import COLUMNS, START_UNIX_NS, make_rows
+from tests.recording.hand_made_loop import COLUMNS, START_UNIX_NS, make_header, make_rows
 from tests.recording.real_loop import record, scheduled
 
 CHUNKS = 7
@@ -66,3 +67,17 @@ def chunks_of_ticks(path: Path) -> list[bytes]:
     with Reader(path) as reader:
         places = [entry.index for entry in reader.entries if entry.index and not entry.index.channels]
         return [data[place.offset : place.offset + place.length] for place in places]
+
+
+def test_ticks_that_were_packed_and_not_written_are_not_written_later(tmp_path: Path):
+    """A write that fails ends the block early; what follows it are other ticks."""
+    writer = Writer(tmp_path / "run.mcap", make_header(), START_UNIX_NS)
+    count = TickPacker(COLUMNS).chunk_rows
+    rows = make_rows(4 * count)
+    with writer.packing(rows[: 3 * count]):
+        writer.write([], rows[:count])
+    writer.write([], rows[3 * count :])
+    writer.close()
+    with Reader(writer.part, tolerant=True) as reader:
+        ticks = np.concatenate([block[:, 0] for block in reader.blocks()])
+    assert ticks.tolist() == [*range(count), *range(3 * count, 4 * count)]
