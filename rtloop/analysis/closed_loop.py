@@ -56,8 +56,8 @@ class Loop:
     reference: ReferencePath = UNFILTERED
 
     def open(self, hz: npt.ArrayLike) -> Complex:
-        """Return the open loop L = C·D at frequencies (k,) in Hz, complex (k,). In discrete time, D includes hold and
-        delay.
+        """Return L = C·D at frequencies (k,) in Hz, complex (k,): controller C and plant D, in discrete time D with its
+        hold and delay.
         """
         points = self._points(hz)
         return self.controller.response(points) * self.plant.response(points)

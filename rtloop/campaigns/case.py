@@ -121,8 +121,8 @@ class CaseRunner:
         """Run all experiments of a rig; return its figures and verdict, with a `refusal` for a rig that cannot run.
 
         `values` by key replace all drawn ones; of a key that they lack, also of "driver.seed", the configured value
-        counts. Raises RuntimeError if the rig that runs has another value than the one given or drawn; without
-        `values`, raises as `sample_values`.
+        counts. Raises RuntimeError if the rig that runs has another value than the one given or drawn, and without
+        `values` ValueError for a rig whose values cannot be drawn, see `sample_values`.
         """
         drawn = self.sample_values(rig) if values is None else dict(values)
         try:

@@ -348,7 +348,11 @@ def _first_rig(path: Path) -> int:
 
 @contextmanager
 def open_store(folder: Path, campaign: Campaign, nominal: Mapping[str, Any]) -> Iterator[Store]:
-    """Open the store of a campaign for a block; raises as Store does."""
+    """Open the store of a campaign's results in `folder` for a block, and close it.
+
+    `nominal` has the configured value of each uncertain key. Raises UnavailableError while another process uses the
+    folder, and the other errors of Store.
+    """
     store = Store(folder, campaign, nominal)
     try:
         yield store

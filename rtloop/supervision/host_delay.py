@@ -93,7 +93,10 @@ def store_host_delay(configuration: Configuration, **figures: Any) -> None:
 
 
 def load_host_delay(configuration: Configuration) -> HostDelay | None:
-    """Return the delay measured at the configuration's rate; None without a valid file that can be read."""
+    """Return the delay that was stored on this host for the configuration's name and rate.
+
+    None where no such file can be read, or where its delay was measured at another rate.
+    """
     for folder in dict.fromkeys((runtime_folder(), *client_folders())):
         try:
             with os.fdopen(open_file(folder / _file_name(configuration), os.O_RDONLY), "rb") as file:

@@ -48,9 +48,10 @@ class Certificate(NamedTuple):
         return self.radius.value < 1
 
     def violations(self, walls: Walls, decay_ms: float | None) -> list[str]:
-        """Return a text for each violated limit, of `walls` and of `decay_ms` (None: no limit); [] if there is none.
+        """Return a text for each limit that a scenario exceeds; [] if there is none.
 
-        If a loop is unstable, the only text says so.
+        `walls` limit |S|, |S| at the disturbance and the noise gain; `decay_ms` limits the slowest mode's time constant
+        (None: no limit). If a loop is unstable, the only text says so.
         """
         if not self.is_stable:
             return [f"unstable with {self.radius.scenario} (largest |pole| {self.radius.value:.5f})"]

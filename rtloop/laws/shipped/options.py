@@ -35,7 +35,7 @@ class PrandtlIshlinskiiOptions(FeedforwardOptions):
 
     @model_validator(mode="after")
     def _check(self) -> Self:
-        """Require either a forward model that has an inverse, or an inverse; 'exact' with a forward model only."""
+        """Require either an invertible forward model or an inverse; `dead_band` = "exact" needs the forward model."""
         self.models()
         if self.dead_band == "exact" and not self.thresholds_v:
             raise ValueError("dead_band: 'exact' needs thresholds_v; add it, or use dead_band = 'none'")
