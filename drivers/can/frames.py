@@ -102,7 +102,7 @@ class Exchange(NamedTuple):
 
     @property
     def channel_capacity(self) -> int:
-        """Number of channels for which each frame of the DBC has room; the first `channels` are used, the others carry 0."""
+        """Number of channels for which each frame has room; the first `channels` are used, the others carry 0."""
         return len(self.drive.signals) - 1
 
     def max_rate_hz(self, options: BusOptions) -> float:

@@ -136,8 +136,8 @@ def _estimate_text(sampling: str, estimate: Yield, rigs: int) -> str:
     `rigs` is the number of all sampled rigs, of which `estimate` counts only some for "saltelli".
     """
     text = (
-        "The yield estimates the share of rigs that pass among all rigs that are drawn from these distributions and "
-        "can run. The interval is that of Clopper and Pearson (1934)"
+        "The yield estimates the share of rigs that pass, among all rigs that are drawn from these distributions. "
+        "Refused rigs, whose configuration cannot run, do not count. The interval is that of Clopper and Pearson (1934)"
     )
     if sampling == "random":
         return f"{text}: this interval contains the true share in at least 95 % of campaigns."

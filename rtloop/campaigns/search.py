@@ -201,7 +201,13 @@ def _check_search(runner: CaseRunner, figure: str) -> None:
     if figure and figure not in options.figures:
         raise ConfigError(name, [f"figure: {figure!r}; allowed: {', '.join(options.figures)}"])
     if not figure and not runner.campaign.limits:
-        raise ConfigError(name, ["limits: none; set [limits] in the campaign's file, or choose a figure with --figure"])
+        raise ConfigError(
+            name,
+            [
+                "limits: the campaign has none by which rigs could be ranked; set [limits] in its file, or name the "
+                f"result to maximise with --figure: {', '.join(options.figures)}"
+            ],
+        )
     words = [key for key, distribution in options.uncertain.items() if not distribution.is_numeric]
     if words:
         raise ConfigError(

@@ -127,7 +127,7 @@ def _serve_board(configuration: Configuration, axes: list[str], is_stopped: Call
     rate_hz = options.board_rate_hz or configuration.loop.rate_hz
     prepare_realtime(Pacing(rate_hz, priority=BOARD_PRIORITY))
     extent = f"{count_text(len(axes), 'channel')} at {rate_hz:g} Hz"
-    click.echo(f"board at {options.file}: {extent}; Ctrl-C ends the board", err=True)
+    click.echo(f"the simulated board runs, {extent}, in shared memory {options.file}; Ctrl-C ends it", err=True)
     try:
         samples = serve(Path(options.file), options, axes, rate_hz, is_stopped, lambda: Notifier().send(READY=1))
     except ValueError as error:

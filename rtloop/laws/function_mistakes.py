@@ -100,7 +100,10 @@ def _wrong_fields(function: ast.FunctionDef, parameters: Mapping[str, _Parameter
             yield Mistake(node.lineno, f"{field}: a {noun} cannot be set; store the value in the state")
         elif node.attr in undefined:
             allowed = ", ".join(f"{record}.{name}" for name in fields if name not in (*undefined, "outputs"))
-            message = f"{field}: has no value in {function.name}, only in update and enter; allowed here: {allowed}"
+            message = (
+                f"{field}: has no value in the function {function.name}, only in the functions update and enter; "
+                f"allowed here: {allowed}"
+            )
             yield Mistake(node.lineno, message)
 
 

@@ -46,5 +46,7 @@ def _stage_text(name: str, stage: Configuration) -> str:
     gains = {key: old[key] for key in ("kp", "ki_per_s") if key in old} if old.get("kind") == "pid" else {}
     axis.pop("prefilter", None)
     axis["controller"] = {"file": f"{name}.py", "ki_per_s": SLOW_KI_PER_S, **gains}
-    comments = [f"The law of {name}.py on the stage of {stage.source}: rtloop check {name}.toml"]
+    comments = [
+        f"Controller: the law in {name}.py. Stage: that of {stage.source}. To check this file: rtloop check {name}.toml"
+    ]
     return edit_text(remove_first_comments(stage.text), table, comments, ["controller"])

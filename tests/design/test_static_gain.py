@@ -56,7 +56,7 @@ def test_its_standard_deviation_is_that_of_a_mean_of_slopes():
 
 @pytest.mark.parametrize(
     ("factor", "problem"),
-    [(-1.0, "falls at every step that raises the command"), (0.0, "does not follow references of 0 … 10")],
+    [(-1.0, "falls at every step that raises the command"), (0.0, "did not move command and position in one")],
 )
 def test_a_position_that_does_not_follow_is_refused(factor: float, problem: str):
     reference = staircase(0.0, 10.0, RATE_HZ)

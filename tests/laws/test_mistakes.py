@@ -48,14 +48,14 @@ TYPOS = {
         "told.error_um + s.integral_um\n",
         "told.error_um + told.command_um\n",
         RETURN,
-        r"told\.command_um: has no value in output, only in update and enter; "
+        r"told\.command_um: has no value in the function output, only in the functions update and enter; "
         r"allowed here: told\.reference_um, told\.position_um, told\.error_um, told\.inputs$",
     ),
     "a drive that is not yet applied": (
         "told.error_um + s.integral_um\n",
         "(told.applied_um - s.integral_um)\n",
         RETURN,
-        r"told\.applied_um: has no value in output, only in update and enter",
+        r"told\.applied_um: has no value in the function output, only in the functions update and enter",
     ),
     "a coefficient": ("c.kp * told", "c.kpp * told", RETURN, r"c\.kpp: unknown coefficient; did you mean c\.kp\?"),
     "an undeclared state": (
@@ -168,7 +168,7 @@ def test_a_typo_is_one_sentence_with_its_line(name: str, tmp_path: Path) -> None
 
 
 @pytest.mark.parametrize(
-    ("name", "message"), [("command_um", None), ("applied_um", "told.applied_um: has no value in")]
+    ("name", "message"), [("command_um", None), ("applied_um", "told.applied_um: has no value in the function")]
 )
 def test_a_coupled_output_may_use_the_commands_that_it_sets(name: str, message: str | None) -> None:
     class Pair(CoupledController):

@@ -66,8 +66,8 @@ def static_gain(reference: Real, position: Real, command: Real, rate_hz: float) 
         )
     if not np.all(slopes > 0):
         raise ValueError(
-            f"gain: position or command does not follow references of {from_um:g} … {to_um:g} µm; use larger "
-            "steps (gain_um)"
+            f"static gain: a step of the reference between {from_um:g} and {to_um:g} µm did not move command and "
+            "position in one direction; use larger steps (gain_um)"
         )
     value = float(np.abs(position_steps).sum() / np.abs(command_steps).sum())
     return StaticGain(value, float(slopes.std(ddof=1)) / float(np.sqrt(slopes.size)), from_um, to_um)

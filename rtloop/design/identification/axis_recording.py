@@ -209,7 +209,7 @@ def excitation_warnings(runs: Sequence[AxisRecording]) -> list[str]:
         if run.is_closed_loop:
             cause = "a controller computed the drive (mode closed_loop)"
             effect = (
-                "Identification takes the controller's response to noise and to the stage's dynamics for hysteresis"
+                "The controller also responds to noise and to the stage's dynamics, which then look like hysteresis"
             )
             sentences.append(f"{run.name}: {cause}. {effect}. {remedy}")
         elif jumps(run):
