@@ -123,6 +123,11 @@ class Service:
         """Request the end: the loop ramps down, the recording is finished, `run` returns."""
         self._end_requested.set()
 
+    @property
+    def is_ending(self) -> bool:
+        """Whether the end was requested; the loop may still ramp down."""
+        return self._end_requested.is_set()
+
     def request_reload(self) -> None:
         """Request that `run` reads the configuration file again and applies it, in a separate thread."""
         self._reload_requested.set()

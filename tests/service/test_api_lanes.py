@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 
 from rtloop.service.api.application import application
+from rtloop.service.desk import Refusal
 from rtloop.service.lock import Lock
 
 PATIENCE_S = 20.0
@@ -27,6 +28,7 @@ class Stuck:
         return {}
 
     start = reload_now
+    is_ending = False
 
     def stop(self) -> int:
         self.stopped += 1
@@ -68,3 +70,19 @@ def test_stop_and_reset_wait_for_nobody(path):
         return said
 
     assert asyncio.run(crowd()) == [200, 200]
+
+
+class EndingService:
+    """A service whose loop ramps down: `start` is refused because of the mode, as a measurement is."""
+
+    def __init__(self, is_ending: bool) -> None:
+        self.is_ending, self.lock = is_ending, Lock()
+
+    def start(self) -> int:
+        raise Refusal("start: the mode is not closed_loop but off")
+
+
+@pytest.mark.parametrize(("is_ending", "code"), [(True, 503), (False, 409)])
+def test_a_refusal_by_a_service_that_ends_names_the_end(is_ending: bool, code: int):
+    app = application(EndingService(is_ending))  # type: ignore[arg-type]
+    assert asyncio.run(post(app, "/start")) == code

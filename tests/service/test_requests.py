@@ -17,7 +17,9 @@ from rtloop.service.api.requests import REQUESTS
 from rtloop.service.lock import Lock
 
 SERVICE: Any = SimpleNamespace(
-    configuration=SimpleNamespace(axes=[SimpleNamespace(name="x"), SimpleNamespace(name="y")]), lock=Lock()
+    is_ending=False,
+    configuration=SimpleNamespace(axes=[SimpleNamespace(name="x"), SimpleNamespace(name="y")]),
+    lock=Lock(),
 )
 PATHS = openapi(["x", "y"])["paths"]
 

@@ -25,6 +25,7 @@ from rtloop.service.api.error_responses import error_response, message_response
 from rtloop.service.api.lanes import Lane, Lanes
 from rtloop.service.api.requester import authorise, watch_client
 from rtloop.service.api.requests import REQUESTS, ApiRequest
+from rtloop.service.desk import Refusal
 from rtloop.service.service import Service
 from rtloop.service.status import newest_signals
 
@@ -160,7 +161,7 @@ async def _answer_request(
         if isinstance(content, str):
             return PlainTextResponse(content, media_type=request.media_type)
         return JSONResponse(content)
-    except asyncio.CancelledError:  # The server ends while the client still waits.
-        return message_response(503, f"{request.name}: the service is ending and takes no more requests")
-    except Exception as error:
+    except (asyncio.CancelledError, Exception) as error:  # Cancelled: the server ends while the client still waits.
+        if isinstance(error, asyncio.CancelledError) or (isinstance(error, Refusal) and service.is_ending):
+            return message_response(503, f"{request.name}: the service is ending and takes no more requests")
         return error_response(error)

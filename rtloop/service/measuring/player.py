@@ -163,5 +163,9 @@ class Player:
 
     def _require_closed_loop(self, rows: Real) -> None:
         """Raise Refusal if any of the records `rows` (ticks, columns) has another mode than closed_loop."""
-        if np.any(rows[:, signals.MODE] != Mode.CLOSED_LOOP):
+        modes = rows[:, signals.MODE]
+        if np.any(modes == Mode.OFF):
+            remedy = "`rtloop ctl start`, or in a running loop `rtloop ctl mode closed_loop`"
+            raise Refusal(f"{self._activity}: the mode is not closed_loop but off; use {remedy} first")
+        if np.any(modes != Mode.CLOSED_LOOP):
             raise Refusal(f"{self._activity}: the mode is not closed_loop; use `rtloop ctl mode closed_loop` first")
