@@ -42,7 +42,9 @@ class Bench:
         self.lock = Lock(self.clock)
         self.work_s, self.meanwhile = 0.0, lambda: None
         options = SimpleNamespace(service=SimpleNamespace(emergency_key_sha256=DIGEST), axes=[])
-        service: Any = SimpleNamespace(lock=self.lock, configuration=options, arm=self._arm, stop=lambda: 7)
+        service: Any = SimpleNamespace(
+            lock=self.lock, configuration=options, arm=self._arm, stop=lambda: 7, is_ending=False
+        )
         self._application = application(service)
 
     def _arm(self) -> None:
