@@ -60,9 +60,9 @@ def judge_write(evidence, levels, volts, written_ns, follows):
 
 @jit
 def _compare_with_window(evidence, levels, volts, written_ns):
-    """Enter the step to `volts`, and its change from every voltage within the window, in the evidence's maxima.
+    """Raise the evidence's largest step and largest change within WINDOW_NS by a write of `volts` at `written_ns`.
 
-    Returns 1 if some voltages of the window are no longer stored, else 0.
+    `levels` are the last MAX_LEVELS voltages, as in `judge_write`. Returns 1 if it lacks some of the window, else 0.
     """
     evidence.largest_step_v = max(evidence.largest_step_v, abs(volts - evidence.written_v))
     i, first = evidence.levels, max(evidence.levels - MAX_LEVELS + 1, 0)

@@ -33,10 +33,10 @@ def classic_frame_bits(length: int) -> int:
 
 
 def fd_frame_bits(length: int) -> tuple[int, int]:
-    """Return the largest numbers of bits of a CAN FD frame with `length` data bytes: (slow, fast).
+    """Return the largest numbers of bits (slow, fast) of a CAN FD frame with 11-bit identifier and `length` data bytes.
 
-    Slow bits have the bitrate of the arbitration phase, fast bits that of the data phase. As many stuff bits as
-    possible are counted as slow.
+    `length` is one of FD_LENGTHS. Slow bits have the bitrate of the arbitration phase, fast bits that of the data
+    phase. As many stuff bits as possible are counted as slow.
     """
     stuffable_bits = _FD_SLOW + _FD_HEAD + 8 * length
     slow_stuff = max_stuff_bits(_FD_SLOW)

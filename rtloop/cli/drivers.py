@@ -112,7 +112,7 @@ def _print_drivers(entries: list[dict[str, Any]]) -> None:
 
 
 def _print_report(report: dict[str, Any]) -> None:
-    """Print the self-test's figures, and its verdict, or that there is none."""
+    """Print a driver's self-test: `report` is the object of `rtloop drivers --selftest --json`."""
     out, rows = console(), table("axis", "gain", "offset", "noise, rms", "delay, ticks", "")
     for row in report["axes"]:
         delay = "does not follow" if row["delay_ticks"] is None else f"{row['delay_ticks']}"

@@ -117,7 +117,10 @@ def _assign(coefficients: Records, name: str, value: object) -> None:
 
 
 def _prefilter(options: PrefilterOptions) -> Mapping[str, object]:
-    """Return fields of the pre-filter; the number of taps is rounded up to whole vectors, 0 without taps."""
+    """Return the pre-filter's coefficients by name: numbers of taps and sections, and where there are any, these.
+
+    `tap_count` is rounded up to a multiple of TAP_LANES; 0 without taps.
+    """
     tap_count = max(len(options.taps), len(options.command_taps))
     fields: dict[str, object] = {
         "tap_count": -(-tap_count // TAP_LANES) * TAP_LANES,

@@ -51,7 +51,10 @@ class RecordedRun:
             ) from None
 
     def _read(self, metadata: dict[str, Any]) -> None:
-        """Set the attributes from a run's description. Raises LookupError, TypeError, ValueError if malformed."""
+        """Set this run's attributes from its description, the table that `read_metadata` returns.
+
+        Raises LookupError for a missing key, TypeError or ValueError for a value of another type.
+        """
         self.experiment: str = metadata["name"]
         self.label: str = metadata["run"]
         self.run_count: int = metadata["runs"]

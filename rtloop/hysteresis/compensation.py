@@ -114,8 +114,9 @@ def compensated_output(actuator: PlayModel, inverse: PlayModel, commands_um: npt
 
 
 def _inverse_loading_curve(inverse: PlayModel, drives: Real) -> Real:
-    """Return the commands v ≥ 0 in µm at which the increasing loading curve of `inverse` reaches each of `drives`
-    (V).
+    """Return the commands (k,) in µm at which the increasing loading curve of `inverse` reaches the drives (k,) in V.
+
+    Its last straight part goes on without an end.
     """
     levels = loading_curve(inverse, inverse.thresholds)
     part = np.clip(np.searchsorted(levels, drives, side="right") - 1, 0, None)

@@ -128,9 +128,9 @@ def count_ticks(coefficients, state, mode, adc_v, lateness_us):
 
 @jit
 def _count_swings(coefficients, state):
-    """Count reversals of the position by more than `oscillation_um`, each within `swing_ticks` of the last.
+    """Add 1 to `state.swing_count` where the position has turned back by more than `oscillation_um` since its extreme.
 
-    A longer pause sets the count to 0.
+    More than `swing_ticks` without such a reversal set the count to 0. Called once per tick.
     """
     position_um, extreme_um = state.position_um, state.swing_extreme_um
     state.swing_age += 1

@@ -410,9 +410,9 @@ def update(record):
 
 @jit_rare
 def _update_coupled(law, first, count, loop):
-    """Advance the feedforwards of the axes after `first` that share its controller, and in closed loop this controller.
+    """Advance the shared controller of axes `first` … `first` + `count` − 1, and the feedforwards of all but the first.
 
-    A failure trips the next tick.
+    The controller advances in closed loop only. A failure adds TRIP_LAW to `loop.pending`: the next tick trips.
     """
     for i in range(first + 1, first + count):
         _update_feedforward(law, i, loop, coefficients_record(law, i))

@@ -82,9 +82,10 @@ class MeasuredLoop:
 
 
 def measured_loop(measured_response: MeasuredResponse, rate_hz: float, mode: LightMode | None) -> MeasuredLoop:
-    """Return the loop L = C·D of a measured response, its lines smoothed; `mode` is the lightly damped mode, or None.
+    """Return the loop L = C·D of a measured response, each line smoothed with its neighbours, which lowers `spread`.
 
-    Its `spread` is smaller than before where neighbouring lines were combined.
+    The pole of the lightly damped `mode` (None: there is none) is divided out before and multiplied in afterwards, so
+    that the peak is not smoothed.
     """
     image = None if mode is None else mode.image(rate_hz)
     raw = measured_response.plant * measured_response.controller * _pole_distance(measured_response.hz, rate_hz, image)

@@ -42,7 +42,7 @@ def unsound_reason(rows: Real, prepared: Prepared) -> StepReason | None:
 
 
 def _drives_beside_safe(rows: Real, prepared: Prepared) -> bool:
-    """Return whether the drive of an axis is not exactly its safe value in any of the rows."""
+    """Return whether some axis has another drive than its safe value in some record of `rows` (ticks, columns)."""
     safe_v = np.asarray(prepared.plan.coefficients)["safe_v"]
     columns = [signals.axis_column(number, signals.DRIVE) for number in range(len(safe_v))]
     return bool(np.any(rows[:, columns] != safe_v))

@@ -149,10 +149,10 @@ def _free_decays(model: Innovations, samples: int) -> Real:
 
 
 def _newton_step(model: Innovations, u: Real, driven: Real, x: Real, selection: SampleSelection) -> tuple[Real, Real]:
-    """Return the step (unknowns,) towards uncorrelated instruments and errors, and the covariance of its result, both
-    without the offset.
+    """Return the step (unknowns,) that makes instruments and errors uncorrelated, and its covariance.
 
-    All signals are whitened over their whole length: a cut signal begins with a jump, which rings in ψ but not in x.
+    `u` is the model's input, `driven` the input that makes the instruments, `x` the position, each (samples,) and
+    whitened over its whole length: a cut signal begins with a jump, which rings in the slopes but not in `x`.
     """
     decays, zeros = _free_decays(model, u.size)[:, selection], np.zeros_like(u)
     slopes, instruments = (

@@ -100,7 +100,7 @@ def _fit_order(guesses: ModeGuesses, order: int, run: Excitation, smaller: Seque
 
 
 def _mode_guesses(run: Excitation) -> ModeGuesses:
-    """Return guesses of modes from the recording's impulse response."""
+    """Return the guesser of modes from the recording's impulse response, for models of any order."""
     return ModeGuesses(impulse_response(run.input, run.position_um, 2 * HANKEL_ROWS + 2), run.period_s)
 
 
