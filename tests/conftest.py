@@ -1,4 +1,4 @@
-"""What all tests share: no example fails because the machine was busy, and Ctrl-C reaches what they start.
+"""Settings of all tests: no hypothesis example fails because the machine is busy, and Ctrl-C reaches child processes.
 
 Processes compute with one thread each, as the command line does.
 """
@@ -22,7 +22,7 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # what a shell starts in 
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
 PAGE = "tests/panel/page"
-"""The tests in a browser."""
+"""Folder of the tests that run in a browser."""
 LONG_FILES = ("tests/syscalls/", "tests/service/test_recovery", "tests/campaigns/test_page", "tests/panel/web/")
 """Files that take long; they begin early, so that no process ends long after the others."""
 
@@ -45,15 +45,15 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: Producer) -> OneBrow
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Begin with the tests in a browser, which take longest, one after the other; then those of LONG_FILES."""
+    """Begin with the tests in a browser, which take longest, one after the other; then run LONG_FILES."""
     items.sort(key=lambda item: (not item.nodeid.startswith(PAGE), not item.nodeid.startswith(LONG_FILES)))
 
 
 @pytest.fixture
 def few_simulated_steps(monkeypatch: pytest.MonkeyPatch) -> None:
-    """`design verify` simulates four steps of each height, in one run, for a test that looks at other things.
+    """Let `design verify` simulate one run of steps in place of many, for tests that look at other figures.
 
-    All of them are simulated in tests/design/test_simulated.py, and for the report in tests/design/test_verify.py.
+    All runs are simulated in tests/design/test_simulated.py, and for the report in tests/design/test_verify.py.
     """
     from rtloop.design.verification import simulation
 

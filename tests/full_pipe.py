@@ -1,4 +1,4 @@
-"""A pipe that nobody reads."""
+"""A pipe without a reader at work."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import os
 
 
 def fill(writing: int) -> int:
-    """Write until nothing more goes in; the bytes that did. The descriptor blocks again afterwards."""
+    """Write to the pipe until it is full; return the number of bytes. The descriptor blocks again afterwards."""
     os.set_blocking(writing, False)
     size = 0
     while True:

@@ -1,4 +1,4 @@
-"""Five loops that do not work, on the stage of the paper: `check`, preview and steps of a run praise none of them."""
+"""Five loops that do not work, on the stage of the paper: `check`, preview and the steps of a run report each one."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What `check` warns of, each provoked on a configuration that is silent without; and `--strict`."""
+"""Warnings of `check`, each provoked by a change of a configuration that has none; and `--strict`."""
 
 from __future__ import annotations
 
@@ -75,23 +75,23 @@ def changed(*changes: tuple[str, str]) -> str:
     return text
 
 
-def found(text: str) -> list[str]:
+def warnings_of(text: str) -> list[str]:
     return cautions(prepare(parse(text, "paper", PAPER.parent, "paper.toml")))
 
 
 def test_the_papers_configuration_gives_no_cause() -> None:
-    assert found(TEXT) == []
+    assert warnings_of(TEXT) == []
 
 
-@pytest.mark.parametrize(("changes", "said"), PROVOKED, ids=[said[:30] for _, said in PROVOKED])
-def test_each_caution_is_one_line(changes: tuple[tuple[str, str], ...], said: str) -> None:
-    lines = found(changed(*changes))
-    assert any(line.startswith(("axis.x.", "driver.channels.x.", "loop.")) and said in line for line in lines), lines
+@pytest.mark.parametrize(("changes", "message"), PROVOKED, ids=[message[:30] for _, message in PROVOKED])
+def test_each_caution_is_one_line(changes: tuple[tuple[str, str], ...], message: str) -> None:
+    lines = warnings_of(changed(*changes))
+    assert any(line.startswith(("axis.x.", "driver.channels.x.", "loop.")) and message in line for line in lines), lines
 
 
 def test_weights_whose_whole_stroke_is_noise_are_named() -> None:
     head = f'[loop]\nrate_hz = 10000\nmode = "off"\n[driver]\nkind = "sim"\n{wired("adc0", "dac0")}'
-    (line,) = [line for line in found(head + one_axis(um_per_v=0.0009)) if "weights" in line]
+    (line,) = [line for line in warnings_of(head + one_axis(um_per_v=0.0009)) if "weights" in line]
     assert line.startswith(
         "axis.x.feedforward.weights_um_per_v: with these weights the drive's limits reach 0.009 µm, less than the "
     )
@@ -99,7 +99,7 @@ def test_weights_whose_whole_stroke_is_noise_are_named() -> None:
 
 
 def test_a_reference_of_the_schedule_counts() -> None:
-    (line,) = found(TEXT + SCHEDULE)
+    (line,) = warnings_of(TEXT + SCHEDULE)
     assert line == "axis.x.reference from tick 500 on: reaches 43 µm, beyond limits.command_um = 42"
 
 
@@ -122,8 +122,8 @@ RECOVER = "[service.recover]\n"
 def test_check_warns_of_what_serve_refuses_or_leaves_out(tmp_path: Path, text: str, warnings: list[str]) -> None:
     config = tmp_path / "stage.toml"
     config.write_text(TEXT + text)
-    found = [line for line in cautions(prepare(load(config))) if "service" in line]
-    assert [line[: len(start)] for line, start in zip(found, warnings, strict=True)] == warnings
+    service_lines = [line for line in cautions(prepare(load(config))) if "service" in line]
+    assert [line[: len(start)] for line, start in zip(service_lines, warnings, strict=True)] == warnings
     if "schedule" in text:
         with pytest.raises(ConfigError, match=warnings[0]):
             Service(config)
@@ -144,14 +144,14 @@ def test_strict_makes_faults_of_them(tmp_path: Path) -> None:
 def test_a_rig_on_which_the_loop_is_unstable_is_named_by_check_and_run(
     shift: float, is_stable: bool, tmp_path: Path
 ) -> None:
-    """At 10 kHz the paper's loop tolerates a resonance 1.82 % above the model's, and no more."""
+    """At 10 kHz the paper's loop is stable with a resonance up to 1.82 % above the model's."""
     config, sensor = tmp_path / "stage.toml", "[driver.plant.sensor]"
     text = changed((sensor, f"[driver.plant.dynamics]\nresonance_shift = {shift}\n{sensor}"))
     config.write_text(text.replace('specification = "paper-spec.toml"', ""))
-    said = "warning: axis.x: on the simulated rig, the loop is unstable (largest |pole| 1.0"
+    message = "warning: axis.x: on the simulated rig, the loop is unstable (largest |pole| 1.0"
     checked = run("check", config)
     assert checked.exit_code == 0
-    assert (said not in checked.stderr) == is_stable
+    assert (message not in checked.stderr) == is_stable
     assert ("stable on the simulated rig" not in checked.stdout) == is_stable
     (axis,) = answer("check", config)["axes"]
     assert axis["stable_on_rig"] == (None if is_stable else False)
@@ -159,7 +159,7 @@ def test_a_rig_on_which_the_loop_is_unstable_is_named_by_check_and_run(
     if not is_stable:
         assert run("check", config, "--strict").exit_code == 78
         stepped = run("run", config, "--duration", 0.01, "--unpaced", "--out", tmp_path)
-        assert said in stepped.stderr
+        assert message in stepped.stderr
 
 
 def test_a_level_below_the_remanence_is_named() -> None:
@@ -231,7 +231,7 @@ def test_weights_far_beyond_the_sensor_are_not_judged_on_hardware(tmp_path: Path
 
 
 @pytest.mark.parametrize(
-    ("low_v", "high_v", "said"),
+    ("low_v", "high_v", "message"),
     [
         (-10.0, 10.0, " or outside -9.99 … 9.99 V at the sensor"),
         (0.0, 10.0, " or above 9.99 V at the sensor, whose input reads 0 … 10 V"),
@@ -239,10 +239,10 @@ def test_weights_far_beyond_the_sensor_are_not_judged_on_hardware(tmp_path: Path
         (0.0, 5.0, ", at no voltage of the sensor, whose input reads 0 … 5 V"),
     ],
 )
-def test_limits_that_the_input_cannot_read_are_not_shown(low_v: float, high_v: float, said: str) -> None:
+def test_limits_that_the_input_cannot_read_are_not_shown(low_v: float, high_v: float, message: str) -> None:
     prepared = prepare(parse(TEXT, "paper", PAPER.parent, "paper.toml"))
     (axis,), (check,) = prepared.configuration.axes, prepared.checks
     out = Console(file=io.StringIO(), width=300)
     judgement = AxisJudgement(axis, replace(check, law=None, on_model=None), {}, None, None, None)
     print_axis(out, judgement, Channel("adc0", low_v, high_v))
-    assert f"the loop trips beyond ±60 µm{said}\n" in out.file.getvalue()
+    assert f"the loop trips beyond ±60 µm{message}\n" in out.file.getvalue()

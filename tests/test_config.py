@@ -1,4 +1,4 @@
-"""Every mistake in a configuration gives one line: the key, its value, what is allowed; all of them at once."""
+"""Every mistake in a configuration gives one line: key, value, allowed values; all mistakes come at once."""
 
 from __future__ import annotations
 
@@ -102,8 +102,8 @@ ONE_FAULT = [
 
 @pytest.mark.parametrize(("change", "message"), ONE_FAULT, ids=lambda value: str(value)[:60])
 def test_one_mistake_one_line(change, message):
-    (found,) = faults(change)
-    assert re.fullmatch(message, found), found
+    (fault,) = faults(change)
+    assert re.fullmatch(message, fault), fault
 
 
 @pytest.mark.parametrize(
@@ -123,8 +123,8 @@ def test_one_mistake_one_line(change, message):
     ],
 )  # fmt: skip
 def test_one_mistake_in_the_schedule(lines, message):
-    (found,) = faults(more=entry(lines))
-    assert re.fullmatch(message, found), found
+    (fault,) = faults(more=entry(lines))
+    assert re.fullmatch(message, fault), fault
 
 
 def test_volts_of_mode_raw_are_no_setpoint_in_micrometres():
@@ -133,14 +133,14 @@ def test_volts_of_mode_raw_are_no_setpoint_in_micrometres():
 
 
 def test_all_mistakes_at_once():
-    found = faults(
+    all_faults = faults(
         (RATE, "rate_hz = -1\nspin = 3\n"),
         ('kind = "sim"', 'kind = "comedy"'),
         ("drive_v = 10.0 ", "drive_v = 0.0 "),
         ("dwell_s = 0.2", 'dwell_s = "long"'),
         more=entry("at_tick = 1"),
     )
-    keys = [fault.split(":")[0] for fault in found]
+    keys = [fault.split(":")[0] for fault in all_faults]
     assert sorted(keys) == sorted(
         ["loop.rate_hz", "loop.spin", "driver.kind", "axis.x.limits.drive_v", "axis.x.reference.dwell_s", "schedule.0"]
     )
@@ -163,16 +163,16 @@ def test_axes_and_channels_must_match():
 
 
 @pytest.mark.parametrize(
-    ("poles", "where"), [("[[]]", "0.0"), ("[[[]]]", "0.0"), ("[[-1.0]]", "0.1"), ("[[0.0, 1.0], []]", "1.0")]
+    ("poles", "place"), [("[[]]", "0.0"), ("[[[]]]", "0.0"), ("[[-1.0]]", "0.1"), ("[[0.0, 1.0], []]", "1.0")]
 )
-def test_a_root_that_lacks_a_part(poles: str, where: str):
-    found = faults((CONTROLLER, f'[axis.controller]\nform = "zpk"\ngain = 60.0\npoles = {poles}\n\n'))
-    assert any(fault.startswith(f"axis.x.controller.poles.{where}: ") for fault in found), found
+def test_a_root_that_lacks_a_part(poles: str, place: str):
+    all_faults = faults((CONTROLLER, f'[axis.controller]\nform = "zpk"\ngain = 60.0\npoles = {poles}\n\n'))
+    assert any(fault.startswith(f"axis.x.controller.poles.{place}: ") for fault in all_faults), all_faults
 
 
 def test_a_repeated_entry_of_the_schedule_is_a_fault():
-    (found,) = faults(more=2 * entry('at_tick = 7\nmode = "off"'))
-    assert found == "schedule, at_tick 7: two equal entries; remove one of them"
+    (fault,) = faults(more=2 * entry('at_tick = 7\nmode = "off"'))
+    assert fault == "schedule, at_tick 7: two equal entries; remove one of them"
 
 
 def models_in(annotation: object) -> Iterator[type[BaseModel]]:
@@ -188,7 +188,7 @@ def models_in(annotation: object) -> Iterator[type[BaseModel]]:
     "section", [LoopOptions, ChannelOptions, RigOptions, AxisOptions, RecordingOptions, ServiceOptions]
 )
 def test_every_key_is_in_the_papers_configuration(section: type[BaseModel]) -> None:
-    """As its first lines promise; wherever it stands there."""
+    """The first lines of that file promise it; the key may be commented out."""
     for model in models_in(section):
-        there = [name for name in model.model_fields if re.search(rf"(?<![a-z_]){name}(?![a-z_])", TEXT)]
-        assert there == list(model.model_fields), model.__name__
+        documented = [name for name in model.model_fields if re.search(rf"(?<![a-z_]){name}(?![a-z_])", TEXT)]
+        assert documented == list(model.model_fields), model.__name__

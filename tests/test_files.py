@@ -30,7 +30,7 @@ def strange(tmp_path: Path) -> list[Path]:
 
 
 def read_table(path: Path) -> None:
-    """Read a table reference."""
+    """Read the samples of a reference of kind "table" from `path`."""
     generator_values(TableOptions(kind="table", file=str(path)), 1000.0, (), path.parent, TableOfSamples())
 
 

@@ -29,7 +29,7 @@ print(resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before)
 @pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="the heap of another C library has other rules")
 def test_arrays_of_megabytes_take_pages_that_the_process_has_already():
     environment = {name: value for name, value in os.environ.items() if not name.startswith("MALLOC_")}
-    kept, returned = (
+    faults_kept, faults_returned = (
         int(
             subprocess.run(
                 [sys.executable, "-c", FAULTS, how], env=environment, capture_output=True, text=True, check=True
@@ -37,4 +37,4 @@ def test_arrays_of_megabytes_take_pages_that_the_process_has_already():
         )
         for how in ("kept", "returned")
     )
-    assert kept < 1_000 < 10_000 < returned
+    assert faults_kept < 1_000 < 10_000 < faults_returned

@@ -12,13 +12,13 @@ from rtloop.cli import main
 
 
 def groups(command: click.Group, path: tuple[str, ...] = ()) -> Iterator[tuple[str, ...]]:
-    """The names of a group and of those below it."""
+    """Yield the names that lead to a group of commands, and to each group within it."""
     yield path
     context = click.Context(command)
     for name in command.list_commands(context):
-        below = command.get_command(context, name)
-        if isinstance(below, click.Group):
-            yield from groups(below, (*path, name))
+        subcommand = command.get_command(context, name)
+        if isinstance(subcommand, click.Group):
+            yield from groups(subcommand, (*path, name))
 
 
 @pytest.mark.parametrize("path", list(groups(main)), ids=lambda path: " ".join(path) or "rtloop")

@@ -1,4 +1,4 @@
-"""What starts often loads nothing that only some uses of it need: a second of import is a second before every run."""
+"""Programs that start often import only modules that every run of them needs: each import delays every start."""
 
 from __future__ import annotations
 
@@ -26,14 +26,14 @@ HEAVY = ("scipy.signal", "scipy.stats", "scipy.optimize", "scipy.interpolate", "
 
 
 def inner_imports(module: str, function: str) -> set[str]:
-    """Modules that a function, or the callback of a command, imports when it runs."""
-    found = getattr(importlib.import_module(module), function)
-    source = inspect.getsource(inspect.unwrap(getattr(found, "callback", found)))
+    """Return the modules that a function, or the callback of a command, imports when it runs."""
+    code = getattr(importlib.import_module(module), function)
+    source = inspect.getsource(inspect.unwrap(getattr(code, "callback", code)))
     return {node.module for node in ast.walk(ast.parse(textwrap.dedent(source))) if isinstance(node, ast.ImportFrom)}
 
 
 @pytest.mark.parametrize(
-    ("module", "others"),
+    ("module", "forbidden"),
     [
         ("rtloop", ("numpy", "pydantic", "click", "rich")),
         ("rtloop.cli", ("numpy", "pydantic")),
@@ -49,17 +49,17 @@ def inner_imports(module: str, function: str) -> set[str]:
         ("rtloop.recording.capture.recorder", ("scipy", "pydantic")),
     ],
 )
-def test_nothing_heavy(module: str, others: tuple[str, ...]):
+def test_nothing_heavy(module: str, forbidden: tuple[str, ...]):
     """`module:f,g` names what commands import while they run: the modules imported inside these functions."""
     module, _, functions = module.partition(":")
     modules = [module, *(inner for name in functions.split(",") if name for inner in inner_imports(module, name))]
     program = f"import sys, {', '.join(modules)}; print(*sys.modules)"
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
-    assert not {*HEAVY, *others} & {*done.stdout.split()}
+    assert not {*HEAVY, *forbidden} & {*done.stdout.split()}
 
 
 @pytest.mark.parametrize(
-    ("arguments", "module", "others"),
+    ("arguments", "module", "forbidden"),
     [
         (("check", "deploy/paper.toml"), "rtloop.workbench.check", ("scipy", "control", "uvicorn")),
         (("info", "RECORDING", "--json"), "rtloop.recording.views.summary", ("scipy", "rich.console", "uvicorn")),
@@ -67,7 +67,7 @@ def test_nothing_heavy(module: str, others: tuple[str, ...]):
     ],
 )
 def test_nothing_heavy_while_a_command_runs(
-    arguments: tuple[str, ...], module: str, others: tuple[str, ...], tmp_path: Path
+    arguments: tuple[str, ...], module: str, forbidden: tuple[str, ...], tmp_path: Path
 ):
     (recording,) = record(tmp_path / "run.mcap", PAPER, 20_000)
     program = """
@@ -80,7 +80,7 @@ main(sys.argv[1:])
     done = subprocess.run([sys.executable, "-c", program, *words], capture_output=True, text=True, check=True, cwd=ROOT)
     loaded = {*done.stderr.split()}
     assert module in loaded
-    assert not {*HEAVY, *others} & loaded
+    assert not {*HEAVY, *forbidden} & loaded
 
 
 def test_the_versions_in_the_digest_of_a_cache_are_those_of_the_metadata():
@@ -96,7 +96,7 @@ def test_pydantic_loads_no_plug_ins_under_the_command_line():
 
 
 def test_an_import_builds_no_validator_of_options():
-    """A default of a nested model built one for it, beside that of the whole file."""
+    """A nested model as a default would build a validator, besides the one of the whole file."""
     program = """
 import rtloop.service.daemon
 from rtloop.foundation.options import Options
@@ -124,14 +124,16 @@ def test_absent_tables_have_the_values_of_a_validated_empty_table():
 def test_the_command_line_computes_with_one_thread():
     program = "import os, rtloop.cli; print(os.environ['OPENBLAS_NUM_THREADS'])"
     environment = {name: value for name, value in os.environ.items() if name != "OPENBLAS_NUM_THREADS"}
-    for asked, used in ((None, "1"), ("4", "4")):
-        given = environment if asked is None else environment | {"OPENBLAS_NUM_THREADS": asked}
-        done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True, env=given)
+    for setting, used in ((None, "1"), ("4", "4")):
+        child_environment = environment if setting is None else environment | {"OPENBLAS_NUM_THREADS": setting}
+        done = subprocess.run(
+            [sys.executable, "-c", program], capture_output=True, text=True, check=True, env=child_environment
+        )
         assert done.stdout.strip() == used
 
 
 def test_a_start_hardly_looks_for_garbage():
-    """Python by itself does so hundreds of times, and a fifth of a service's start was that."""
+    """With Python's default thresholds hundreds of collections took a fifth of a service's start."""
     count = "print(*(generation['collections'] for generation in gc.get_stats()), file=sys.stderr)"
     program = f"import atexit, gc, sys; atexit.register(lambda: {count}); from rtloop.cli import main; main(['schema'])"
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)

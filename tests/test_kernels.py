@@ -55,7 +55,7 @@ def test_all_kernels_are_in_the_digest() -> None:
 
 
 def test_kernels_use_nothing_from_outside_the_digest() -> None:
-    """Neither a function nor a constant: what a kernel is made from must be in the digest, too."""
+    """Functions and constants that a kernel uses are in the digest of the cache, as the kernel is."""
     for path in filter(compiles, sources()):
         names = kernel_names(path)
         assert names

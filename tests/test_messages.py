@@ -163,7 +163,7 @@ def test_a_narrow_terminal_cuts_no_number(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("old", "new", "said"),
+    ("old", "new", "message"),
     [
         (
             "rate_hz = 10000",
@@ -181,7 +181,7 @@ def test_a_narrow_terminal_cuts_no_number(tmp_path: Path) -> None:
         ("drive_v = 10.0 ", "drive_v 10.0 ", "line {n}, column 9: not valid TOML: Expected '=' after a key"),
     ],
 )
-def test_a_slip_of_toml_is_shown_with_its_line_and_a_hint(old: str, new: str, said: str, tmp_path: Path) -> None:
+def test_a_slip_of_toml_is_shown_with_its_line_and_a_hint(old: str, new: str, message: str, tmp_path: Path) -> None:
     text, config = PAPER.read_text(encoding="utf-8"), tmp_path / "slip.toml"
     assert f"\n{old}" in text
     config.write_text(text.replace(f"\n{old}", f"\n{new}", 1))
@@ -190,20 +190,20 @@ def test_a_slip_of_toml_is_shown_with_its_line_and_a_hint(old: str, new: str, sa
     assert result.exit_code == 78
     heading, fault = result.stderr.splitlines()
     assert heading == f"rtloop: {config}: 1 fault"
-    assert re.match(said.format(n=line), fault.strip()), fault
+    assert re.match(message.format(n=line), fault.strip()), fault
     assert f", in: {new.strip()}" in fault
 
 
-@pytest.mark.parametrize(("text", "said"), [
+@pytest.mark.parametrize(("text", "message"), [
     ("poles = [[-1, 0], [-2, 0]\nallow_unstable = true\n", "line 1: not valid TOML: Unclosed array; a bracket"),
     ("[loop]\nmodes = [\n  1,\n]\n\ngain =", "line 6: not valid TOML: Invalid value, in: gain ="),
     ("label = \"a # b\"\nrate_hz = 1,5\n", "line 2, column 12: not valid TOML: .*a decimal number has a point: 1.5"),
     ("a = 1\nrate_hz = inf nan\n", "line 2, column 15: not valid TOML: [^;]*, in: rate_hz = inf nan"),
 ])  # fmt: skip
-def test_a_slip_of_toml_blames_no_line_that_is_right(text: str, said: str, tmp_path: Path) -> None:
+def test_a_slip_of_toml_blames_no_line_that_is_right(text: str, message: str, tmp_path: Path) -> None:
     (tmp_path / "slip.toml").write_text(text)
     result = run("check", tmp_path / "slip.toml")
-    assert re.match(said, result.stderr.splitlines()[1].strip()), result.stderr
+    assert re.match(message, result.stderr.splitlines()[1].strip()), result.stderr
 
 
 def test_a_file_of_another_kind_is_named_with_its_commands(tmp_path: Path) -> None:
@@ -211,7 +211,7 @@ def test_a_file_of_another_kind_is_named_with_its_commands(tmp_path: Path) -> No
     (recording,), large = record(tmp_path / "run", TWO_AXES, 100), tmp_path / "large.mcap"
     large.write_bytes(recording.read_bytes().ljust(2 << 20))
     spec, folder = PAPER.parent / "paper-spec.toml", tmp_path
-    for arguments, code, said in (
+    for arguments, code, message in (
         (("check", recording), 66, "a recording, not a text file; `rtloop info`"),
         (("run", large), 66, "a recording, not a text file; `rtloop info`"),
         (("design", "synthesise", recording), 66, "a recording, not a text file; `rtloop info`"),
@@ -228,5 +228,5 @@ def test_a_file_of_another_kind_is_named_with_its_commands(tmp_path: Path) -> No
     ):
         result = run(*arguments)
         assert result.exit_code == code, result.output
-        assert said in result.stderr
+        assert message in result.stderr
         assert len(result.stderr.splitlines()) <= 2, result.stderr

@@ -1,6 +1,6 @@
-"""Files are opened by `rtloop.foundation.trusted`: every other open in the product is found, and has its reason here.
+"""The product opens files by `rtloop.foundation.trusted`; other calls that open one are listed here with reasons.
 
-A descriptor becomes a file by `os.fdopen`, which takes nothing else.
+`os.fdopen` is allowed everywhere, because it takes only a descriptor that is already open.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ ALLOWED = {
     ("starters/templates/__init__.py", "files(__name__).joinpath(f'{name}.in').read_text"): PACKAGE_FILE,
     ("supervision/paths.py", "os.open"): "made anew in a folder that `open_folder` holds",
 }
-"""(module, called): why it opens by itself."""
+"""Reason for each call outside of `trusted`, by (module, call)."""
 
 
 def opens(text: str) -> Iterator[tuple[int, str]]:

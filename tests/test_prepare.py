@@ -1,4 +1,4 @@
-"""What only shows when the parts of a configuration are put together."""
+"""Faults that show only when the parts of a configuration are put together."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ PAPER = Path(__file__).resolve().parents[1] / "deploy" / "paper.toml"
 
 
 def test_mistakes_between_the_parts_are_reported_at_once():
-    found = faults(
+    all_faults = faults(
         ("drive_v = 10.0 ", "drive_v = 12.0 "), ("dwell_s = 0.2", "dwell_s = 1e-9"), UNSTABLE, duration_s=1e-9
     )
-    assert [fault.split(":")[0] for fault in found] == [
+    assert [fault.split(":")[0] for fault in all_faults] == [
         "axis.x.controller",
         "axis.x.limits.drive_v",
         "axis.x.reference.dwell_s",
@@ -62,23 +62,23 @@ def test_an_anti_windup_too_slow_for_an_unstable_controller():
     """A pole at 3000 rad/s grows by 1.35 a tick: followed slowly, it would run away while limited."""
     unstable = 'form = "transfer_function"\nnumerator = [1.0]\ndenominator = [1.0, -3000.0]\ntracking_s = {}\n\n'
     model = TEXT[TEXT.index("[axis.model]") : TEXT.index("# delay_ticks")]
-    for tracking_s, good in (("0.01", False), ("0.0", True)):
+    for tracking_s, is_valid in (("0.01", False), ("0.0", True)):
         changes = [(CONTROLLER, f"[axis.controller]\n{unstable.format(tracking_s)}"), (model, "")]
-        if good:
+        if is_valid:
             built(*changes)
         else:
-            (found,) = faults(*changes)
+            (fault,) = faults(*changes)
             assert re.fullmatch(
                 r"axis\.x\.controller\.tracking_s: 0\.01 s makes the controller unstable .*; use a smaller value.*",
-                found,
+                fault,
             )
 
 
 @pytest.mark.parametrize("duration_s", [0.0, 1e-9, -1.0, float("nan"), float("inf"), 1e30])
 def test_durations_without_a_tick(duration_s):
-    (found,) = faults(duration_s=duration_s)
+    (fault,) = faults(duration_s=duration_s)
     allowed = "one period, 0.0001 s, to 9.0072e+11 s at 10000 Hz"
-    assert found == f"--duration: {duration_s:g} s; allowed: {allowed}"
+    assert fault == f"--duration: {duration_s:g} s; allowed: {allowed}"
 
 
 def test_real_hardware_is_not_run_unpaced(monkeypatch):
@@ -89,20 +89,22 @@ def test_real_hardware_is_not_run_unpaced(monkeypatch):
     ]
 
 
-@pytest.mark.parametrize(("slew", "good"), [(1e-12, False), (1e-9, False), (1.999, False), (2.0, True), (1e6, True)])
-def test_every_ramp_to_safe_ends_within_seconds(slew, good):
-    """From 10 V, the end of the channel, in 5 s at most."""
+@pytest.mark.parametrize(
+    ("slew", "is_valid"), [(1e-12, False), (1e-9, False), (1.999, False), (2.0, True), (1e6, True)]
+)
+def test_every_ramp_to_safe_ends_within_seconds(slew, is_valid):
+    """The ramp begins at 10 V, the end of the channel, and may take 5 s."""
     change = ("trip_slew_v_per_s = 1000.0", f"trip_slew_v_per_s = {slew}")
-    if good:
+    if is_valid:
         built(change)
     else:
-        (found,) = faults(change)
-        assert found.startswith(f"axis.x.limits.trip_slew_v_per_s: {slew:g} V/s; the ramp of 10 V from the end of ")
-        assert found.endswith(" s; allowed: at most 5 s, so at least 2 V/s")
+        (fault,) = faults(change)
+        assert fault.startswith(f"axis.x.limits.trip_slew_v_per_s: {slew:g} V/s; the ramp of 10 V from the end of ")
+        assert fault.endswith(" s; allowed: at most 5 s, so at least 2 V/s")
 
 
 def test_a_library_that_is_missing_is_no_fault_of_the_configuration(monkeypatch):
-    """Exit 69, what is not there; 78 is for what is written wrongly."""
+    """The exit code is 69, for a missing resource; 78 is for a wrong configuration."""
 
     def missing(kind: str) -> None:
         raise MissingLibrary(f"driver {kind!r}: libcard.so: cannot open shared object file")

@@ -22,7 +22,7 @@ def answer(time_s: np.ndarray | float, zeta: float) -> np.ndarray:
 
 
 def settled_s(zeta: float, band: float = 0.05) -> float:
-    """When |x − 1| is `band` for the last time: between the last extreme beyond it and the next."""
+    """Return the last time in s at which |x − 1| is `band`, between the last extreme beyond it and the next one."""
     half_turn_s = np.pi / (OMEGA * np.sqrt(1 - zeta**2))
     extremes = half_turn_s * np.arange(0, 200)
     beyond = np.flatnonzero(np.abs(answer(extremes, zeta) - 1) > band)[-1]
@@ -43,7 +43,7 @@ def test_a_second_order_step(zeta: float, before: float, after: float) -> None:
 
 
 def test_an_answer_from_below_has_no_overshoot() -> None:
-    """Whichever side it comes from; its last fifth is what it settles to, and the rest is the static error."""
+    """Upwards and downwards; the mean of the last fifth is the final value, whose distance is the static error."""
     for height in (10.0, -10.0):
         reference = np.repeat([0.0, height], [10, DWELL])
         position = np.concatenate([np.zeros(10), 0.98 * height * (1 - np.exp(-np.arange(DWELL) / 100))])

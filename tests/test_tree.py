@@ -39,9 +39,9 @@ def test_no_files_import_each_other_in_a_circle():
     modules = sorted(graph.modules)
     number = {module: i for i, module in enumerate(modules)}
     arrows = [
-        (number[module], number[other])
+        (number[module], number[imported])
         for module in modules
-        for other in graph.find_modules_directly_imported_by(module)
+        for imported in graph.find_modules_directly_imported_by(module)
     ]
     rows, columns = np.array(arrows).T
     matrix = coo_array((np.ones(len(arrows)), (rows, columns)), shape=(len(modules), len(modules)))
@@ -53,14 +53,14 @@ def test_no_files_import_each_other_in_a_circle():
 
 
 def _docstrings(path: Path) -> Iterator[tuple[str, str]]:
-    """(place, text) of each docstring and of each string below a constant or a field."""
+    """Yield (place, text) of each docstring and of each string below a constant or a field."""
     for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
         if isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant) and isinstance(node.value.value, str):
             yield f"{path.relative_to(ROOT)}:{node.lineno}", node.value.value
 
 
 def _texts() -> list[tuple[str, str]]:
-    """(place, text) of all documentation: pages, and docstrings of the product."""
+    """Return (place, text) of all documentation: pages, and docstrings of the product."""
     pages = [(str(path.relative_to(ROOT)), path.read_text(encoding="utf-8")) for path in DOCS]
     return pages + [text for path in PRODUCT for text in _docstrings(path)]
 
@@ -102,10 +102,10 @@ def test_commands_in_the_documentation_exist():
             for word in words.split():
                 if not isinstance(command, click.Group):
                     break
-                if (below := command.get_command(click.Context(command), word)) is None:
+                if (subcommand := command.get_command(click.Context(command), word)) is None:
                     missing.add(f"{place}: rtloop {words}")
                     break
-                command = below
+                command = subcommand
     assert not missing
 
 
@@ -123,7 +123,7 @@ def test_imports_in_the_documentation_work():
 
 @cache
 def _known_names() -> frozenset[str]:
-    """Every name in the tree's Python code, every string that is one word, and the names of files and folders."""
+    """Return all names in the tree's Python code, every string that is one word, and the names of files and folders."""
     names = set()
     for path in [*PRODUCT, *(ROOT / "tests").rglob("*.py")]:
         text = path.read_text(encoding="utf-8")

@@ -1,4 +1,4 @@
-"""Values as JSON."""
+"""Values that are written as JSON are finite or null."""
 
 from __future__ import annotations
 

@@ -64,7 +64,7 @@ class Plays:
         self.outputs = [0.0] * len(THRESHOLDS_V)
 
     def displacement(self, drive_v: float) -> tuple[list[float], float]:
-        """Return the outputs of the plays and the displacement in µm at a drive; nothing moves."""
+        """Return the outputs of the plays and the displacement in µm at a drive, without moving the stage."""
         outputs = [max(drive_v - r, min(drive_v + r, last)) for r, last in zip(THRESHOLDS_V, self.outputs, strict=True)]
         return outputs, sum(p * output for p, output in zip(WEIGHTS_UM_PER_V, outputs, strict=True))
 

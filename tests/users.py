@@ -19,7 +19,7 @@ ROOT_ONLY = pytest.mark.skipif(os.geteuid() != 0, reason="becoming another user 
 
 
 class Raised(Exception):
-    """What a function raised in another user's process: its type's name, its message, its exit code."""
+    """An exception in another user's process: name of its type, message, exit code."""
 
     def __init__(self, name: str, message: str, exit_code: int | None) -> None:
         super().__init__(name, message, exit_code)
@@ -27,7 +27,7 @@ class Raised(Exception):
 
 
 def as_user(uid: int, function: Callable[[], Any], groups: tuple[int, ...] = ()) -> Any:
-    """What `function` returns in a process of this user, without a home. Raises Raised for what it raises."""
+    """Call `function` in a process of user `uid` without a home; return its result. Its exception becomes Raised."""
     read, write = os.pipe()
     pid = os.fork()
     if pid == 0:
@@ -38,8 +38,8 @@ def as_user(uid: int, function: Callable[[], Any], groups: tuple[int, ...] = ())
     with open(read, "rb") as answer:
         data = answer.read()
     os.waitpid(pid, 0)
-    good, value = pickle.loads(data)
-    if good:
+    has_returned, value = pickle.loads(data)
+    if has_returned:
         return value
     raise value
 
@@ -59,7 +59,7 @@ def _become_and_call(uid: int, function: Callable[[], Any], groups: tuple[int, .
 
 @contextmanager
 def clean_places() -> Iterator[Path]:
-    """The victim's folder in /tmp, which is there neither before nor after."""
+    """Yield the path of the victim's folder in /tmp, which does not exist before and after."""
     folder = Path(f"/tmp/rtloop-{VICTIM}")
 
     def remove() -> None:
