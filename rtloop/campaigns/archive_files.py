@@ -91,7 +91,7 @@ def _is_recovered(path: str) -> bool:
 
 
 def _group_runs(paths: Sequence[str]) -> Iterator[tuple[str, ...]]:
-    """Yield the files of each run, in the order of the sorted `paths`.
+    """Yield the files of each run; `paths` must be sorted, and the runs come in their order.
 
     Files are of one run if their names differ in the number alone, and if `open_run` accepts them together. If it does
     not, each of them is yielded as a run of one file.

@@ -57,7 +57,11 @@ def configuration_schema() -> Schema:
 
 
 def _law_table(laws: dict[str, type[Law]], references: dict[Any, Schema], base: type[Law], default: str) -> Schema:
-    """Return the schema of a table that names a law derived from `base`; a table without a name has law `default`."""
+    """Return the schema of a table that chooses a law derived from `base`, by `kind` or by the `file` that defines it.
+
+    Any of `laws` by its kind and options, a file, or a kind that does not ship. A table without `kind` and `file` has
+    the law `default`. `references` has the schema of each law's options.
+    """
     kinds = {kind: law for kind, law in laws.items() if issubclass(law, base)}
     choices = [_choice(kind, references[law.options_model], kind != default) for kind, law in kinds.items()]
     own_file = {"title": "a law of a file", "required": ["file"], "properties": {"file": {"type": "string"}}}

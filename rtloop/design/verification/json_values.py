@@ -45,7 +45,7 @@ def as_dict(verification: Verification) -> dict[str, Any]:
 
 
 def _scenarios(scenarios: ScenarioResults) -> dict[str, Any]:
-    """Return `count`, and `rows` with name, worst value (null unless finite), its plant and verdict `met`, for JSON."""
+    """Return {count, rows}; each row has name, worst value (may be infinite or NaN), its plant, and verdict `met`."""
     rows = [
         {
             "name": row.name,
