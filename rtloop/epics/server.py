@@ -107,7 +107,8 @@ class ChannelServer:
         Raises RtloopError for a refusal.
         """
         variable = channel.variable
-        assert variable.request is not None
+        if variable.request is None:
+            raise TypeError(f"{variable.suffix}: only variables with a request can be written")
         request = partial(variable.request, self._connection, value)
         is_stop = (variable.suffix, value) in STOPS
         await (self._requests.stop(request) if is_stop else self._requests.execute(request))
@@ -167,13 +168,13 @@ async def _serve(
         """Log why caproto stopped to serve a connection, such as bytes that break the protocol."""
         log(f"connection: {one_line_error(report['exception']) if 'exception' in report else report['message']}")
 
-    loop, task = asyncio.get_running_loop(), asyncio.current_task()
-    assert task is not None
+    loop = asyncio.get_running_loop()
     loop.set_exception_handler(log_broken_connection)
+    serving = asyncio.ensure_future(context.run(startup_hook=begin))
     for number in (signal.SIGINT, signal.SIGTERM):
-        loop.add_signal_handler(number, task.cancel)
+        loop.add_signal_handler(number, serving.cancel)
     try:
-        await context.run(startup_hook=begin)  # Returns when the task is cancelled.
+        await serving  # Returns when it is cancelled.
     finally:
         channels.close()
 
