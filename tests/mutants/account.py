@@ -1,4 +1,4 @@
-"""What came of the mutants: results kept line by line, mutants that change nothing, and the table by room."""
+"""Results of the mutants (one JSON line each), list of mutants that change no behaviour, and scores of the rooms."""
 
 from __future__ import annotations
 
@@ -18,17 +18,17 @@ EQUIVALENT = Path(__file__).with_name("equivalent.toml")
 
 
 class Verdict(StrEnum):
-    """What the tests made of a mutant."""
+    """The outcome of the tests of a mutant."""
 
     DIED = "died"
     TIMED_OUT = "timed out"
     SURVIVED = "survived"
     UNTESTED = "untested"
-    """No test of the room executes its line: it survived, and nothing had to be run to know it."""
+    """No test of the room executes the changed line: the mutant survived, and no test was run."""
 
 
 class Result(NamedTuple):
-    """A verdict, how long it took, and the test that killed the mutant."""
+    """A mutant's verdict, the duration of its tests, and the first test that failed (empty if none did)."""
 
     key: str
     verdict: Verdict
@@ -37,7 +37,7 @@ class Result(NamedTuple):
 
 
 class Equivalent(NamedTuple):
-    """A change that no test can see, and why; found again by its lines, wherever in the file they stand by now."""
+    """A change that alters no behaviour, and the reason; it is identified by its lines, not by their numbers."""
 
     file: str
     before: str
@@ -45,35 +45,33 @@ class Equivalent(NamedTuple):
     reason: str
 
 
-def equivalents(path: Path = EQUIVALENT) -> list[Equivalent]:
-    """The kept list of mutants that change no behaviour."""
+def read_equivalents(path: Path = EQUIVALENT) -> list[Equivalent]:
+    """Return the listed mutants that change no behaviour."""
     return [Equivalent(**entry) for entry in tomllib.loads(path.read_text(encoding="utf-8")).get("equivalent", [])]
 
 
-def kept(path: Path) -> dict[str, Result]:
-    """Results by key, the newest of each; nothing where the file is not there yet."""
+def read_results(path: Path) -> dict[str, Result]:
+    """Return the newest result of each mutant by its key; an empty dict if the file does not exist."""
     lines = path.read_text(encoding="utf-8").splitlines() if path.exists() else []
-    told = (json.loads(line) for line in lines)
-    return {
-        entry["key"]: Result(entry["key"], Verdict(entry["verdict"]), entry["seconds"], entry["test"]) for entry in told
-    }
+    rows = (json.loads(line) for line in lines)
+    return {row["key"]: Result(row["key"], Verdict(row["verdict"]), row["seconds"], row["test"]) for row in rows}
 
 
-def keep(path: Path, mutant: Mutant, result: Result) -> None:
-    """Add one result."""
+def append_result(path: Path, mutant: Mutant, result: Result) -> None:
+    """Append the result of a mutant to the file `path`."""
     path.parent.mkdir(parents=True, exist_ok=True)
     with path.open("a", encoding="utf-8") as file:
         file.write(json.dumps({**mutant._asdict(), **result._asdict()}) + "\n")
 
 
-def table(
-    mutants: Iterable[Mutant], results: dict[str, Result], known: Iterable[Equivalent]
+def summarise_results(
+    mutants: Iterable[Mutant], results: dict[str, Result], equivalents: Iterable[Equivalent]
 ) -> tuple[Table, list[Mutant], float]:
-    """The table by room, the survivors that are not known to be equivalent, and the score of all rooms.
+    """Return the table by room, the survivors that are not listed as equivalent, and the score of all rooms (0 … 1).
 
-    The score is the share that died or timed out among those that are not equivalent.
+    The score is the share of mutants that died or timed out, among the mutants that are not equivalent.
     """
-    harmless = {(entry.file, entry.before, entry.after) for entry in known}
+    equivalent_lines = {(entry.file, entry.before, entry.after) for entry in equivalents}
     rooms: dict[str, Counter[str]] = {}
     survivors = []
     for mutant in mutants:
@@ -81,20 +79,21 @@ def table(
             continue
         verdict = str(result.verdict)
         if result.verdict in (Verdict.SURVIVED, Verdict.UNTESTED):
-            if (mutant.file, mutant.before, mutant.after) in harmless:
+            if (mutant.file, mutant.before, mutant.after) in equivalent_lines:
                 verdict = "equivalent"
             else:
                 survivors.append(mutant)
         rooms.setdefault(mutant.room, Counter())[verdict] += 1
-    whole: Counter[str] = sum(rooms.values(), Counter())
+    totals: Counter[str] = sum(rooms.values(), Counter())
     columns = ("died", "timed out", "survived", "untested", "equivalent")
-    shown = Table("room", "drawn", *columns, "score")
-    for name, counts in (*rooms.items(), ("all", whole)):
+    table = Table("room", "drawn", *columns, "score")
+    for name, counts in (*rooms.items(), ("all", totals)):
         score = f"{100 * _score(counts):.0f} %"
-        shown.add_row(name, str(counts.total()), *(str(counts[column]) for column in columns), score)
-    return shown, survivors, _score(whole)
+        table.add_row(name, str(counts.total()), *(str(counts[column]) for column in columns), score)
+    return table, survivors, _score(totals)
 
 
 def _score(counts: Counter[str]) -> float:
-    judged = counts.total() - counts["equivalent"]
-    return (counts["died"] + counts["timed out"]) / judged if judged else 1.0
+    """Return the share of mutants that died or timed out, without the equivalent ones; 1 if there are none."""
+    counted = counts.total() - counts["equivalent"]
+    return (counts["died"] + counts["timed out"]) / counted if counted else 1.0

@@ -9,7 +9,7 @@ from tests.mutants.rooms import ROOT
 
 
 class Change(NamedTuple):
-    """One operator of cosmic-ray at its occurrence in a module, numbered as cosmic-ray numbers them."""
+    """An operator of cosmic-ray, and the number (from 0) of the place in a module where it acts."""
 
     operator: str
     occurrence: int
@@ -28,11 +28,11 @@ class Mutant(NamedTuple):
 
     @property
     def place(self) -> str:
-        """As an editor jumps to it."""
+        """FILE:LINE, a form that editors can open."""
         return f"{self.file}:{self.line}"
 
     @property
     def key(self) -> str:
-        """A name that lasts as long as the file is as it is."""
+        """Identifier of the mutant; it changes when the file's contents change."""
         digest = hashlib.sha256((ROOT / self.file).read_bytes()).hexdigest()[:12]
         return f"{self.file} {digest} {self.operator} {self.occurrence}"

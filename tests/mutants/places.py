@@ -1,8 +1,8 @@
-"""Mistakes that can be planted in a module: cosmic-ray's operators, at the places where they change a promise.
+"""Mistakes that can be planted in a module: cosmic-ray's operators, at the places where they change behaviour.
 
 Left out, because they change no promised behaviour: annotations and unions of types, messages (f-strings and the
 arguments of what is raised), `__repr__` and `__str__`, log calls, docstrings and other texts, decorators. Left out too:
-operators that nobody confuses, such as `+` and `<<`; almost every such mutant is a TypeError.
+operators that programmers do not confuse, such as `+` and `<<`: almost every such mutant raises a TypeError.
 """
 
 from __future__ import annotations
@@ -38,16 +38,16 @@ Position = tuple[int, int]
 
 
 class _Positions(Visitor):
-    """The starts of all places where each operator can act, in the order of their occurrences."""
+    """A visitor that collects the start of every place where an operator can act, in the order of occurrence."""
 
     def __init__(self) -> None:
         self._operators = [(name, _operator(name)) for name in OPERATORS]
         self.starts: dict[str, list[Position]] = {name: [] for name in OPERATORS}
 
     def visit(self, node: Any) -> Any:
-        """Note the positions in `node`, unchanged."""
+        """Add the positions of the operators that act on `node`; return the node unchanged."""
         if node.type in ("name", "string", "newline") or getattr(node, "value", "") in PUNCTUATION:
-            return node  # nothing acts on these, and they are most of a module
+            return node  # No operator acts on these nodes, which are most of a module.
         for name, operator in self._operators:
             self.starts[name] += [start for start, _ in operator.mutation_positions(node)]
         return node
@@ -55,35 +55,37 @@ class _Positions(Visitor):
 
 @cache
 def _operator(name: str) -> Any:
+    """Return an operator of cosmic-ray by its name."""
     return cosmic_ray.plugins.get_operator(f"core/{name}")()
 
 
 def places(source: str) -> dict[Position, list[Change]]:
-    """The places of a module where a mistake changes behaviour, in order, each with the changes possible there."""
-    positions, left_out = _Positions(), _left_out(source)
+    """Return the places of a module where a mistake changes behaviour, in order, with the possible changes of each."""
+    positions, excluded = _Positions(), _excluded_spans(source)
     positions.walk(get_ast(source))
-    found: dict[Position, list[Change]] = {}
+    changes_at: dict[Position, list[Change]] = {}
     for name, starts in positions.starts.items():
         for occurrence, start in enumerate(starts):
-            if not any(first <= start < last for first, last in left_out):
-                found.setdefault(start, []).append(Change(name, occurrence))
-    return dict(sorted(found.items()))
+            if not any(first <= start < last for first, last in excluded):
+                changes_at.setdefault(start, []).append(Change(name, occurrence))
+    return dict(sorted(changes_at.items()))
 
 
-def mutated(source: str, change: Change) -> str | None:
-    """The module with one change; None where that is no Python, or no change."""
+def apply_change(source: str, change: Change) -> str | None:
+    """Return the module's source with one change; None if it is no valid Python or does not change."""
     try:
         text = mutate_code(source, _operator(change.operator), change.occurrence)
-    except AttributeError:  # cosmic-ray's, for an exception named by its module
+    except AttributeError:  # cosmic-ray raises it for an exception with the name of its module.
         return None
     try:
         ast.parse(text or "")
     except SyntaxError:
         return None
-    return None if text is None else text.replace("CosmicRayTestingException", "GeneratorExit")  # that nobody raises
+    return None if text is None else text.replace("CosmicRayTestingException", "GeneratorExit")  # No code raises it.
 
 
-def _left_out(source: str) -> list[tuple[Position, Position]]:
+def _excluded_spans(source: str) -> list[tuple[Position, Position]]:
+    """Return the (start, end) of the parts of a module in which no mistake is planted."""
     lines = source.splitlines()
 
     def position(line: int, byte: int) -> Position:
@@ -91,12 +93,12 @@ def _left_out(source: str) -> list[tuple[Position, Position]]:
 
     return [
         (position(node.lineno, node.col_offset), position(node.end_lineno, node.end_col_offset))
-        for node in _unpromised(ast.parse(source))
+        for node in _excluded_nodes(ast.parse(source))
     ]
 
 
-def _unpromised(tree: ast.AST) -> Iterator[Any]:
-    """Nodes whose text is no behaviour."""
+def _excluded_nodes(tree: ast.AST) -> Iterator[Any]:
+    """Yield the nodes that the module's docstring leaves out."""
     for node in ast.walk(tree):
         match node:
             case ast.JoinedStr():

@@ -1,4 +1,4 @@
-"""The rooms that are mutated, and the tests of each: data for `make mutants`."""
+"""The rooms (parts of the program) in which `make mutants` plants mistakes, and the tests of each room."""
 
 from __future__ import annotations
 
@@ -8,17 +8,17 @@ from pathlib import Path
 from typing import NamedTuple
 
 ROOT = Path(__file__).resolve().parents[2]
-LEAST = 25
-"""Mutants of a room, where as many are asked for and it has as many places."""
+MIN_PER_ROOM = 25
+"""Smallest number of mutants of a room, if the total suffices and the room has as many places."""
 
 
 class Room(NamedTuple):
-    """Sources and tests, folders or files from the root of the tree; `without` are sources that another room has."""
+    """Folder of sources (except its subfolder `without`) and folders or files of tests, from the tree's root."""
 
     sources: str
     tests: tuple[str, ...]
     compiled: bool
-    """Whether kernels are compiled in its tests: only where no kernel is made from its sources, for that takes long."""
+    """Whether tests run with compiled kernels: only if the sources contain no kernel, because compiling takes long."""
     without: str = ""
 
 
@@ -78,15 +78,15 @@ ROOMS = {
 }
 
 
-def sources_of(room: Room, tree: Path = ROOT) -> list[str]:
-    """The room's modules, as paths from the root of the tree."""
-    found = sorted(path.relative_to(tree).as_posix() for path in (tree / room.sources).rglob("*.py"))
-    return [path for path in found if not (room.without and path.startswith(room.without + "/"))]
+def room_sources(room: Room, tree: Path = ROOT) -> list[str]:
+    """Return the room's modules, as paths from the root of the tree."""
+    modules = sorted(path.relative_to(tree).as_posix() for path in (tree / room.sources).rglob("*.py"))
+    return [path for path in modules if not (room.without and path.startswith(room.without + "/"))]
 
 
 @cache
 def room_tests(room: Room) -> list[str]:
-    """The room's test files, as paths from the root of the tree: those listed, then those that name its package."""
+    """Return the room's test files, as paths from the tree's root: those listed, then others that name its package."""
     listed = [
         path
         for place in room.tests
@@ -96,18 +96,18 @@ def room_tests(room: Room) -> list[str]:
 
 
 def _tests_that_name(room: Room) -> list[Path]:
-    """Return the test files in which the name of the room's package stands."""
+    """Return the test files that contain the name of the room's package."""
     name = re.compile(rf"\b{re.escape('rtloop.' + room.sources.removeprefix('rtloop/').replace('/', '.'))}\b")
     return [path for path in sorted((ROOT / "tests").rglob("test_*.py")) if name.search(path.read_text("utf-8"))]
 
 
-def shares(counts: dict[str, int], total: int, least: int = LEAST) -> dict[str, int]:
-    """The number of mutants of each room: `least` (where `total` suffices), and a share of the rest by its places."""
-    base = min(least, total // len(counts))
-    rest, places_in_all = total - base * len(counts), sum(counts.values())
-    exact = {name: rest * count / places_in_all for name, count in counts.items()}
-    given = {name: base + int(share) for name, share in exact.items()}
+def shares(counts: dict[str, int], total: int, minimum: int = MIN_PER_ROOM) -> dict[str, int]:
+    """Return each room's number of mutants: `minimum` if `total` suffices; the rest by its places."""
+    base = min(minimum, total // len(counts))
+    remainder, places_in_all = total - base * len(counts), sum(counts.values())
+    exact = {name: remainder * count / places_in_all for name, count in counts.items()}
+    numbers = {name: base + int(share) for name, share in exact.items()}
     largest = sorted(counts, key=lambda name: exact[name] % 1, reverse=True)
-    for name in largest[: total - sum(given.values())]:
-        given[name] += 1
-    return {name: min(number, counts[name]) for name, number in given.items()}
+    for name in largest[: total - sum(numbers.values())]:
+        numbers[name] += 1
+    return {name: min(number, counts[name]) for name, number in numbers.items()}

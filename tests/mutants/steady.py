@@ -1,4 +1,4 @@
-"""Tests that run in the same way each time, and no longer than they must: options and a plug-in of pytest."""
+"""Options and a plug-in of pytest for tests that run alike each time and no longer than necessary."""
 
 from __future__ import annotations
 
@@ -9,21 +9,21 @@ from tests.mutants.uncompiled import install
 
 OPTIONS = (
     *("-q", "--tb=line", "-p", "no:cacheprovider", "-p", "no:xdist"),
-    *("-p", "no:unraisableexception"),  # a process that a test leaves behind would end the whole session
-    *("-W", "ignore::pytest.PytestAssertRewriteWarning"),  # of plug-ins that the forking process has imported
+    *("-p", "no:unraisableexception"),  # A process that a test leaves running would end the whole session.
+    *("-W", "ignore::pytest.PytestAssertRewriteWarning"),  # The forking process has already imported plug-ins.
 )
 EXAMPLES = 20
-"""Of a property that asks for more, for uncompiled kernels take a thousand times as long as compiled ones."""
+"""Largest number of examples of a property: uncompiled kernels take a thousand times as long as compiled ones."""
 
 
-class Steady:
-    """Hypothesis draws the same examples each time, and does not look for the smallest that fails."""
+class DeterministicTests:
+    """Plug-in with which hypothesis draws the same examples each time and does not shrink an example that fails."""
 
     def __init__(self, *, compiled: bool) -> None:
         self._compiled = compiled
 
     def pytest_configure(self) -> None:
-        """Before any test's module is imported."""
+        """Load the profile of hypothesis and the uncompiled kernels before pytest imports a test module."""
         if not self._compiled:
             install()
         settings.register_profile(
@@ -37,9 +37,9 @@ class Steady:
         settings.load_profile("steady")
 
     def pytest_collection_modifyitems(self, items: list[pytest.Item]) -> None:
-        """Fewer examples of the properties that ask for many."""
+        """Limit the examples of each property to EXAMPLES."""
         for item in items:
             function = getattr(item, "function", None)
-            asked: settings | None = getattr(function, "_hypothesis_internal_use_settings", None)
-            if asked is not None and asked.max_examples > EXAMPLES:
-                vars(function)["_hypothesis_internal_use_settings"] = settings(asked, max_examples=EXAMPLES)
+            own_settings: settings | None = getattr(function, "_hypothesis_internal_use_settings", None)
+            if own_settings is not None and own_settings.max_examples > EXAMPLES:
+                vars(function)["_hypothesis_internal_use_settings"] = settings(own_settings, max_examples=EXAMPLES)

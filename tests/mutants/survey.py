@@ -1,4 +1,4 @@
-"""Which lines each test of a room executes, and how long it takes, without any mistake: a plug-in of pytest."""
+"""A plug-in of pytest that records the lines and the duration of each test of a room, in the code without mistakes."""
 
 from __future__ import annotations
 
@@ -14,21 +14,21 @@ from typing import Any
 import coverage
 import pytest
 
-from tests.mutants.steady import Steady
+from tests.mutants.steady import DeterministicTests
 
 CPU_LIMIT_S, COMPILED_CPU_LIMIT_S = 2.0, 20.0
-"""A test that computes for longer, traced and with kernels that are uncompiled or compiled, is left out."""
+"""Limits of processor time of a traced test, with uncompiled and with compiled kernels; slower ones are left out."""
 COVERAGE = str(Path(coverage.__file__).parent)
 SHARED = "shared"
-"""The test of a file under whose name lines of its wider fixtures stand."""
+"""Name, in place of a test's, under which the lines of a file's fixtures with a wider scope are recorded."""
 
 
 class TooLong(BaseException):
-    """A test took more than its share of the processor."""
+    """A test exceeded its limit of processor time."""
 
 
-class Survey(Steady):
-    """Notes the seconds and the lines of every test that passes."""
+class Survey(DeterministicTests):
+    """Records the duration and the executed lines of every test that passes."""
 
     def __init__(self, root: Path, *, compiled: bool) -> None:
         super().__init__(compiled=compiled)
@@ -37,12 +37,12 @@ class Survey(Steady):
         self.seconds: dict[str, float] = {}
         self.failed: dict[str, str] = {}
         self.starting: set[str] = set()
-        """Tests that start processes, in which no line is seen."""
+        """Tests that start processes; the lines executed there are not recorded."""
         self._coverage = coverage.Coverage(
             data_file=None, config_file=False, include=[f"{root}/{place}/*" for place in ("rtloop", "hil", "drivers")]
         )
         self._too_long: set[str] = set()
-        """Functions of which one case was too long, so that the others need not be tried."""
+        """Test functions with a case that took too long; their other cases are skipped."""
         self._current = ""
         self._watch_processes()
         signal.signal(signal.SIGPROF, _raise_too_long)
@@ -52,15 +52,15 @@ class Survey(Steady):
         """Add the current test to `starting` whenever a process is started."""
         start = subprocess.Popen.__init__
 
-        def watched(popen: Any, *arguments: Any, **options: Any) -> None:
+        def start_and_record(popen: Any, *arguments: Any, **options: Any) -> None:
             self.starting.add(self._current)
             start(popen, *arguments, **options)
 
-        subprocess.Popen.__init__ = watched
+        subprocess.Popen.__init__ = start_and_record
 
     @pytest.hookimpl(wrapper=True)
     def pytest_runtest_protocol(self, item: pytest.Item) -> Iterator[None]:
-        """Run one test under its own name."""
+        """Record the lines and the duration of a test under its name."""
         self._coverage.switch_context(item.nodeid)
         self._current, start = item.nodeid, time.monotonic()
         try:
@@ -70,14 +70,14 @@ class Survey(Steady):
             self._coverage.switch_context("")
 
     def pytest_runtest_setup(self, item: pytest.Item) -> None:
-        """Leave a case out whose like was too long."""
+        """Skip a case if another case of its function took too long."""
         if item.nodeid.partition("[")[0] in self._too_long:
             pytest.skip("another case was too long")
 
     @pytest.hookimpl(wrapper=True)
     def pytest_runtest_call(self, item: pytest.Item) -> Iterator[None]:
-        """For so long and no longer."""
-        signal.setitimer(signal.ITIMER_PROF, self._limit_s, self._limit_s / 10)  # again, where a callback swallowed it
+        """Fail a test that exceeds the limit of processor time."""
+        signal.setitimer(signal.ITIMER_PROF, self._limit_s, self._limit_s / 10)  # A callback may swallow the first.
         try:
             return (yield)
         except TooLong:
@@ -88,7 +88,7 @@ class Survey(Steady):
 
     @pytest.hookimpl(wrapper=True)
     def pytest_fixture_setup(self, fixturedef: Any, request: Any) -> Iterator[None]:
-        """What a wider fixture executes belongs to every test of the file."""
+        """Record the lines of a fixture with a wider scope than a function for all tests of its file."""
         if fixturedef.scope == "function":
             return (yield)
         item = request._pyfuncitem.nodeid
@@ -99,12 +99,12 @@ class Survey(Steady):
             self._coverage.switch_context(item)
 
     def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
-        """Note what did not pass, or was skipped."""
+        """Record the reason why a test failed or was skipped."""
         if report.outcome != "passed":
             self.failed[report.nodeid] = str(report.longrepr)[-400:]
 
     def result(self) -> dict[str, Any]:
-        """Seconds of each test that passed, why others did not, which start processes, and the lines of all by file."""
+        """Return durations of passed tests, reasons of the others, tests that start processes, and lines by file."""
         self._coverage.stop()
         data = self._coverage.get_data()
         lines: dict[str, dict[str, list[int]]] = {}
@@ -123,7 +123,7 @@ class Survey(Steady):
 
 
 def _raise_too_long(_: int, frame: FrameType | None) -> None:
-    """Raise TooLong, but not within coverage, which would keep its lock for ever; the timer comes again."""
+    """Raise TooLong, except within coverage, which would never release its lock; the timer repeats the signal."""
     if frame is not None and frame.f_code.co_filename.startswith(COVERAGE):
         return
-    raise TooLong("too many seconds of the processor")
+    raise TooLong("the test exceeded its limit of processor time")

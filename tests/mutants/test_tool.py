@@ -1,4 +1,4 @@
-"""The tool that plants mistakes tells the dead from the survivors, and counts them."""
+"""The tool that plants mistakes tells dead mutants from survivors, computes their score and selects tests."""
 
 from __future__ import annotations
 
@@ -11,9 +11,18 @@ from dataclasses import dataclass
 import pytest
 
 from tests.mutants import choice
-from tests.mutants.account import EQUIVALENT, Equivalent, Result, Verdict, equivalents, keep, kept, table
+from tests.mutants.account import (
+    EQUIVALENT,
+    Equivalent,
+    Result,
+    Verdict,
+    append_result,
+    read_equivalents,
+    read_results,
+    summarise_results,
+)
 from tests.mutants.mutant import Mutant
-from tests.mutants.rooms import LEAST, ROOMS, ROOT, room_tests, shares, sources_of
+from tests.mutants.rooms import MIN_PER_ROOM, ROOMS, ROOT, room_sources, room_tests, shares
 from tests.mutants.trees import Tree
 from tests.mutants.trial import Trial
 
@@ -29,19 +38,21 @@ def test_a_value_beyond_the_limit_is_the_limit():
 """
 
 
-def mutant(room: str = "kernel", after: str = "if value <= limit:") -> Mutant:
+def make_mutant(room: str = "kernel", after: str = "if value <= limit:") -> Mutant:
+    """Return a mutant of line 2 of a module; `after` is the changed line."""
     return Mutant(room, "rtloop/foundation/modal.py", 2, "operator", hash(after), "if value > limit:", after)
 
 
 @dataclass
 class Scratch:
-    """A project of one module and one test in a temporary folder."""
+    """A project of one module with tests, in a temporary folder."""
 
     tree: Tree
 
     def verdict(self, text: str, tests: tuple[str, ...]) -> Result:
+        """Run `tests` with `text` as the module's source; return the result."""
         trial = Trial(
-            self.tree, mutant()._replace(file="rtloop/limits.py"), text, dict.fromkeys(tests, 1.0), compiled=True
+            self.tree, make_mutant()._replace(file="rtloop/limits.py"), text, dict.fromkeys(tests, 1.0), compiled=True
         )
         while (result := trial.result()) is None:
             time.sleep(0.01)
@@ -50,6 +61,7 @@ class Scratch:
 
 @pytest.fixture
 def scratch(tmp_path, monkeypatch):
+    """Return a scratch project whose mutants all have the key "key"."""
     project = tmp_path / "project"
     files = {
         "rtloop/limits.py": SOURCE,
@@ -88,22 +100,22 @@ def test_a_copy_leaves_out_recordings_of_the_project_and_no_folder_of_tests(scra
 def test_every_room_gets_its_share():
     counts = {"small": 30, "middle": 300, "large": 3000}
     assert shares(counts, 12) == {"small": 4, "middle": 4, "large": 4}
-    given = shares(counts, 175)
-    assert sum(given.values()) == 175
-    assert given == {"small": LEAST + 1, "middle": LEAST + 9, "large": LEAST + 90}
+    numbers = shares(counts, 175)
+    assert sum(numbers.values()) == 175
+    assert numbers == {"small": MIN_PER_ROOM + 1, "middle": MIN_PER_ROOM + 9, "large": MIN_PER_ROOM + 90}
     assert shares({"small": 3, "large": 3000}, 100)["small"] == 3
 
 
 def test_every_room_has_sources_and_tests_and_no_source_is_in_two():
-    sources = [path for room in ROOMS.values() for path in sources_of(room)]
+    sources = [path for room in ROOMS.values() for path in room_sources(room)]
     assert len(sources) == len(set(sources))
     for room in ROOMS.values():
-        assert sources_of(room)
+        assert room_sources(room)
         assert all((ROOT / path).is_file() for path in room_tests(room))
 
 
 def test_each_mutant_that_is_called_equivalent_still_fits_its_source():
-    for entry in equivalents(EQUIVALENT):
+    for entry in read_equivalents(EQUIVALENT):
         text = " ".join(line.strip() for line in (ROOT / entry.file).read_text(encoding="utf-8").splitlines())
         assert entry.before in text, entry
         assert entry.after != entry.before, entry
@@ -112,30 +124,30 @@ def test_each_mutant_that_is_called_equivalent_still_fits_its_source():
 
 def test_the_score_counts_deaths_among_mutants_that_change_something():
     verdicts = [Verdict.DIED, Verdict.TIMED_OUT, Verdict.SURVIVED, Verdict.UNTESTED, Verdict.SURVIVED]
-    mutants = [mutant(after=str(number)) for number in range(len(verdicts) + 1)]
+    mutants = [make_mutant(after=str(number)) for number in range(len(verdicts) + 1)]
     results = {
-        one.key: Result(one.key, verdict, 1.0, "") for one, verdict in zip(mutants, verdicts, strict=False)
-    }  # the last was not tried
-    known = [Equivalent(mutants[4].file, mutants[4].before, mutants[4].after, "a reason")]
-    _, survivors, score = table(mutants, results, known)
+        mutant.key: Result(mutant.key, verdict, 1.0, "") for mutant, verdict in zip(mutants, verdicts, strict=False)
+    }  # The last mutant was not tried.
+    equivalents = [Equivalent(mutants[4].file, mutants[4].before, mutants[4].after, "a reason")]
+    _, survivors, score = summarise_results(mutants, results, equivalents)
     assert survivors == mutants[2:4]
     assert score == 0.5
 
 
 def test_the_newest_result_of_a_mutant_counts(tmp_path):
-    path, one = tmp_path / "folder" / "results.jsonl", mutant()
-    assert kept(path) == {}
+    path, mutant = tmp_path / "folder" / "results.jsonl", make_mutant()
+    assert read_results(path) == {}
     for verdict in (Verdict.SURVIVED, Verdict.DIED):
-        keep(path, one, Result(one.key, verdict, 1.5, "a test"))
-    assert kept(path) == {one.key: Result(one.key, Verdict.DIED, 1.5, "a test")}
+        append_result(path, mutant, Result(mutant.key, verdict, 1.5, "a test"))
+    assert read_results(path) == {mutant.key: Result(mutant.key, Verdict.DIED, 1.5, "a test")}
 
 
 def test_a_test_file_that_cannot_be_collected_stops_the_survey(scratch, tmp_path, monkeypatch):
     (scratch.tree.root / "tests" / "test_limits.py").write_text("import rtloop.no_such_module\n")
     monkeypatch.setattr(choice, "room_tests", lambda room: ["tests/test_limits.py"])
-    monkeypatch.setattr(choice.Choice, "_path", lambda self, file, compiled: tmp_path / "survey.json")
+    monkeypatch.setattr(choice.Selection, "_path", lambda self, file, compiled: tmp_path / "survey.json")
     with pytest.raises(RuntimeError, match=r"survey survey: exit code is 2; allowed: 0, 1\n(.|\n)*no_such_module"):
-        choice.Choice(tmp_path).survey({"analysis"}, [scratch.tree])
+        choice.Selection(tmp_path).survey({"analysis"}, [scratch.tree])
 
 
 def test_loop_and_drivers_can_be_imported_without_the_compiler():
@@ -149,9 +161,9 @@ def test_a_survey_knows_lines_seconds_and_the_tests_that_start_processes(scratch
     test = scratch.tree.root / "tests" / "test_limits.py"
     test.write_text(TEST + "\n\ndef test_of_a_process():\n    import subprocess\n    subprocess.run(['true'])\n")
     monkeypatch.setattr(choice, "room_tests", lambda room: ["tests/test_limits.py"])
-    monkeypatch.setattr(choice.Choice, "_path", lambda self, file, compiled: tmp_path / "survey.json")
-    surveyed = choice.Choice(tmp_path)
-    surveyed.survey({"analysis"}, [scratch.tree])
-    line = mutant("analysis")._replace(file="rtloop/limits.py", line=2)
-    assert list(surveyed.tests(line)) == ["tests/test_limits.py::test_a_value_beyond_the_limit_is_the_limit"]
-    assert list(surveyed.second_look(line)) == ["tests/test_limits.py::test_of_a_process"]
+    monkeypatch.setattr(choice.Selection, "_path", lambda self, file, compiled: tmp_path / "survey.json")
+    selection = choice.Selection(tmp_path)
+    selection.survey({"analysis"}, [scratch.tree])
+    line = make_mutant("analysis")._replace(file="rtloop/limits.py", line=2)
+    assert list(selection.tests(line)) == ["tests/test_limits.py::test_a_value_beyond_the_limit_is_the_limit"]
+    assert list(selection.second_round(line)) == ["tests/test_limits.py::test_of_a_process"]

@@ -14,7 +14,7 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[2]
 FOLDERS = ("deploy", "drivers", "hil", "rtloop")
 A_TEST = "tests/test_values.py"
-"""File that setuptools packs into a source archive by itself, and that MANIFEST.in must leave out."""
+"""A test file, which setuptools packs into a source archive unless MANIFEST.in excludes it."""
 SETUPTOOLS = 77
 """Oldest setuptools that reads a licence expression."""
 
@@ -28,7 +28,7 @@ def can_build() -> bool:
 
 
 def copy_tree(target: Path) -> Path:
-    """Copy all that a build may read to a new folder, with links as links and without caches; return the folder."""
+    """Copy all files that a build may read to a new folder, links as links, without caches; return the folder."""
     ignored = shutil.ignore_patterns("__pycache__", "*.pyc", ".*")
     target.mkdir()
     for folder in FOLDERS:
@@ -45,12 +45,12 @@ def build(kind: str, source: Path, target: Path) -> Path:
     """Build `sdist` or `wheel` of the tree `source` into the folder `target`; return the archive."""
     program = f"import sys; from setuptools import build_meta; print(build_meta.build_{kind}(sys.argv[1]))"
     target.mkdir(exist_ok=True)
-    done = subprocess.run(
+    completed = subprocess.run(
         [sys.executable, "-c", program, str(target)], cwd=source, capture_output=True, text=True,
         env=os.environ | {"PYTHONDONTWRITEBYTECODE": "1"},
     )  # fmt: skip
-    assert done.returncode == 0, done.stderr
-    return target / done.stdout.split()[-1]
+    assert completed.returncode == 0, completed.stderr
+    return target / completed.stdout.split()[-1]
 
 
 def unpack_sdist(sdist: Path, target: Path) -> Path:

@@ -1,6 +1,6 @@
 """Read, print, export and plot a recording as on a system without the calls of Linux: `foreign_system.py FILE FOLDER`.
 
-Modules and functions that Windows does not have are removed before rtloop is imported. Libraries are imported before.
+Modules and functions that Windows lacks are removed after the import of libraries and before the import of rtloop.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ FUNCTIONS = (
     "sched_", "memfd_", "pidfd_", "eventfd", "posix_fa", "O_PATH", "O_NOFOLLOW", "O_CLOEXEC", "O_NONBLOCK", "O_NOCTTY",
     "O_DIRECTORY", "geteuid", "getegid", "getuid", "getgid", "getgroups", "fchown", "chown", "pwrite", "pread",
 )  # fmt: skip
-"""Beginnings of names in `os`."""
+"""Prefixes of the names that Windows lacks in `os`."""
 
 
 class MissingModules(MetaPathFinder):

@@ -23,8 +23,8 @@ def _normal_name(name: str) -> str:
 def test_each_installed_package_is_listed_with_its_version(tmp_path: Path):
     out = tmp_path / "list.json"
     command = [sys.executable, "-m", "cyclonedx_py", "environment", "--output-file", str(out), sys.executable]
-    done = subprocess.run(command, capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
+    completed = subprocess.run(command, capture_output=True, text=True)
+    assert completed.returncode == 0, completed.stderr
     listed = {(_normal_name(part["name"]), part["version"]) for part in json.loads(out.read_bytes())["components"]}
     folders = [path for path in sys.path if "site-packages" in path]
     installed = {(_normal_name(package.name), package.version) for package in distributions(path=folders)}

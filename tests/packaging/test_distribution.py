@@ -1,4 +1,4 @@
-"""Wheel and source archive hold the whole package and nothing else, and each module of the wheel can be imported."""
+"""Wheel and source archive contain the whole package and no other files; each module of the wheel can be imported."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ from tests.packaging.distribution import ROOT, build, can_build, copy_tree, unpa
 pytestmark = pytest.mark.skipif(not can_build(), reason="setuptools is missing or too old to build rtloop")
 
 LINKED = ("drivers", "hil")
-"""Rooms of rtloop that are links to top-level folders."""
-UNPACKED = re.compile(r"(^|/)(tests|__pycache__|\.[^/]*)/|\.(pyc|nbi|nbc|mcap|part)$|~$")
-"""Names that no archive may hold: tests, caches, hidden folders, recordings, backups of editors."""
+"""Folders of rtloop that are links to top-level folders."""
+FORBIDDEN = re.compile(r"(^|/)(tests|__pycache__|\.[^/]*)/|\.(pyc|nbi|nbc|mcap|part)$|~$")
+"""Names that no archive may contain: tests, caches, hidden folders, recordings, backups of editors."""
 IMPORT_ALL = """
 import importlib, sys
 sys.path.insert(0, sys.argv[1])
@@ -38,11 +38,11 @@ import rtloop
 failures += [f"rtloop.{name} rtloop" for name in rtloop.__all__ if name not in dir(rtloop) or not hasattr(rtloop, name)]
 print(*failures, sep="\\n")
 """
-"""Prints a module that cannot be imported with the missing module; a public name that is missing with `rtloop`."""
+"""Prints "MODULE MISSING_MODULE" for each failed import, and "rtloop.NAME rtloop" for a missing public name."""
 
 
-class Built(NamedTuple):
-    """Archives that were built from one copy of the tree, and the wheel that the source archive builds."""
+class Archives(NamedTuple):
+    """Wheel and source archive of one copy of the tree, and the wheel and the folder of the unpacked source archive."""
 
     sdist: Path
     wheel: Path
@@ -51,21 +51,23 @@ class Built(NamedTuple):
 
 
 @pytest.fixture(scope="module")
-def built(tmp_path_factory: pytest.TempPathFactory) -> Built:
+def built(tmp_path_factory: pytest.TempPathFactory) -> Archives:
+    """Return the archives, built once for the tests of this file."""
     folder = tmp_path_factory.mktemp("dist")
     source = copy_tree(folder / "source")
     sdist = build("sdist", source, folder / "dist")
     tree = unpack_sdist(sdist, folder / "unpacked")
-    return Built(sdist, build("wheel", source, folder / "dist"), build("wheel", tree, folder / "second"), tree)
+    return Archives(sdist, build("wheel", source, folder / "dist"), build("wheel", tree, folder / "second"), tree)
 
 
 @pytest.fixture(scope="module")
-def metadata(built: Built) -> Message:
+def metadata(built: Archives) -> Message:
+    """Return the METADATA of the wheel."""
     name = next(name for name in wheel_files(built.wheel) if name.endswith(".dist-info/METADATA"))
     return BytesParser().parsebytes(wheel_files(built.wheel)[name])
 
 
-def test_the_wheel_holds_every_module_and_every_file_of_the_page(built: Built):
+def test_the_wheel_holds_every_module_and_every_file_of_the_page(built: Archives):
     expected = {
         str(Path("rtloop") / file.relative_to(top))
         for top in [ROOT / "rtloop"]
@@ -79,24 +81,24 @@ def test_the_wheel_holds_every_module_and_every_file_of_the_page(built: Built):
 
 
 @pytest.mark.parametrize("archive", ["wheel", "sdist"])
-def test_no_archive_holds_tests_or_caches(built: Built, archive: str):
+def test_no_archive_holds_tests_or_caches(built: Archives, archive: str):
     names = wheel_files(built.wheel) if archive == "wheel" else built.sdist_tree.rglob("*")
     relative = (str(name) if archive == "wheel" else str(Path(name).relative_to(built.sdist_tree)) for name in names)
-    assert [name for name in relative if UNPACKED.search(f"{name}/" if name.endswith("tests") else name)] == []
+    assert [name for name in relative if FORBIDDEN.search(f"{name}/" if name.endswith("tests") else name)] == []
 
 
-def test_the_wheel_holds_rtloop_alone(built: Built):
+def test_the_wheel_holds_rtloop_alone(built: Archives):
     tops = {name.split("/")[0] for name in wheel_files(built.wheel)}
     assert tops == {"rtloop", f"rtloop-{rtloop.__version__}.dist-info"}
 
 
-def test_the_source_archive_builds_the_same_wheel(built: Built):
+def test_the_source_archive_builds_the_same_wheel(built: Archives):
     first, second = wheel_files(built.wheel), wheel_files(built.sdist_wheel)
     assert set(first) == set(second)
     assert [name for name in first if first[name] != second[name] and not name.endswith("/RECORD")] == []
 
 
-def test_the_source_archive_can_install_a_service(built: Built):
+def test_the_source_archive_can_install_a_service(built: Archives):
     needed = ("Makefile", "constraints.txt", "deploy/install", "deploy/paper.toml", "deploy/systemd/rtloop@.service")
     assert [name for name in needed if not (built.sdist_tree / name).is_file()] == []
 
@@ -122,8 +124,8 @@ def test_the_description_has_one_version_in_one_place():
     assert not re.search(r"^version:", (ROOT / "CITATION.cff").read_text(encoding="utf-8"), re.MULTILINE)
 
 
-def test_licences_of_bundled_programs_are_packed(built: Built):
-    """A minified script was written elsewhere: a licence lies beside it, and among the licences of the wheel."""
+def test_licences_of_bundled_programs_are_packed(built: Archives):
+    """The folder of each minified script has its licence, which is among the licences of the wheel too."""
     files = wheel_files(built.wheel)
     licences = [text for name, text in files.items() if ".dist-info/licenses/" in name]
     bundled = {str(Path(name).parent) for name in files if ".min." in name}
@@ -132,7 +134,7 @@ def test_licences_of_bundled_programs_are_packed(built: Built):
 
 
 @pytest.mark.soak
-def test_each_module_and_each_public_name_of_the_wheel_can_be_imported(built: Built, tmp_path: Path):
+def test_each_module_and_each_public_name_of_the_wheel_can_be_imported(built: Archives, tmp_path: Path):
     """A module may need a package of an optional installation; all other packages must be there."""
     with zipfile.ZipFile(built.wheel) as archive:
         archive.extractall(tmp_path)
@@ -142,17 +144,17 @@ def test_each_module_and_each_public_name_of_the_wheel_can_be_imported(built: Bu
         if name.endswith(".py") and not name.endswith("__main__.py")
     ]
     assert len(modules) > 400
-    done = subprocess.run(
+    completed = subprocess.run(
         [sys.executable, "-I", "-c", IMPORT_ALL, str(tmp_path)],
         input="\n".join(modules), capture_output=True, text=True, cwd=tmp_path,
     )  # fmt: skip
-    assert done.returncode == 0, done.stderr
-    failures = [line.split() for line in done.stdout.splitlines() if line]
+    assert completed.returncode == 0, completed.stderr
+    failures = [line.split() for line in completed.stdout.splitlines() if line]
     assert [line for line in failures if line[1].startswith("rtloop") or find_spec(line[1].split(".")[0])] == []
 
 
-def test_the_index_accepts_the_description(built: Built):
+def test_the_index_accepts_the_description(built: Archives):
     pytest.importorskip("twine", reason="twine is missing: `make dist` installs it")
     command = [sys.executable, "-m", "twine", "check", "--strict", str(built.wheel), str(built.sdist)]
-    done = subprocess.run(command, capture_output=True, text=True)
-    assert done.returncode == 0, done.stdout
+    completed = subprocess.run(command, capture_output=True, text=True)
+    assert completed.returncode == 0, completed.stdout

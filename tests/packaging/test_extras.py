@@ -1,4 +1,4 @@
-"""docs/installation.md names every extra of a user with its packages, as pyproject.toml has them."""
+"""The table of docs/installation.md names every extra for users with its packages, as pyproject.toml does."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from tests.packaging.distribution import ROOT
 
 DEVELOPERS = {"api-test", "bench", "browser", "mutants", "release", "test"}
 KEPT_NAMES = {"can"}
-"""Extras without a package of their own."""
+"""Extras without packages, kept for old commands."""
 EXTRAS: dict[str, list[str]] = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
 PAGE = (ROOT / "docs" / "installation.md").read_text()
 
 
 def rows() -> dict[str, set[str]]:
-    """Words of the column `packages` of the page's table by extra."""
+    """Return the words of the column `packages` in the page's table, by extra."""
     table = {}
     for line in PAGE.splitlines():
         cells = [cell.strip() for cell in line.split("|")]

@@ -1,4 +1,4 @@
-"""A recording can be read, exported and plotted where nothing can be driven: without the calls of Linux."""
+"""A recording can be read, exported and plotted on a system without Linux's calls, where no loop can run."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ def test_a_recording_is_read_exported_and_plotted_without_the_calls_of_linux(tmp
     pytest.importorskip("matplotlib", reason="matplotlib is missing: the extra 'plot' installs it")
     (recording,) = record(tmp_path / "run.mcap", scheduled(), TICKS)
     program = Path(__file__).with_name("foreign_system.py")
-    done = subprocess.run(
+    completed = subprocess.run(
         [sys.executable, str(program), str(recording), str(tmp_path)], capture_output=True, text=True,
         env=os.environ | {"PYTHONPATH": str(ROOT), "MPLBACKEND": "agg"},
     )  # fmt: skip
-    assert done.returncode == 0, done.stderr
-    lines = done.stdout.splitlines()
+    assert completed.returncode == 0, completed.stderr
+    lines = completed.stdout.splitlines()
     assert lines[0] == f"ticks {TICKS}"
     assert {"done info", "done export", "done plot"} <= set(lines)
     assert (tmp_path / "a.png").read_bytes().startswith(b"\x89PNG")

@@ -1,4 +1,4 @@
-"""What a release needs besides the package: news, citation, security policy and a workflow."""
+"""News fragments, changelog, citation file and workflows are complete and consistent for a release."""
 
 from __future__ import annotations
 
@@ -37,10 +37,10 @@ def test_news_begin_below_the_introduction_of_the_changelog():
 def test_a_draft_of_the_news_holds_every_fragment():
     pytest.importorskip("towncrier", reason="towncrier is missing: `make news` installs it")
     command = [sys.executable, "-m", "towncrier", "build", "--draft", "--version", "9.9.9"]
-    done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT)
-    assert done.returncode == 0, done.stderr
-    assert "## 9.9.9 (" in done.stdout
-    printed = " ".join(done.stdout.split())
+    completed = subprocess.run(command, capture_output=True, text=True, cwd=ROOT)
+    assert completed.returncode == 0, completed.stderr
+    assert "## 9.9.9 (" in completed.stdout
+    printed = " ".join(completed.stdout.split())
     for file in NEWS.glob("+*.md"):
         assert " ".join(file.read_text(encoding="utf-8").split()) in printed
 

@@ -1,6 +1,6 @@
-"""Plant each mistake in a copy of the tree and run the tests that must go red: `make soak NAME=planted`.
+"""Plant each mistake in a copy of the tree and run the tests that must fail: `make soak NAME=planted`.
 
-Exit code 0 only if every chosen mistake died: each of its tests was green without it and red with it.
+Exit code 0 only if every selected mistake died: each of its tests passed without the mistake and failed with it.
 """
 
 from __future__ import annotations
@@ -19,22 +19,22 @@ from pathlib import Path
 
 from tests.planted.mistakes import ROOT, Mistake, all_mistakes
 
-LONGEST_S = 1200.0
-"""For the tests of one mistake."""
-GREEN, RED = 0, 1
-"""Exit codes of pytest: all tests passed; some failed. With any other one the tests did not run."""
+TESTS_LIMIT_S = 1200.0
+"""Limit for the tests of one mistake."""
+ALL_PASSED, SOME_FAILED = 0, 1
+"""Exit codes of pytest: all tests passed; some failed. After any other code the tests did not run."""
 
 
 class Tree:
-    """A copy of the working tree in a folder of its own, with a cache of compiled code of its own."""
+    """A copy of the working tree in a folder, with a separate cache of compiled code."""
 
     def __init__(self, folder: Path) -> None:
         self.root = folder / "tree"
-        listed = subprocess.run(
+        file_names = subprocess.run(
             ["git", "ls-files", "-z", "--cached", "--others", "--exclude-standard"],
             cwd=ROOT, check=True, capture_output=True, text=True,
         ).stdout  # fmt: skip
-        for name in filter(None, listed.split("\0")):
+        for name in filter(None, file_names.split("\0")):
             if os.path.lexists(ROOT / name):
                 (self.root / name).parent.mkdir(parents=True, exist_ok=True)
                 shutil.copy2(ROOT / name, self.root / name, follow_symlinks=False)
@@ -42,12 +42,12 @@ class Tree:
             **os.environ, "PYTHONPATH": str(self.root), "XDG_CACHE_HOME": str(folder / "cache"), "TMPDIR": str(folder),
             "PYTHONDONTWRITEBYTECODE": "1",
         }  # fmt: skip
-        where = self._run([sys.executable, "-c", "import rtloop; print(rtloop.__file__)"], False)[1].strip()
-        if not Path(where).is_relative_to(self.root):
-            raise SystemExit(f"the copy is not what its tests import: {where}")
+        module_file = self._run([sys.executable, "-c", "import rtloop; print(rtloop.__file__)"], False)[1].strip()
+        if not Path(module_file).is_relative_to(self.root):
+            raise SystemExit(f"the tests of the copy import another rtloop: {module_file}")
 
     def failures(self, tests: Sequence[str], uncompiled: bool) -> tuple[int, list[str]]:
-        """Exit code of pytest on `tests`, and the node ids that failed; code -1 where it took longer than LONGEST_S."""
+        """Return pytest's exit code on `tests` (-1 if it exceeded TESTS_LIMIT_S) and the node ids that failed."""
         code, output = self._run(
             [sys.executable, "-m", "pytest", "-q", "--tb=no", "-rfE", "-p", "no:cacheprovider", *tests], uncompiled
         )
@@ -55,13 +55,14 @@ class Tree:
         return code, [line[1] for line in lines if line[0] in ("FAILED", "ERROR") and len(line) > 1]
 
     def _run(self, command: list[str], uncompiled: bool) -> tuple[int, str]:
+        """Run a command in the tree; return exit code and output, (-1, "") if it exceeded TESTS_LIMIT_S."""
         environment = self._environment | ({"NUMBA_DISABLE_JIT": "1"} if uncompiled else {})
         process = subprocess.Popen(
             command, cwd=self.root, env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
             start_new_session=True,
         )  # fmt: skip
         try:
-            output, _ = process.communicate(timeout=LONGEST_S)
+            output, _ = process.communicate(timeout=TESTS_LIMIT_S)
             return process.returncode, output
         except subprocess.TimeoutExpired:
             return -1, ""
@@ -69,63 +70,66 @@ class Tree:
             _end_session(process)
 
     def verdict(self, mistake: Mistake) -> str:
-        """`died`, or why it did not; the tree is as before afterwards."""
+        """Plant a mistake, run its tests, restore the file; return `died`, or the reason why it did not die."""
         path = self.root / mistake.file
         before = path.read_bytes()
         mistake.plant(self.root)
         try:
-            code, red = self.failures(mistake.tests, mistake.uncompiled)
+            code, failed_tests = self.failures(mistake.tests, mistake.uncompiled)
         finally:
             path.write_bytes(before)
-        if code not in (GREEN, RED):
+        if code not in (ALL_PASSED, SOME_FAILED):
             return "HUNG" if code == -1 else f"BROKEN: its tests did not run (pytest ended with {code})"
-        green = [test for test in mistake.tests if not any(name.startswith(test) for name in red)]
-        return f"SURVIVED: green is {', '.join(green)}" if green else "died"
+        passed_tests = [test for test in mistake.tests if not any(name.startswith(test) for name in failed_tests)]
+        return f"SURVIVED: passed: {', '.join(passed_tests)}" if passed_tests else "died"
 
 
 def _end_session(process: subprocess.Popen[str]) -> None:
-    """End what the tests started and left behind."""
+    """Kill the processes that the tests left running."""
     with contextlib.suppress(ProcessLookupError):
         os.killpg(process.pid, signal.SIGKILL)
     process.wait()
 
 
-def red_without(tree: Tree, mistakes: Sequence[Mistake]) -> list[str]:
-    """Tests that fail in the tree as it is, of those that the mistakes name."""
-    red = []
+def failures_without_mistakes(tree: Tree, mistakes: Sequence[Mistake]) -> list[str]:
+    """Return the tests of `mistakes` that fail in the unchanged tree, and a line for each run that did not complete."""
+    failed_tests = []
     for uncompiled in (False, True):
-        tests = dict.fromkeys(test for one in mistakes if one.uncompiled == uncompiled for test in one.tests)
+        group = [mistake for mistake in mistakes if mistake.uncompiled == uncompiled]
+        tests = dict.fromkeys(test for mistake in group for test in mistake.tests)
         if tests:
             code, failed = tree.failures(list(tests), uncompiled)
-            red += failed
-            if code not in (GREEN, RED):
-                red.append(f"pytest ended with {code} on {', '.join(tests)}")
-    return red
+            failed_tests += failed
+            if code not in (ALL_PASSED, SOME_FAILED):
+                failed_tests.append(f"pytest ended with {code} on {', '.join(tests)}")
+    return failed_tests
 
 
 def main() -> int:
-    """All mistakes, or those in whose name or file one of the words occurs."""
+    """Try all mistakes, or those in whose name or file one of the words occurs; return the exit code."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("words", nargs="*")
     words = parser.parse_args().words
-    chosen = [one for one in all_mistakes() if not words or any(word in f"{one.name} {one.file}" for word in words)]
-    stale = {one.name: fault for one in chosen if (fault := one.fault())}
+    selected = all_mistakes()
+    if words:
+        selected = [m for m in selected if any(word in f"{m.name} {m.file}" for word in words)]
+    stale = {mistake.name: fault for mistake in selected if (fault := mistake.fault())}
     for name, fault in stale.items():
         print(f"STALE     {name}: {fault}")
-    planted = [one for one in chosen if one.name not in stale]
+    plantable = [mistake for mistake in selected if mistake.name not in stale]
     died = 0
     with tempfile.TemporaryDirectory(prefix="rtloop-planted-", ignore_cleanup_errors=True) as folder:
         tree = Tree(Path(folder))
-        if red := red_without(tree, planted):
-            print("red without any mistake, so that nothing can be said:", *red, sep="\n  ")
+        if failed_tests := failures_without_mistakes(tree, plantable):
+            print("tests fail without any mistake, so that no mistake can be tried:", *failed_tests, sep="\n  ")
             return 1
-        for one in planted:
+        for mistake in plantable:
             began_s = time.monotonic()
-            verdict = tree.verdict(one)
+            verdict = tree.verdict(mistake)
             died += verdict == "died"
-            print(f"{time.monotonic() - began_s:6.1f} s  {one.name}: {verdict}", flush=True)
-    print(f"{died} of {len(chosen)} died")
-    return 0 if died == len(chosen) > 0 else 1
+            print(f"{time.monotonic() - began_s:6.1f} s  {mistake.name}: {verdict}", flush=True)
+    print(f"{died} of {len(selected)} died")
+    return 0 if died == len(selected) > 0 else 1
 
 
 if __name__ == "__main__":

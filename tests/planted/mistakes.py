@@ -1,4 +1,4 @@
-"""Planted mistakes as data: TOML files beside this one, an entry a mistake.
+"""Planted mistakes, read from the TOML files of this folder. Each entry is one mistake:
 
     [[mistake]]
     name = "a ramp at 10 kHz never waits"
@@ -8,9 +8,9 @@
     tests = ["tests/engine/test_ramp.py::test_a_ramp_lasts_a_period_for_every_step"]
     uncompiled = true       # optional: the tests run without the compiler, which saves a minute where kernels change
 
-`tests` are node ids of pytest, of which each must go red; one without `[…]` goes red with any of its parameters. The
-mutants in `tests/laws/mutants.py` and `tests/drivers/mutants.py` are another thing: plug-ins that break a contract, as
-classes for the conformance suites.
+`tests` are node ids of pytest, each of which must fail; one without `[…]` fails if one of its cases fails. The mutants
+in `tests/laws/mutants.py` and `tests/drivers/mutants.py` are different: classes that break the contract of a plug-in,
+for the conformance suites.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ ROOT = FOLDER.parents[1]
 
 @dataclass(frozen=True)
 class Mistake:
-    """A mistake that a competent programmer could make, and the tests that it turns red."""
+    """A mistake that a competent programmer could make, and the tests that must fail with it."""
 
     name: str
     file: str
@@ -35,7 +35,7 @@ class Mistake:
     uncompiled: bool = False
 
     def fault(self, root: Path = ROOT) -> str | None:
-        """Why the entry does not fit the tree below `root`; None where it does."""
+        """Return the reason why the entry does not fit the tree below `root`; None if it fits."""
         path = root / self.file
         if not path.is_file():
             return f"{self.file}: there is no such file"
@@ -48,13 +48,13 @@ class Mistake:
         return f"{', '.join(missing)}: there is no such file" if missing else None
 
     def plant(self, root: Path) -> None:
-        """Make the mistake in the tree below `root`."""
+        """Write the mistake into its file in the tree below `root`."""
         path = root / self.file
         path.write_text(path.read_text(encoding="utf-8").replace(self.old, self.new), encoding="utf-8")
 
 
 def all_mistakes() -> list[Mistake]:
-    """Every entry of every file. Raises TypeError for an entry with a key too many or too few."""
+    """Return the mistakes of all files. Raises TypeError for an entry with an unknown or a missing key."""
     mistakes = []
     for path in sorted(FOLDER.glob("*.toml")):
         for entry in tomllib.loads(path.read_text(encoding="utf-8"))["mistake"]:

@@ -1,4 +1,4 @@
-"""The list of planted mistakes fits the tree; `make soak NAME=planted` plants them."""
+"""Every planted mistake fits the current sources, and a stale one is reported."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The site, built once for the tests of this folder."""
+"""The built site for the tests of this folder, and a parser of its pages."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ ROOT = Path(__file__).resolve().parents[2]
 
 
 class Page(HTMLParser):
-    """A built page: its anchors, its links, what it loads, and the text of its tables by the heading above them."""
+    """A built page: its anchors, links, loaded files, and the text of its tables by the heading above them."""
 
     def __init__(self, path: Path) -> None:
         super().__init__()
@@ -49,7 +49,7 @@ class Page(HTMLParser):
             self._cell = []
 
     def handle_endtag(self, tag: str) -> None:
-        """Store a finished cell."""
+        """Add the text of a finished cell to its row."""
         if tag == "td" and self._cell is not None:
             self.rows[self.heading][-1].append("".join(self._cell).strip())
             self._cell = None
@@ -66,7 +66,7 @@ class Page(HTMLParser):
 
 @pytest.fixture(scope="session")
 def site(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Page]:
-    """The pages of the site by their path in it, without ".html"; the strict build reports no warning."""
+    """Build the site strictly, without a warning; return its pages by path, without ".html"."""
     pytest.importorskip("material", reason="mkdocs-material is not installed (extra `test`)")
     folder = tmp_path_factory.mktemp("site")
     build = subprocess.run(

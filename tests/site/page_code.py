@@ -12,13 +12,13 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
 FENCE = re.compile(r"^```([a-z]+)(?: title=\"([^\"]+)\")?\n(.*?)^```$", re.MULTILINE | re.DOTALL)
-ANYTHING = "…"
-"""Stands in an expected line for any text."""
+ANY_TEXT = "…"
+"""Placeholder for any text in an expected line."""
 
 
 @dataclass(frozen=True)
 class Block:
-    """Fenced block of a page: its language, the file that it is, or "", and its text."""
+    """Fenced block of a page: its language, the name of its file (or ""), and its text."""
 
     language: str
     file: str
@@ -47,13 +47,13 @@ def commands(console: str) -> Iterator[tuple[str, list[str]]]:
 
 
 def missing_line(expected: list[str], output: str) -> str | None:
-    """Return the first expected line that does not follow the former ones in `output`; None if all are there.
+    """Return the first expected line that does not follow the earlier ones in `output`; None if all do.
 
-    Blanks count as one blank; ANYTHING matches any text of a line.
+    Several blanks count as one blank; ANY_TEXT matches any text of a line.
     """
     lines = iter([" ".join(line.split()) for line in output.splitlines()])
     for line in expected:
-        pattern = ".*".join(re.escape(part.strip()) for part in " ".join(line.split()).split(ANYTHING))
+        pattern = ".*".join(re.escape(part.strip()) for part in " ".join(line.split()).split(ANY_TEXT))
         if line.strip() and not any(re.fullmatch(pattern, candidate) for candidate in lines):
             return line
     return None
@@ -78,7 +78,7 @@ def run_page(page: Path, folder: Path) -> None:
 
 
 def program_environment(folder: Path) -> dict[str, str]:
-    """Return an environment in which `rtloop` and `python3` are those of the tests; they lie beside `folder`."""
+    """Create `rtloop` and `python3` of the tests' interpreter beside `folder`; return an environment with them."""
     programs = folder.parent / f"{folder.name}-programs"
     programs.mkdir()
     for name, arguments in (("rtloop", " -m rtloop"), ("python3", "")):
@@ -95,8 +95,8 @@ def program_environment(folder: Path) -> dict[str, str]:
 
 def _run(command: list[str], folder: Path, environment: dict[str, str]) -> str:
     """Return standard output and error of a command, together. Raises AssertionError if it does not end with 0."""
-    done = subprocess.run(
+    completed = subprocess.run(
         command, cwd=folder, env=environment, text=True, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, timeout=120
     )
-    assert done.returncode == 0, f"{command[-1]}\nended with {done.returncode}:\n{done.stdout}"
-    return done.stdout
+    assert completed.returncode == 0, f"{command[-1]}\nended with {completed.returncode}:\n{completed.stdout}"
+    return completed.stdout

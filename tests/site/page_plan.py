@@ -1,4 +1,4 @@
-"""How the commands and snippets of a page are executed: its entry in page_plans.toml, and the execution."""
+"""Execution of the commands and snippets of a page, as its entry in page_plans.toml plans it."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ from tests.site.snippets import SHELL, Snippet, snippets
 
 PLANS = Path(__file__).with_name("page_plans.toml")
 EXECUTED = (SHELL, "python", "matlab")
-"""Kinds of snippets that somebody may execute."""
-OTHERS = "*"
-PATIENCE_S = 900.0
+"""Kinds of snippets that a reader may execute."""
+ALL_OTHERS = "*"
+TIMEOUT_S = 900.0
 EMERGENCY_KEY = b"brass-otter-seven-lamps"
-"""The key of docs/service.md."""
-PATIENT_SERVICE = f"""
+"""Emergency key of the example in docs/service.md."""
+TOLERANT_SERVICE = f"""
 [service]
 arm = true
 stall_ms = 100000.0
@@ -52,7 +52,7 @@ class PagePlan:
         for key in (*self.not_run, *self.elsewhere):
             if snippet.text.startswith(key):
                 return key
-        return OTHERS if OTHERS in self.elsewhere else None
+        return ALL_OTHERS if ALL_OTHERS in self.elsewhere else None
 
     def adapt(self, text: str) -> str:
         """Return a text of the page with its replacements."""
@@ -73,10 +73,10 @@ def plans() -> dict[str, PagePlan]:
 
 
 def executable_snippets(page: Path) -> list[Snippet]:
-    """Return the snippets of a page that a reader may execute; of a page with `console`, those of its kind `shell`."""
-    found = list(snippets(page))
-    kinds = (SHELL,) if any(snippet.kind == "console" for snippet in found) else EXECUTED
-    return [snippet for snippet in found if snippet.kind in kinds]
+    """Return the snippets of a page that a reader may execute: only shell commands on a page with a block `console`."""
+    page_snippets = list(snippets(page))
+    kinds = (SHELL,) if any(snippet.kind == "console" for snippet in page_snippets) else EXECUTED
+    return [snippet for snippet in page_snippets if snippet.kind in kinds]
 
 
 def executed_snippets(page: Path) -> list[Snippet]:
@@ -93,18 +93,18 @@ def execute_page(page: Path, folder: Path) -> None:
     plan, snippets_of_page = plans().get(page.name, PagePlan()), executed_snippets(page)
     shutil.copytree(ROOT / "deploy", folder / "deploy")
     for specification in (folder / "deploy").glob("*-spec.toml"):
-        shutil.copy(specification, folder)  # Copies of configurations name them.
+        shutil.copy(specification, folder)  # Copied configurations refer to these files.
     (folder / "runtime").mkdir(mode=0o700)
     environment = program_environment(folder) | {"RUNTIME_DIRECTORY": str(folder / "runtime")}
     run_command("set -e\n" + plan.setup, [0], folder, environment)
     service = _start_service(folder / plan.service, folder, environment) if plan.service else None
     try:
-        place = folder
+        current_folder = folder
         for snippet in snippets_of_page:
             if snippet.kind == SHELL and snippet.text.startswith("cd "):
-                place = place / snippet.text.removeprefix("cd ").strip()
+                current_folder = current_folder / snippet.text.removeprefix("cd ").strip()
             elif snippet.kind == SHELL:
-                run_command(plan.adapt(snippet.text), plan.exit_codes(snippet.text), place, environment)
+                run_command(plan.adapt(snippet.text), plan.exit_codes(snippet.text), current_folder, environment)
         if script := "\n".join(plan.adapt(snippet.text) for snippet in snippets_of_page if snippet.kind == "python"):
             (folder / "page.py").write_text(f"{plan.python}\n{script}\n", encoding="utf-8")
             run_command(f"{sys.executable} page.py", [0], folder, environment)
@@ -116,7 +116,7 @@ def execute_page(page: Path, folder: Path) -> None:
 
 def run_command(command: str, codes: list[int], folder: Path, environment: Mapping[str, str]) -> None:
     """Run a command by bash. Raises AssertionError, with its output, for an exit code that is not among `codes`."""
-    done = subprocess.run(
+    completed = subprocess.run(
         ["bash", "-uo", "pipefail", "-c", command],
         cwd=folder,
         env=environment,
@@ -124,20 +124,20 @@ def run_command(command: str, codes: list[int], folder: Path, environment: Mappi
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
         text=True,
-        timeout=PATIENCE_S,
+        timeout=TIMEOUT_S,
     )
-    assert done.returncode in codes, f"{command}\nended with {done.returncode}:\n{done.stdout}"
+    assert completed.returncode in codes, f"{command}\nended with {completed.returncode}:\n{completed.stdout}"
 
 
 def _start_service(configuration: Path, folder: Path, environment: Mapping[str, str]) -> subprocess.Popen[bytes]:
     """Start a service on a copy of a configuration that tolerates a stalled host; return it once its loop is closed."""
     text = configuration.read_text(encoding="utf-8").replace("late_ticks = 10", "late_ticks = 0")
     text = text.replace("[loop]\n", "[loop]\nheartbeat_timeout_s = 100.0\n", 1)
-    (folder / f"{SERVICE}.toml").write_text(text + PATIENT_SERVICE, encoding="utf-8")
+    (folder / f"{SERVICE}.toml").write_text(text + TOLERANT_SERVICE, encoding="utf-8")
     service = subprocess.Popen(
         [sys.executable, "-m", "rtloop", "serve", f"{SERVICE}.toml"], cwd=folder, env=environment
     )
-    end_s = time.monotonic() + PATIENCE_S
+    end_s = time.monotonic() + TIMEOUT_S
     start = ["bash", "-c", "rtloop ctl arm && rtloop ctl setpoint x 0 && rtloop ctl start"]
     while subprocess.run(start, cwd=folder, env=environment, capture_output=True).returncode:
         assert service.poll() is None, "the service has ended"

@@ -15,7 +15,7 @@ COMMAND = re.compile(
     r"(\$ )?(\.venv/bin/\w+|caget|camonitor|cd|curl|cyclictest|dask|echo|eval|export|make|mcap|pip|printf|python3"
     r"|rtloop|source|ssh|ssh-keygen|sudo|systemctl) "
 )
-"""Beginning of a command: its first word."""
+"""Pattern of the beginning of a command: its first word."""
 PROMPT = "$ "
 SHELL, OTHER = "shell", "text"
 
@@ -34,7 +34,7 @@ class Snippet:
 
 
 def snippets(page: Path) -> Iterator[Snippet]:
-    """Yield the snippets of a page in order; a command is a snippet of its own, without its prompt."""
+    """Yield the snippets of a page in order; each command is a separate snippet, without its prompt."""
     for language, block in _blocks(page.read_text(encoding="utf-8").splitlines()):
         for snippet in _paragraphs(SHELL if language == "sh" else language, block):
             if snippet.kind == SHELL:
@@ -57,27 +57,27 @@ def _blocks(lines: list[str]) -> Iterator[tuple[str, str]]:
             while end < len(lines) and (lines[end].startswith("    ") or not lines[end].strip()):
                 end += 1
             text = textwrap.dedent("\n".join(lines[number:end])).strip("\n")
-            if not text.startswith("- "):  # Else it belongs to a list.
+            if not text.startswith("- "):  # Otherwise the block belongs to a list.
                 yield "", text
         number = max(end, number + 1)
 
 
 def _paragraphs(kind: str, block: str) -> Iterator[Snippet]:
-    """Yield the parts of a block with one kind each; a fenced block is one part of the `kind` that is given."""
+    """Yield the parts of an indented block (`kind` is ""), one kind each; a fenced block is one part of kind `kind`."""
     if kind:
         yield Snippet(kind, block)
         return
     parts: list[list[str]] = []
     kinds: list[str] = []
     for paragraph in re.split(r"\n\n+", block):
-        found = _kind(paragraph)
-        if kinds and found in (kinds[-1], OTHER) and kinds[-1] != SHELL:
+        part_kind = _kind(paragraph)
+        if kinds and part_kind in (kinds[-1], OTHER) and kinds[-1] != SHELL:
             parts[-1].append(paragraph)
         else:
-            kinds.append(found)
+            kinds.append(part_kind)
             parts.append([paragraph])
-    for found, paragraphs in zip(kinds, parts, strict=True):
-        yield Snippet(found, "\n\n".join(paragraphs))
+    for part_kind, paragraphs in zip(kinds, parts, strict=True):
+        yield Snippet(part_kind, "\n\n".join(paragraphs))
 
 
 def _kind(paragraph: str) -> str:

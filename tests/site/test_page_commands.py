@@ -1,4 +1,4 @@
-"""Each command and snippet of docs/ is executed, here or by the test that its plan names, or has a reason why not."""
+"""Each command and snippet of docs/ is executed here or by the test in its plan, or the plan says why it is not."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import pytest
 from rtloop.configuration.schema import configuration_schema
 from tests.site.page_code import ROOT
 from tests.site.page_plan import (
-    OTHERS,
+    ALL_OTHERS,
     PagePlan,
     executable_snippets,
     execute_page,
@@ -27,19 +27,19 @@ DOCS = ROOT / "docs"
 PAGES = {path.name: path for path in sorted(DOCS.rglob("*.md")) if path.name != "README.md"}
 EXECUTED = [path for path in PAGES.values() if executed_snippets(path)]
 NOT_CONFIGURATIONS = {"data.md", "experiments.md"}
-"""Pages with TOML of other files: a mapping of columns, a specification."""
+"""Pages whose TOML is no configuration but a mapping of columns or a specification."""
 FOREIGN = {"project"}
-"""Sections of TOML on the pages that belong to pyproject.toml."""
-LEAST_REASON = 2
+"""Sections of TOML on the pages that are part of a pyproject.toml."""
+MIN_REASON_WORDS = 2
 
 
 def test_a_plan_names_a_page_and_what_stands_there():
     assert plans().keys() <= PAGES.keys()
     stale = []
     for name, plan in plans().items():
-        found = executable_snippets(PAGES[name])
+        page_snippets = executable_snippets(PAGES[name])
         for key in (*plan.elsewhere, *plan.not_run, *plan.exits):
-            if key != OTHERS and not any(snippet.text.startswith(key) for snippet in found):
+            if key != ALL_OTHERS and not any(snippet.text.startswith(key) for snippet in page_snippets):
                 stale.append(f"{name}: {key}")
         text = "\n".join(snippet.text for snippet in executed_snippets(PAGES[name]))
         stale += [f"{name}: {old}" for old in plan.replace if old not in text]
@@ -48,12 +48,12 @@ def test_a_plan_names_a_page_and_what_stands_there():
 
 def test_what_is_not_executed_here_has_a_reason_or_the_place_where_it_is():
     for name, plan in plans().items():
-        assert [reason for reason in plan.not_run.values() if len(reason.split()) < LEAST_REASON] == [], name
+        assert [reason for reason in plan.not_run.values() if len(reason.split()) < MIN_REASON_WORDS] == [], name
         assert [place for place in plan.elsewhere.values() if not (ROOT / place).exists()] == [], name
 
 
 def test_programs_of_commands_are_known():
-    """A block that begins with the name of a program, or a prompt, is a command."""
+    """No block of kind "text" begins with a prompt or with the name of an installed program."""
     first_words = {
         (path.name, word)
         for path in PAGES.values()
@@ -72,7 +72,7 @@ def test_the_commands_of_a_page_run(page: Path, tmp_path: Path):
 
 
 def _merge(raw: dict[str, Any], part: dict[str, Any]) -> None:
-    """Put a part of a configuration into the whole; a table with `kind`, `file` or `form` replaces the other one."""
+    """Merge `part` into the configuration `raw`; a table with `kind`, `file` or `form` replaces that of its name."""
     for key, value in part.items():
         if isinstance(value, dict) and isinstance(raw.get(key), dict) and not value.keys() & {"kind", "file", "form"}:
             _merge(raw[key], value)
@@ -81,7 +81,7 @@ def _merge(raw: dict[str, Any], part: dict[str, Any]) -> None:
 
 
 def toml_faults(text: str) -> list[str]:
-    """Return what a validator of another project finds in a part of a configuration, put into deploy/paper.toml."""
+    """Return the errors that jsonschema reports for a part of a configuration, merged into deploy/paper.toml."""
     jsonschema = pytest.importorskip("jsonschema", reason="jsonschema is not installed")
     raw = copy.deepcopy(tomllib.loads((ROOT / "deploy/paper.toml").read_text(encoding="utf-8")))
     part = tomllib.loads(text)

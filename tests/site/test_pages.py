@@ -1,4 +1,4 @@
-"""The code on the pages runs, in the page's order, and prints what the page says."""
+"""The code on the pages runs, in the order of the page, and prints the output that the page shows."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ SHORTEST = "index.md"
 """The page that runs in `make test`; the others are soak tests."""
 
 
-def _cost(page: Path) -> list[pytest.MarkDecorator]:
-    """Return the mark of a page that is too long for `make test`."""
+def _page_marks(page: Path) -> list[pytest.MarkDecorator]:
+    """Return the mark `soak` for each page but SHORTEST, because the others take too long for `make test`."""
     return [] if page.name == SHORTEST else [pytest.mark.soak]
 
 
@@ -22,7 +22,7 @@ def test_every_tutorial_has_commands():
     assert {path for path in PAGES if path.parent.name == "tutorial"} == set((ROOT / "docs/tutorial").glob("*.md"))
 
 
-@pytest.mark.parametrize("page", [pytest.param(page, id=page.name, marks=_cost(page)) for page in PAGES])
+@pytest.mark.parametrize("page", [pytest.param(page, id=page.name, marks=_page_marks(page)) for page in PAGES])
 def test_the_code_on_a_page_runs(page: Path, tmp_path: Path):
     folder = tmp_path / "work"
     folder.mkdir()

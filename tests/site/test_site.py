@@ -1,4 +1,4 @@
-"""The site: no dead link, nothing from the network, and an entry for every key, command, signal, request and name."""
+"""The site has no dead link, loads no remote file, and documents every key, command, signal, request and name."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ from rtloop.service.api.requests import REQUESTS
 from tests.site.conftest import ROOT, Page
 
 NOT_IN_FILES = {"HostDelay", "LawOptions", "FeedforwardOptions", "ControllerOptions"}
-"""Models that no file has: a service's own state, and bases of the laws' options."""
+"""Models of options that occur in no file: a service's state, and base classes of the laws' options."""
 FILES = {
     "configuration": ("rtloop.configuration", "rtloop.laws", "rtloop.drivers", "rtloop.hil"),
     "specification": ("rtloop.design",),
     "campaign": ("rtloop.campaigns",),
 }
-"""Rooms whose models of options belong to each file."""
+"""Packages that define the options of each kind of file."""
 
 
 def test_a_link_leads_to_a_page_and_an_anchor_of_it(site: dict[str, Page]):
@@ -70,9 +70,9 @@ def test_every_page_of_docs_is_in_the_site(site: dict[str, Page]):
 
 def _subclasses(model: type) -> Iterator[type]:
     """Yield all subclasses of a class."""
-    for below in model.__subclasses__():
-        yield below
-        yield from _subclasses(below)
+    for subclass in model.__subclasses__():
+        yield subclass
+        yield from _subclasses(subclass)
 
 
 @cache
@@ -86,23 +86,23 @@ def _annotations() -> str:
     return " ".join(str(field.annotation) for field in fields)
 
 
-def _models(rooms: tuple[str, ...]) -> set[type[Any]]:
-    """Return the models of options that the rooms define and that a file has by themselves: no mere bases."""
+def _models(packages: tuple[str, ...]) -> set[type[Any]]:
+    """Return the models of options that `packages` define, without base classes that no field refers to."""
     annotations = _annotations()
     return {
         model
         for model in _subclasses(Options)
-        if model.__module__.startswith(rooms)
+        if model.__module__.startswith(packages)
         and model.__name__ not in NOT_IN_FILES
         and (not model.__subclasses__() or f".{model.__name__}" in annotations)
     }
 
 
-def missing_keys(page: Page, rooms: tuple[str, ...]) -> set[str]:
-    """Return "model.key" of each key of the rooms' models that a page has no row for."""
+def missing_keys(page: Page, packages: tuple[str, ...]) -> set[str]:
+    """Return "model.key" of each key of the packages' models that a page has no row for."""
     return {
         f"{model.__name__}.{key}"
-        for model in _models(rooms)
+        for model in _models(packages)
         for key in model.model_fields
         if key not in page.first_cells(model.__name__)
     }
@@ -113,7 +113,7 @@ def test_every_key_of_a_file_has_an_entry(site: dict[str, Page], name: str):
     page = site[f"reference/{name}"]
     assert missing_keys(page, FILES[name]) == set()
     cells = [row for rows in page.rows.values() for row in rows if row]
-    assert all(row[1] and row[2] for row in cells), "a key has neither type nor default"
+    assert all(row[1] and row[2] for row in cells), "a key lacks its type or its default"
 
 
 def test_a_key_without_an_entry_is_found(site: dict[str, Page]):
@@ -127,7 +127,7 @@ def test_a_key_without_an_entry_is_found(site: dict[str, Page]):
 
 
 def keys_without_text(models: Iterable[Any]) -> set[str]:
-    """Return "model.key" of each key below which there is no text, or one that says no more than its name."""
+    """Return "model.key" of each key whose text, without articles, has less than two words or only words of the key."""
     without = set()
     for model in models:
         texts = texts_below(model)
@@ -168,14 +168,14 @@ def test_the_schema_has_the_text_of_every_key():
 
 
 def _commands(command: click.Command, words: tuple[str, ...]) -> Iterator[tuple[tuple[str, ...], click.Command]]:
-    """Yield (words, command) of a command and those below it, as its own listing has them."""
+    """Yield (words, command) of a command and its subcommands, in the order of its listing."""
     yield words, command
     if isinstance(command, click.Group):
         context = click.Context(command)
         for name in command.list_commands(context):
-            below = command.get_command(context, name)
-            assert below is not None
-            yield from _commands(below, (*words, name))
+            subcommand = command.get_command(context, name)
+            assert subcommand is not None
+            yield from _commands(subcommand, (*words, name))
 
 
 def test_every_command_and_option_has_an_entry(site: dict[str, Page]):
@@ -186,9 +186,9 @@ def test_every_command_and_option_has_an_entry(site: dict[str, Page]):
             continue
         if "-".join(words) not in page.anchors:
             missing.add(" ".join(words))
-        shown = " ".join(page.first_cells("-".join(words)))
+        documented = " ".join(page.first_cells("-".join(words)))
         options = [name for p in command.params if isinstance(p, click.Option) and not p.hidden for name in p.opts]
-        missing |= {f"{' '.join(words)} {name}" for name in options if name not in shown.replace(",", " ").split()}
+        missing |= {f"{' '.join(words)} {name}" for name in options if name not in documented.replace(",", " ").split()}
     assert missing - {"rtloop --help"} == set()
 
 
