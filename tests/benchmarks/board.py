@@ -1,4 +1,4 @@
-"""A board in shared memory as a process of its own, for driver kind `shm`."""
+"""A board in shared memory, served by a separate process, for driver kind `shm`."""
 
 from __future__ import annotations
 
@@ -16,41 +16,41 @@ from tests.benchmarks.configurations import RIG, ROOT, changed, last_cpu, write
 
 BOARD_RATE_HZ = 10_000
 STALE = ("# sample_age_us = 1000.0 ", "sample_age_us = 500000.0 ")
-"""The board is a process beside others; a host that stalls it trips no interlock here."""
+"""Change: a limit of the sample's age so high that a host that stalls the board's process trips no interlock."""
 START_TIMEOUT_S, END_TIMEOUT_S = 120.0, 20.0
 POLL_S = 0.2
 
 
-def on_a_board(file: Path, *changes: tuple[str, str]) -> str:
-    """The paper's configuration on the board at `file`."""
+def board_configuration(file: Path, *changes: tuple[str, str]) -> str:
+    """Return the paper's configuration, changed to the board at `file`."""
     rig = RIG.replace('kind = "sim"', f'kind = "shm"\nfile = "{file}"\nboard_rate_hz = {BOARD_RATE_HZ}')
     return changed((RIG, rig), STALE, *changes)
 
 
 @contextmanager
 def board() -> Iterator[Path]:
-    """The file of a running board."""
+    """Run a board in a process; yield its file."""
     with tempfile.TemporaryDirectory() as name:
         file = Path(name) / "board"
-        with served(("hil", "serve", write(Path(name), on_a_board(file)))):
+        with running_rtloop(("hil", "serve", write(Path(name), board_configuration(file)))):
             yield file
 
 
 @contextmanager
-def served(arguments: Sequence[str | Path]) -> Iterator[None]:
-    """A process of `rtloop` that has told systemd's socket, here ours, that it is ready; SIGTERM ends it.
+def running_rtloop(arguments: Sequence[str | Path]) -> Iterator[None]:
+    """Run `rtloop ARGUMENTS` in a process that is ready (READY=1 on its NOTIFY_SOCKET); end it with SIGTERM.
 
-    It runs on the processors that are not the loop's. Raises RuntimeError where it does not become ready.
+    It runs on all processors but the loop's. Raises RuntimeError if it does not become ready.
     """
     command = [sys.executable, "-m", "rtloop", *map(str, arguments)]
-    with tempfile.TemporaryDirectory() as name, socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as notified:
-        notified.bind(f"{name}/notify")
-        notified.settimeout(POLL_S)
+    with tempfile.TemporaryDirectory() as name, socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as notify_socket:
+        notify_socket.bind(f"{name}/notify")
+        notify_socket.settimeout(POLL_S)
         environment = os.environ | {"NOTIFY_SOCKET": f"{name}/notify"}
         process = subprocess.Popen(command, cwd=ROOT, env=environment, stderr=subprocess.PIPE, text=True)
         try:
             os.sched_setaffinity(process.pid, os.sched_getaffinity(0) - {last_cpu()} or os.sched_getaffinity(0))
-            _await_ready(process, notified)
+            _await_ready(process, notify_socket)
             yield
         finally:
             process.terminate()
@@ -61,11 +61,12 @@ def served(arguments: Sequence[str | Path]) -> Iterator[None]:
                 process.communicate()
 
 
-def _await_ready(process: subprocess.Popen[str], notified: socket.socket) -> None:
+def _await_ready(process: subprocess.Popen[str], notify_socket: socket.socket) -> None:
+    """Wait for READY=1 on the socket. Raises RuntimeError if the process ends or the time is over."""
     deadline_s = time.monotonic() + START_TIMEOUT_S
     while time.monotonic() < deadline_s:
         with suppress(TimeoutError):
-            if b"READY=1" in notified.recv(4096):
+            if b"READY=1" in notify_socket.recv(4096):
                 return
         if process.poll() is not None:
             break

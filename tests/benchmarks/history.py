@@ -1,4 +1,4 @@
-"""The history: one JSON object a line for each benchmark that was run; a machine's own, and no part of the sources."""
+"""The history of this machine, no part of the sources: a file with one JSON object a line for each benchmark run."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ HISTORY = ROOT / ".benchmarks" / "history.jsonl"
 PACKAGES = ("rtloop", "numpy", "numba", "llvmlite", "scipy", "control", "mcap", "zstandard", "foxglove-sdk", "h5py")
 
 
-def surroundings() -> dict[str, Any]:
-    """What figures depend on: host, versions, revision of the sources."""
+def measurement_conditions() -> dict[str, Any]:
+    """Return host, versions and revision of the sources, on which the figures depend."""
     return {
         "host": {
             "cpu": _cpu_model(),
@@ -36,26 +36,26 @@ def surroundings() -> dict[str, Any]:
 
 
 def entry(
-    benchmark: str, effort: Effort, results: dict[str, Any], took_s: float, around: dict[str, Any]
+    benchmark: str, effort: Effort, results: dict[str, Any], took_s: float, conditions: dict[str, Any]
 ) -> dict[str, Any]:
-    """One line of the history."""
+    """Return a benchmark's line of the history; `conditions` come from `measurement_conditions`."""
     date = time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime())
     load = os.getloadavg()[0]
     return {
         "benchmark": benchmark, "date": date, "pairs": effort.pairs, "share": effort.share, "took_s": round(took_s, 1),
-        "load": round(load, 2), **around, "results": results,
+        "load": round(load, 2), **conditions, "results": results,
     }  # fmt: skip
 
 
 def append(line: dict[str, Any]) -> None:
-    """Add an entry."""
+    """Append an entry to the history."""
     HISTORY.parent.mkdir(exist_ok=True)
     with HISTORY.open("a", encoding="utf-8") as file:
         file.write(json.dumps(line) + "\n")
 
 
 def newest() -> dict[str, dict[str, Any]]:
-    """The last entry of each benchmark."""
+    """Return the last entry of each benchmark, by its name."""
     if not HISTORY.exists():
         return {}
     with HISTORY.open(encoding="utf-8") as file:
@@ -63,11 +63,13 @@ def newest() -> dict[str, dict[str, Any]]:
 
 
 def _cpu_model() -> str:
+    """Return the processor's name in /proc/cpuinfo."""
     lines = Path("/proc/cpuinfo").read_text(errors="replace").splitlines()
     return next((line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")), "unknown")
 
 
 def _version(package: str) -> str:
+    """Return the version of an installed package, or "not installed"."""
     try:
         return version(package)
     except PackageNotFoundError:
@@ -75,7 +77,7 @@ def _version(package: str) -> str:
 
 
 def _revision() -> str:
-    """Of the sources, with a + where they were changed since."""
+    """Return the revision of the sources, with a + if they have changes; "unknown" without git."""
     command = ["git", "describe", "--always", "--dirty=+", "--abbrev=10"]
     try:
         return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True).stdout.strip()

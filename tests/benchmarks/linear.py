@@ -1,4 +1,4 @@
-"""The closed loop where it is linear, against the simulators that control engineers know."""
+"""Time of the linear closed loop in rtloop, and in simulators of `control` and `scipy` that give equal positions."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from rtloop.engine.plan import Plan
 from rtloop.foundation.arrays import Real
 from rtloop.signals import ERROR, FLAGS, POSITION, REFERENCE, axis_column
 from tests.benchmarks.configurations import PAPER, RIG, STEPS, TEXT, changed
-from tests.benchmarks.kernels import Differs
-from tests.benchmarks.measure import Effort, NotMeasured, in_turn, ratio, seconds, spread
+from tests.benchmarks.kernels import ResultsDiffer
+from tests.benchmarks.measure import Effort, MeasurementUnavailable, interleave, ratio, spread, time_call
 from tests.benchmarks.scenario import PythonLoop
 
 TICKS = 50_000
 TOLERANCE_UM = 1e-9
-"""On positions of some µm: the three discretise and add up in different orders."""
+"""Tolerance on positions of some µm: the three programs discretise and sum in different orders."""
 HYSTERESIS = TEXT[TEXT.index("thresholds_v = [0.095") : TEXT.index("dead_band = ")]
 LINEAR_RIG = """[driver]
 kind = "sim"
@@ -42,37 +42,37 @@ resolution_um = 0.0
 
 """
 SMALL_STEPS = 'kind = "steps"\nlevels = [0.0, 4.0, -4.0]\ndwell_s = 0.2\n\n'
-"""From rest, and small enough that nothing saturates."""
+"""Steps from rest, so small that no limit acts."""
 
 
 def linear_plan() -> Plan:
-    """The paper's controller and plant with a gain in the hysteresis's place, ideal converters and sensor."""
+    """Return the paper's loop with a gain in place of the hysteresis, and with ideal converters and sensor."""
     gain = "thresholds_v = [0.0]\nweights_um_per_v = [4.0]\n"
     text = changed((RIG, LINEAR_RIG), (HYSTERESIS, gain), (STEPS, SMALL_STEPS))
     return prepare(parse(text, "linear", PAPER.parent, "linear.toml"), paced=False).plan
 
 
 def _chain(parts: list[tuple[Real, Real, Real, Real]]) -> tuple[Real, Real, Real, Real]:
-    """Systems one after the other, as one state space."""
+    """Return the series connection of systems (a, b, c, d)."""
     a, b, c, d = parts[0]
     for a2, b2, c2, d2 in parts[1:]:
-        above = np.hstack([a, np.zeros((len(a), len(a2)))])
-        a, b = np.vstack([above, np.hstack([b2 @ c, a2])]), np.vstack([b, b2 @ d])
+        top = np.hstack([a, np.zeros((len(a), len(a2)))])
+        a, b = np.vstack([top, np.hstack([b2 @ c, a2])]), np.vstack([b, b2 @ d])
         c, d = np.hstack([d2 @ c, c2]), d2 @ d
     return a, b, c, d
 
 
 def _sections(numerator: Any, denominator: Any, gain: float) -> list[tuple[Real, Real, Real, Real]]:
-    """Factor by factor: expanded, the paper's polynomials would lose their digits."""
+    """Return one system for each pair of factors: the paper's expanded polynomials would lose digits."""
     padded = [*numerator, *[[1.0]] * (len(denominator) - len(numerator))]
-    found = [signal.tf2ss(above, below) for above, below in zip(padded, denominator, strict=True)]
-    a, b, c, d = found[0]
-    return [(a, b, gain * c, gain * d), *found[1:]]
+    sections = [signal.tf2ss(upper, lower) for upper, lower in zip(padded, denominator, strict=True)]
+    a, b, c, d = sections[0]
+    return [(a, b, gain * c, gain * d), *sections[1:]]
 
 
 def closed_loop(period_s: float) -> tuple[Real, Real, Real, Real]:
-    """Reference to position in z, by scipy alone: C(s) of eq (20) by Tustin's rule, D(s) of eq (5) with held inputs."""
-    # eqs (20) and (5), paired so that no section has more zeros than poles
+    """Return the loop from reference to position in z: C(s), eq (20), by Tustin's rule; D(s), eq (5), inputs held."""
+    # Equations (20) and (5); factors are paired so that no section has more zeros than poles.
     controller = _sections(
         [[1.0, 7.9e6], [1.0, 971.0, 4.6e5], [1.0, 43.0, 1.4e7]],
         [[1.0, 8.8e4], np.polymul([1.0, 974.0], [1.0, 1.0]), [1.0, 1153.0, 1.6e7]],
@@ -102,10 +102,10 @@ def linear(effort: Effort) -> dict[str, Any]:
     try:
         import control
     except ImportError:
-        raise NotMeasured("control is not installed; the extra `bench` has it") from None
+        raise MeasurementUnavailable("control is not installed; the extra `bench` has it") from None
     plan = linear_plan()
     period_s = 1.0 / plan.pacing.rate_hz
-    loop, until = PythonLoop(plan), TICKS
+    loop, until_tick = PythonLoop(plan), TICKS
     loop.run(TICKS)
     rows = loop.rows[:TICKS].copy()
     position_um, reference_um = rows[:, axis_column(0, POSITION)], rows[:, axis_column(0, REFERENCE)]
@@ -113,9 +113,9 @@ def linear(effort: Effort) -> dict[str, Any]:
     system, time_s = control.ss(*matrices, period_s), np.arange(TICKS) * period_s
 
     def rtloop() -> None:
-        nonlocal until
-        until += TICKS
-        loop.run(until)
+        nonlocal until_tick
+        until_tick += TICKS
+        loop.run(until_tick)
 
     forced_response = lambda: control.forced_response(system, time_s, reference_um).outputs
     dlsim = lambda: signal.dlsim((*matrices, period_s), reference_um, time_s)[1][:, 0]
@@ -123,17 +123,19 @@ def linear(effort: Effort) -> dict[str, Any]:
     for name, action in {"control.forced_response": forced_response, "scipy.signal.dlsim": dlsim}.items():
         difference_um = float(np.abs(np.asarray(action()) - position_um).max())
         if not difference_um <= TOLERANCE_UM:
-            raise Differs(f"linear: {name} differs from the loop by {difference_um:g} µm")
-    actions = {"rtloop": rtloop, "forced_response": forced_response, "dlsim": dlsim}
-    taken = in_turn({name: lambda action=action: seconds(action) for name, action in actions.items()}, effort.pairs)
-    found: dict[str, Any] = {f"{name}_ms": spread([1e3 * value for value in values]) for name, values in taken.items()}
-    others = ("forced_response", "dlsim")
-    return found | {f"times_faster_than_{name}": ratio(taken[name], taken["rtloop"]) for name in others}
+            raise ResultsDiffer(f"linear: {name} differs from the loop by {difference_um:g} µm")
+    programs = {"rtloop": rtloop, "forced_response": forced_response, "dlsim": dlsim}
+    actions = {name: lambda program=program: time_call(program) for name, program in programs.items()}
+    durations_s = interleave(actions, effort.pairs)
+    results: dict[str, Any] = {f"{name}_ms": spread([1e3 * s for s in values]) for name, values in durations_s.items()}
+    for name in ("forced_response", "dlsim"):
+        results[f"times_faster_than_{name}"] = ratio(durations_s[name], durations_s["rtloop"])
+    return results
 
 
 def _require_linear(plan: Plan, rows: Real) -> None:
-    """No limit, no trip, and something that moved. Raises Differs."""
+    """Require that the output moved without a limit or a trip. Raises ResultsDiffer."""
     assert isinstance(plan.driver(), SimDriver)
     flags = int(np.bitwise_or.reduce(rows[:, FLAGS].astype(np.int64)))
     if flags or np.abs(rows[:, axis_column(0, ERROR)]).max() < 1.0:
-        raise Differs(f"linear: the run was not linear, its flags are {flags}")
+        raise ResultsDiffer(f"linear: the run was not linear, its flags are {flags}")

@@ -1,4 +1,4 @@
-"""Times of several that do the same work, in turn, so that a busy machine burdens all alike."""
+"""Timing of several programs that do the same work; they run in turn, so that other load affects all alike."""
 
 from __future__ import annotations
 
@@ -10,21 +10,21 @@ from typing import Any, NamedTuple
 
 
 class Effort(NamedTuple):
-    """How often everything is repeated, and the part of its usual duration that each repetition takes."""
+    """Number of repetitions of a benchmark, and the share of the usual duration that each repetition takes."""
 
     pairs: int
     share: float
 
-    def seconds(self, usual_s: float) -> float:
-        """A duration, shortened."""
+    def duration_s(self, usual_s: float) -> float:
+        """Return the shortened duration of a repetition."""
         return usual_s * self.share
 
 
 FULL, QUICK = Effort(11, 1.0), Effort(3, 0.25)
 
 
-class NotMeasured(Exception):
-    """What a benchmark needs is not there; the message says what."""
+class MeasurementUnavailable(Exception):
+    """A requirement of a benchmark is missing; the message names it."""
 
 
 class Spread(NamedTuple):
@@ -35,57 +35,59 @@ class Spread(NamedTuple):
     maximum: float
 
     @classmethod
-    def of(cls, values: Sequence[float]) -> Spread:
+    def from_values(cls, values: Sequence[float]) -> Spread:
+        """Return the spread of several values."""
         return cls(statistics.median(values), min(values), max(values))
 
     def scaled(self, factor: float) -> Spread:
-        """All of it in another unit."""
+        """Return the spread multiplied by a factor."""
         return Spread(*(value * factor for value in self))
 
 
 class Pair(NamedTuple):
-    """Seconds of the first, of the second, and the ratio of the first to the second, pair by pair."""
+    """Durations (s) of two programs, and the ratios of the first to the second, pair by pair."""
 
     first: Spread
     second: Spread
     ratio: Spread
 
 
-def say(text: str) -> None:
-    """What is going on, on a terminal."""
+def show_progress(text: str) -> None:
+    """Show a line of progress, if standard error is a terminal."""
     if sys.stderr.isatty():
         print(f"\r\x1b[K{text}", end="", file=sys.stderr, flush=True)
 
 
-def seconds(action: Callable[[], object]) -> float:
-    """Wall time of one call."""
+def time_call(action: Callable[[], object]) -> float:
+    """Return the wall time of one call in s."""
     begin = time.perf_counter()
     action()
     return time.perf_counter() - begin
 
 
-def in_turn(actions: Mapping[str, Callable[[], Any]], rounds: int) -> dict[str, list[Any]]:
-    """What each action returns, round by round, each once a round."""
+def interleave(actions: Mapping[str, Callable[[], Any]], rounds: int) -> dict[str, list[Any]]:
+    """Call each action once a round; return the results of each action by its name."""
     results: dict[str, list[Any]] = {name: [] for name in actions}
     for number in range(rounds):
-        say(f"round {number + 1} of {rounds}")
+        show_progress(f"round {number + 1} of {rounds}")
         for name, action in actions.items():
             results[name].append(action())
     return results
 
 
-def ratio(firsts: Sequence[float], others: Sequence[float]) -> dict[str, float]:
-    """Spread of the ratios of the first to the others, pair by pair."""
-    return spread([one / two for one, two in zip(firsts, others, strict=True)])
+def ratio(numerators: Sequence[float], denominators: Sequence[float]) -> dict[str, float]:
+    """Return the spread of the quotients, pair by pair."""
+    return spread([a / b for a, b in zip(numerators, denominators, strict=True)])
 
 
 def spread(values: Sequence[float]) -> dict[str, float]:
-    """A Spread as a benchmark reports it."""
-    return Spread.of(values)._asdict()
+    """Return a Spread as the dict that a benchmark reports."""
+    return Spread.from_values(values)._asdict()
 
 
-def alternately(first: Callable[[], object], second: Callable[[], object], pairs: int) -> Pair:
-    """Time both, one after the other, `pairs` times; a pair before that warms up."""
-    taken = [(seconds(first), seconds(second)) for _ in range(pairs + 1)][1:]
-    firsts, seconds_ = [one for one, _ in taken], [two for _, two in taken]
-    return Pair(Spread.of(firsts), Spread.of(seconds_), Spread.of([one / two for one, two in taken]))
+def time_alternately(first: Callable[[], object], second: Callable[[], object], pairs: int) -> Pair:
+    """Time two programs one after the other, `pairs` times, after a pair that is not counted."""
+    durations_s = [(time_call(first), time_call(second)) for _ in range(pairs + 1)][1:]
+    firsts_s, seconds_s = zip(*durations_s, strict=True)
+    ratios = [first_s / second_s for first_s, second_s in durations_s]
+    return Pair(Spread.from_values(firsts_s), Spread.from_values(seconds_s), Spread.from_values(ratios))

@@ -1,4 +1,4 @@
-"""Memory of each process of a paced run at rest."""
+"""Memory of each process of a paced service."""
 
 from __future__ import annotations
 
@@ -8,18 +8,18 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from tests.benchmarks.board import on_a_board
+from tests.benchmarks.board import board_configuration
 from tests.benchmarks.configurations import SINE, STEPS
 from tests.benchmarks.measure import Effort, spread
 from tests.faults.bench import Bench
 
 SETTLE_S, APART_S = 8.0, 0.5
-"""The ring of records, which holds ten seconds, is then in memory as a whole."""
+"""Wait before the first look, after which the whole ring of records is in memory, and time between two looks."""
 ROLES = ("rt", "recorder", "service")
 
 
 def memory_mib(pid: int) -> dict[str, float]:
-    """RSS counts a page in every process that has it, PSS a share of it; private ones are this process's alone."""
+    """Return resident, proportional and private memory of a process in MiB, as /proc/PID/smaps_rollup reports them."""
     lines = Path(f"/proc/{pid}/smaps_rollup").read_text().splitlines()[1:]
     kib = {line.split(":")[0]: int(line.split()[1]) for line in lines}
     private = kib["Private_Clean"] + kib["Private_Dirty"]
@@ -35,21 +35,24 @@ def memory(effort: Effort) -> dict[str, Any]:
     with tempfile.TemporaryDirectory() as name, Bench(Path(name), text=_configuration(Path(name))) as bench:
         time.sleep(SETTLE_S)
         reports: dict[str, list[Mapping[str, float]]] = {role: [] for role in ROLES}
-        for _ in _apart(effort.pairs):
-            for role, found in reports.items():
-                found.append(memory_mib(bench.pid(role)))
+        for _ in _spaced_counts(effort.pairs):
+            for role, rows in reports.items():
+                rows.append(memory_mib(bench.pid(role)))
         if bench.stop() != 0:
             raise RuntimeError(bench.log())
     return {
-        role: {kind: spread([report[kind] for report in found]) for kind in found[0]} for role, found in reports.items()
+        role: {kind: spread([report[kind] for report in rows]) for kind in rows[0]} for role, rows in reports.items()
     }
 
 
 def _configuration(folder: Path) -> str:
-    return on_a_board(folder / "board", (STEPS, SINE), ('folder = "recordings"', f'folder = "{folder}/recordings"'))
+    """Return the configuration of a loop on a board in `folder`, which records there too."""
+    recordings = ('folder = "recordings"', f'folder = "{folder}/recordings"')
+    return board_configuration(folder / "board", (STEPS, SINE), recordings)
 
 
-def _apart(count: int) -> Iterator[int]:
+def _spaced_counts(count: int) -> Iterator[int]:
+    """Yield 0 … count - 1, each after a pause of APART_S."""
     for number in range(count):
         time.sleep(APART_S)
         yield number

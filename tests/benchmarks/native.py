@@ -1,5 +1,5 @@
-"""The C baseline, compiled when it is needed. It works on the very records of the compiled Python, and its functions
-take the places of rtloop's laws, driver and clock behind the same pointers."""
+"""The C baseline, compiled on first use. It works on the same records as the compiled Python, and its functions replace
+rtloop's laws, driver and clock behind the same pointers."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ from rtloop.kernel.reference import GENERATOR, Generator
 from rtloop.laws.shipped import prandtl_ishlinskii, transfer
 
 SOURCE = Path(__file__).parent / "c"
-# vectors of four are the fastest that this code was seen to run with on x86; 512 bits cost a third more
+# Vectors of four numbers are the fastest measured for this code on x86; 512 bits take a third more time.
 VECTORS = ("-mprefer-vector-width=256",) if platform.machine() == "x86_64" else ()
 OPTIONS = ("-O3", "-march=native", *VECTORS, "-ffp-contract=off", "-std=gnu11", "-Wall", "-Wextra", "-fPIC", "-shared")
 
@@ -67,11 +67,11 @@ COLUMNS = (
 )
 C_TYPES = {"f8": "double", "i8": "int64_t", "u8": "uint64_t", "u4": "uint32_t", "u1": "uint8_t"}
 LAWS = {"prandtl_ishlinskii": "plays", "transfer": "linear"}
-"""Prefix of the C functions of a law."""
+"""Prefix of the C functions of each law."""
 
 
-def struct_of(name: str, dtype: np.dtype[Any]) -> str:
-    """A C struct with the layout of `dtype`, and the assertions that it has it."""
+def c_struct(name: str, dtype: np.dtype[Any]) -> str:
+    """Return the text of a C struct with the layout of `dtype`, and static assertions of its size and offsets."""
     assert dtype.fields is not None
     members, checks = [], [f'_Static_assert(sizeof(struct {name}) == {dtype.itemsize}, "{name}");']
     for field, (kind, offset, *_) in dtype.fields.items():
@@ -82,7 +82,7 @@ def struct_of(name: str, dtype: np.dtype[Any]) -> str:
 
 
 def _constants() -> Iterator[str]:
-    """Lines of C that name the values which Python and C share."""
+    """Yield lines of C that name the constants shared by Python and C."""
     for prefix, members in ENUMS.items():
         yield from (f"enum {{ {prefix}_{name} = {int(value)} }};" for name, value in members.__members__.items())
     yield from (f"enum {{ COLUMN_{name} = {getattr(signals, name)} }};" for name in COLUMNS)
@@ -90,14 +90,14 @@ def _constants() -> Iterator[str]:
 
 
 def header() -> str:
-    """All structs and constants that Python and C share."""
-    structs = (struct_of(name, dtype) for name, dtype in STRUCTS.items())
+    """Return the C header with all structs and constants shared by Python and C."""
+    structs = (c_struct(name, dtype) for name, dtype in STRUCTS.items())
     return "\n".join(["#pragma once", "#include <stddef.h>", "#include <stdint.h>", *_constants(), *structs, ""])
 
 
 @cache
 def library() -> ctypes.CDLL:
-    """The baseline, compiled and loaded. Raises FileNotFoundError without a C compiler."""
+    """Compile and load the baseline. Raises FileNotFoundError without a C compiler."""
     compiler = shutil.which("cc")
     if compiler is None:
         raise FileNotFoundError("cc: a C compiler is needed for the baseline")
@@ -112,14 +112,14 @@ def library() -> ctypes.CDLL:
 
 
 def _address(function: str) -> int:
-    """Address of a C function of the baseline."""
+    """Return the address of a C function of the baseline."""
     address = ctypes.cast(getattr(library(), function), ctypes.c_void_p).value
     assert address is not None
     return address
 
 
 def law_at_rest(plan: Plan) -> LawMemory:
-    """The memory of the plan's laws before the first tick, with the C functions in their slots."""
+    """Return the memory of the plan's laws before the first tick, with the C functions in their slots."""
     functions = np.zeros(len(plan.laws), layout.FUNCTIONS)
     for record, law in zip(functions, plan.laws, strict=True):
         for name in ("output", "update", "enter"):
@@ -130,29 +130,29 @@ def law_at_rest(plan: Plan) -> LawMemory:
 
 
 def rig_pointers(context_address: int) -> Pointers:
-    """The C functions of the simulated rig, on the context of rtloop's own driver."""
+    """Return the C functions of the simulated rig with the context of rtloop's driver."""
     return Pointers(context_address, _address("rig_read"), _address("rig_write"))
 
 
 def unpaced_clock(clock_context: clock.Clock) -> clock.Clock:
-    """The C function of virtual time, on the context of rtloop's own clock."""
+    """Return the C function of virtual time with the context of rtloop's clock."""
     return clock.Clock(_address("unpaced_wait"), 0, clock_context.context)
 
 
 def run_law(law: LawMemory, inputs: tuple[np.ndarray[Any, Any], ...], ticks: int, out: np.ndarray[Any, Any]) -> None:
-    """`run_law` of loop.c on readings [V], references, modes (−1: as before) and one record of conditions."""
+    """Call `run_law` of loop.c; `inputs`: readings (V), references, modes (-1: unchanged), a record of conditions."""
     addresses = [ctypes.c_void_p(array.ctypes.data) for array in (law.records, *inputs)]
     library().run_law(*addresses, ctypes.c_int64(ticks), ctypes.c_void_p(out.ctypes.data))
 
 
 def run_loop(assembly: Assembly, until_tick: int) -> int:
-    """`run_loop` of loop.c on the context of an assembly; the reason why it ended."""
+    """Call `run_loop` of loop.c on the context of an assembly; return the reason of its end."""
     address = assembly.loop.__array_interface__["data"][0]
     return library().run_loop(ctypes.c_void_p(address), ctypes.c_int64(until_tick))
 
 
 def spin(period_ns: float, ticks: int) -> tuple[np.ndarray[Any, Any], ...]:
-    """`spin` of spin.h: deadlines [ns], whether each tick was late, periods skipped before it; each (ticks,)."""
+    """Call `spin` of spin.h; return deadlines (ns), late (0 or 1), periods skipped before each tick; each (ticks,)."""
     arrays = tuple(np.zeros(ticks) for _ in range(3))
     addresses = [ctypes.c_void_p(array.ctypes.data) for array in arrays]
     library().spin(ctypes.c_double(period_ns), ctypes.c_int64(ticks), *addresses)

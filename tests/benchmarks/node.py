@@ -1,4 +1,4 @@
-"""The exchange with a node over loopback: the loop's calls against a plain C program that does the same exchange."""
+"""Time of the exchange with a node over loopback: the loop's read and write, against a C program's exchange."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ import numpy as np
 import rtloop
 from rtloop.signals import Flag
 from tests.benchmarks.configurations import RIG, ROOT, SINE, STEPS, at_rate, changed, last_cpu, pinned, write
-from tests.benchmarks.measure import Effort, NotMeasured, in_turn, ratio, say, spread
+from tests.benchmarks.measure import Effort, MeasurementUnavailable, interleave, ratio, show_progress, spread
 from tests.benchmarks.rates import RATES_HZ, WINDOWS, late_shares
 
 SECONDS, RATE_HZ = 4.0, 10_000
@@ -43,15 +43,15 @@ um_per_v = 10.0
 
 
 SPINNING, REAL_TIME = ((), ("--spin",)), (("chrt", "-f", "70"), ())
-"""What stands before the node's program and behind it: of a spinning node, of one in real time."""
+"""Words before and after the node's program in its command: of a spinning node, of a node with real-time priority."""
 ALLOWED = 0.01
 
 
 @contextmanager
 def node_in_c(programs: Path, *, spins: bool, environment: dict[str, str] | None = None) -> Iterator[int]:
     """Run the node in C on processor 0, spinning, or asleep between frames and in real time; yield its port."""
-    before, behind = SPINNING if spins else REAL_TIME
-    command = ["taskset", "-c", "0", *before, programs / "rtloop-node", "--port", "0", "--hold", str(HOLD_US), *behind]
+    before, after = SPINNING if spins else REAL_TIME
+    command = ["taskset", "-c", "0", *before, programs / "rtloop-node", "--port", "0", "--hold", str(HOLD_US), *after]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environment) as process:
         assert process.stdout is not None
         yield json.loads(process.stdout.readline())["port"]
@@ -69,8 +69,8 @@ def node(effort: Effort) -> dict[str, Any]:
       median one-second window.
     """
     if shutil.which("cc") is None or shutil.which("make") is None:
-        raise NotMeasured("a C compiler and make build the node: apt-get install build-essential")
-    duration_s, found = effort.seconds(SECONDS), dict[str, Any]()
+        raise MeasurementUnavailable("a C compiler and make build the node: apt-get install build-essential")
+    duration_s, results = effort.duration_s(SECONDS), dict[str, Any]()
     with tempfile.TemporaryDirectory() as name:
         programs = Path(name)
         make = ["make", "-C", ROOT / "deploy/node", "all", f"BUILD={programs}"]
@@ -81,21 +81,21 @@ def node(effort: Effort) -> dict[str, Any]:
                     "rtloop": partial(_loop_us, programs, port, answer, duration_s),
                     "c": partial(_c_us, programs, port, answer, duration_s),
                 }
-                rounds = in_turn(actions, effort.pairs)
-                calls = {which: [row["calls"] for row in rows] for which, rows in rounds.items()}
-                found[key] = {f"{which}_calls_us": spread(values) for which, values in calls.items()}
-                found[key]["ratio"] = ratio(calls["rtloop"], calls["c"])
-                found[key]["held_ticks"] = spread([row["held"] for row in rounds["rtloop"]])
+                rounds = interleave(actions, effort.pairs)
+                calls = {program: [row["calls"] for row in rows] for program, rows in rounds.items()}
+                results[key] = {f"{program}_calls_us": spread(values) for program, values in calls.items()}
+                results[key]["ratio"] = ratio(calls["rtloop"], calls["c"])
+                results[key]["held_ticks"] = spread([row["held"] for row in rounds["rtloop"]])
                 if key == "same_tick":
                     for figure in ("apart_from_wait", "exchange_p50", "exchange_p99"):
-                        found[key][f"{figure}_us"] = spread([row[figure] for row in rounds["rtloop"]])
+                        results[key][f"{figure}_us"] = spread([row[figure] for row in rounds["rtloop"]])
         with node_in_c(programs, spins=False) as port:
-            found["highest_hz"] = _highest_hz(programs, port, max(round(effort.seconds(WINDOWS)), 2))
-    return found
+            results["highest_hz"] = _highest_hz(programs, port, max(round(effort.duration_s(WINDOWS)), 2))
+    return results
 
 
 def _highest_hz(folder: Path, port: int, windows: int) -> float:
-    """Return the last rate of the ladder before the first one that is not kept; 0 where none is."""
+    """Return the last rate (Hz) of the ladder before the first with a share of ALLOWED or more; 0 if the first has."""
     highest_hz = 0.0
     for rate_hz in RATES_HZ:
         driver, pins = DRIVER.format(port=port, answer="next tick"), pinned(last_cpu())
@@ -103,7 +103,7 @@ def _highest_hz(folder: Path, port: int, windows: int) -> float:
         deadline_ns, flags, missed, status = recording.read("deadline_ns", "flags", "periods_missed", "driver_status")
         lost = late_shares(deadline_ns, flags, missed).lost
         held = late_shares(deadline_ns, np.where(status == 1, int(Flag.OVERRUN), 0), np.zeros_like(missed)).overrun
-        say(f"{rate_hz} Hz: overrun or skipped {lost:.3%}, without an answer {held:.3%}")
+        show_progress(f"{rate_hz} Hz: overrun or skipped {lost:.3%}, without an answer {held:.3%}")
         if max(lost, held) >= ALLOWED:
             break
         highest_hz = float(rate_hz)
@@ -118,7 +118,7 @@ def record(folder: Path, duration_s: float, *changes: tuple[str, str]) -> rtloop
 
 
 def _loop_us(folder: Path, port: int, answer: str, duration_s: float) -> dict[str, float]:
-    """Run the loop; return medians over its ticks in µs."""
+    """Run the loop; return medians over its ticks in µs, p99 of the exchange, and the count of held ticks."""
     driver = RIG, DRIVER.format(port=port, answer=answer)
     recording = record(folder, duration_s, driver, *pinned(last_cpu()))
     read_us, write_us, exchange_us = (recording[name][100:] for name in ("read_us", "write_us", "node_exchange_us"))
@@ -137,7 +137,7 @@ def _c_us(programs: Path, port: int, answer: str, duration_s: float) -> dict[str
     command = ["taskset", "-c", str(last_cpu()), programs / "exchange", "127.0.0.1", str(port), "--rate", str(RATE_HZ)]
     options = ["--count", str(round(duration_s * RATE_HZ)), f"--{answer.replace(' ', '-')}", "--hold", str(HOLD_US)]
     options += ["--priority", "80"]
-    done = subprocess.run([*command, *options], capture_output=True, text=True)
-    if done.returncode:
-        raise NotMeasured(f"exchange: {done.stderr.strip()}")
-    return {"calls": json.loads(done.stdout)["calls_us"]["p50"]}
+    completed = subprocess.run([*command, *options], capture_output=True, text=True)
+    if completed.returncode:
+        raise MeasurementUnavailable(f"exchange: {completed.stderr.strip()}")
+    return {"calls": json.loads(completed.stdout)["calls_us"]["p50"]}

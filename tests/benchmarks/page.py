@@ -1,4 +1,4 @@
-"""The tables of docs/benchmarks.md, from the newest figures of the history."""
+"""Update of the tables in docs/benchmarks.md with the newest figures of the history."""
 
 from __future__ import annotations
 
@@ -12,22 +12,22 @@ from tests.benchmarks.targets import Figure, figures, number
 BEGIN, END = "<!-- figures: begin -->\n", "<!-- figures: end -->\n"
 
 
-class NoPlace(ValueError):
-    """A page without the two markers."""
+class MissingMarkers(ValueError):
+    """A page does not contain each of the two markers once, in order."""
 
 
 def rewrite(path: Path, entries: Mapping[str, dict[str, Any]], benchmarks: Mapping[str, Callable[..., Any]]) -> None:
-    """Put the tables between the markers of a page, and leave the rest of it. Raises NoPlace, OSError."""
+    """Replace the text between the markers of a page by the tables. Raises MissingMarkers, OSError."""
     text = path.read_text(encoding="utf-8")
     if text.count(BEGIN) != 1 or text.count(END) != 1 or text.index(BEGIN) > text.index(END):
-        raise NoPlace(f"{path}: {BEGIN.strip()} and {END.strip()} must be there, once, in this order")
-    before, rest = text.split(BEGIN)
+        raise MissingMarkers(f"{path}: {BEGIN.strip()} and {END.strip()} must each occur once, in this order")
+    before, after = text.split(BEGIN)
     sections = [_section(name, inspect.getdoc(run) or "", entries.get(name)) for name, run in benchmarks.items()]
-    path.write_text(before + BEGIN + "\n" + "\n".join(sections) + "\n" + END + rest.split(END)[1], encoding="utf-8")
+    path.write_text(before + BEGIN + "\n" + "\n".join(sections) + "\n" + END + after.split(END)[1], encoding="utf-8")
 
 
 def _section(name: str, method: str, entry: Mapping[str, Any] | None) -> str:
-    """Heading, method, table, and where the figures come from."""
+    """Return a benchmark's section: heading, method, table, date and revision of the figures."""
     lines = [f"### {name}", "", method, ""]
     if entry is None:
         return "\n".join([*lines, "Not measured yet.", ""])
@@ -39,6 +39,7 @@ def _section(name: str, method: str, entry: Mapping[str, Any] | None) -> str:
 
 
 def _row(figure: Figure) -> str:
+    """Return the table's row of a figure."""
     if isinstance(figure.value, str):
         return f"| {figure.name} | – | {figure.value} | |"
     span = "" if figure.low is None or figure.high is None else f"{number(figure.low)} … {number(figure.high)}"

@@ -1,4 +1,4 @@
-"""A driver in plain Python, as a third party's package that the loop's process finds by its entry point."""
+"""A driver in plain Python, installed like a third party's package: the loop's process finds it by its entry point."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ UM_PER_V, SENSOR_UM_PER_V = 4.0, 10.0
 
 
 class LagDriver(PythonDriver):
-    """A first-order lag: the least that a card in Python can be and still close the loop."""
+    """A first-order lag as a card: the smallest driver in Python that can close the loop."""
 
     kind = "bench_lag"
 
@@ -24,27 +24,27 @@ class LagDriver(PythonDriver):
 
     @property
     def facts(self) -> Facts:
-        """One channel each way."""
+        """The driver's facts: one input and one output."""
         return Facts((Channel("in"),), (Channel("out"),), exclusive=False, real=False)
 
     def start(self) -> None:
-        """Nothing to take."""
+        """Return at once: the driver has no device to open."""
 
     def read(self) -> Sequence[float]:
-        """The lag's output."""
+        """Advance the lag by one tick; return its output in V."""
         self._reading_v += LAG * (self._drive_v * UM_PER_V / SENSOR_UM_PER_V - self._reading_v)
         return (self._reading_v,)
 
     def write(self, volts: Sequence[float]) -> None:
-        """The lag's input."""
+        """Set the lag's input in V."""
         self._drive_v = volts[0]
 
     def stop(self) -> None:
-        """Nothing to let go."""
+        """Return at once: the driver has no device to close."""
 
 
 def install(folder: Path) -> None:
-    """This module as a package in `folder`, with the metadata that declares its driver."""
+    """Write this module to `folder` as a package, with metadata that declares its driver."""
     (folder / f"{NAME}.py").write_text(Path(__file__).read_text())
     metadata = folder / f"{NAME}-1.0.dist-info"
     metadata.mkdir()

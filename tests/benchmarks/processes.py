@@ -1,4 +1,4 @@
-"""The whole program: `rtloop` as an operator starts it, with loop, recorder and supervisor as processes."""
+"""Benchmarks of the program `rtloop` as an operator starts it, with loop, recorder and supervisor as processes."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ from pathlib import Path
 from typing import Any
 
 from tests.benchmarks.configurations import PAPER, ROOT, TEXT, write
-from tests.benchmarks.measure import Effort, NotMeasured, spread
+from tests.benchmarks.measure import Effort, MeasurementUnavailable, spread
 
 RATE_HZ = 10_000
 UNPACED_S, PACED_S = 100.0, 10.0
-AROUND_S, SETTLE_S = 3.0, 1.0
-"""A run lasts so much longer than it is looked at; it is looked at so long after the recorder has its file."""
+EXTRA_S, SETTLE_S = 3.0, 1.0
+"""Excess of a run's duration over the measured part, and wait from the open recording to the measured part."""
 ONE_TICK_S = 1 / RATE_HZ
 TIMEOUT_S = 600.0
 
 
-class Failed(RuntimeError):
+class CommandFailed(RuntimeError):
     """A command ended with another code than 0."""
 
     def __init__(self, message: str, code: int) -> None:
@@ -34,21 +34,21 @@ class Failed(RuntimeError):
 
 
 def rtloop(*arguments: str | Path, environment: Mapping[str, str] | None = None) -> tuple[dict[str, Any], float]:
-    """What a command with --json prints, and its wall time in s. Raises Failed."""
+    """Run a command with --json; return its output and its wall time in s. Raises CommandFailed."""
     command = [sys.executable, "-m", "rtloop", *map(str, arguments), "--json"]
     begin = time.perf_counter()
-    done = subprocess.run(
+    completed = subprocess.run(
         command, cwd=ROOT, env=os.environ | (environment or {}), capture_output=True, text=True, timeout=TIMEOUT_S
     )
     wall_s = time.perf_counter() - begin
-    if done.returncode != 0:
-        said = done.stderr.strip() or done.stdout
-        raise Failed(f"{' '.join(command)} ended with {done.returncode}: {said}", done.returncode)
-    return json.loads(done.stdout), wall_s
+    if completed.returncode != 0:
+        message = completed.stderr.strip() or completed.stdout
+        raise CommandFailed(f"{' '.join(command)} ended with {completed.returncode}: {message}", completed.returncode)
+    return json.loads(completed.stdout), wall_s
 
 
 def run(duration_s: float, *, paced: bool, text: str = TEXT) -> dict[str, Any]:
-    """The summary of one run of a configuration, and its wall time as `wall_s`; the recording is gone afterwards."""
+    """Run a configuration and delete the recording; return the summary with the wall time `wall_s`."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         config = PAPER if text is TEXT else write(folder, text)
@@ -60,17 +60,17 @@ def run(duration_s: float, *, paced: bool, text: str = TEXT) -> dict[str, Any]:
 
 
 def paced_run(duration_s: float, text: str = TEXT) -> dict[str, Any]:
-    """The same, paced. Raises NotMeasured where the host grants no real-time scheduling."""
+    """Like `run`, paced. Raises MeasurementUnavailable if the host refuses real-time scheduling."""
     summary = run(duration_s, paced=True, text=text)
     if summary["realtime"]["scheduler"] != "SCHED_FIFO":
-        raise NotMeasured(f"the host refused {'; '.join(summary['realtime']['refused'])}")
+        raise MeasurementUnavailable(f"the host refused {'; '.join(summary['realtime']['refused'])}")
     return summary
 
 
 def recorded(effort: Effort) -> dict[str, Any]:
     """Unpaced with recording: times real time from the first tick on, less the end of a run of one tick."""
     run(ONE_TICK_S, paced=False)
-    rates, duration_s = [], effort.seconds(UNPACED_S)
+    rates, duration_s = [], effort.duration_s(UNPACED_S)
     for _ in range(effort.pairs):
         end_s = _since_first_tick(run(ONE_TICK_S, paced=False))
         rates.append(duration_s / (_since_first_tick(run(duration_s, paced=False)) - end_s))
@@ -78,6 +78,7 @@ def recorded(effort: Effort) -> dict[str, Any]:
 
 
 def _since_first_tick(summary: dict[str, Any]) -> float:
+    """Return the seconds from the first tick to the end of the command."""
     return summary["wall_s"] - summary["startup_s"]
 
 
@@ -85,21 +86,21 @@ def recorder(effort: Effort) -> dict[str, Any]:
     """At 10 kHz, paced: the recorder's share of a processor in % while it records, by the kernel's account of its
     thread, and bytes a tick of the whole file.
     """
-    shares, sizes, duration_s = [], [], effort.seconds(PACED_S)
+    shares, sizes, duration_s = [], [], effort.duration_s(PACED_S)
     for _ in range(effort.pairs):
         with ThreadPoolExecutor(1) as pool:
-            running = pool.submit(run, duration_s + AROUND_S, paced=True)
-            shares.append(_recorder_share(running, duration_s))
-            sizes.append(running.result()["bytes_per_tick"])
+            run_future = pool.submit(run, duration_s + EXTRA_S, paced=True)
+            shares.append(_recorder_share(run_future, duration_s))
+            sizes.append(run_future.result()["bytes_per_tick"])
     return {"cpu_percent": spread(shares), "bytes_per_tick": spread(sizes)}
 
 
-def _recorder_share(running: Future[Any], duration_s: float) -> float:
-    """% of a processor over `duration_s`, from when the recorder of our only run has a file to write to."""
+def _recorder_share(run_future: Future[Any], duration_s: float) -> float:
+    """Return the recorder's share of a processor in % over `duration_s`, after it has opened its recording."""
     deadline_s = time.monotonic() + TIMEOUT_S
-    while not (pids := _recorders_of(os.getpid())):
-        if running.done() or time.monotonic() > deadline_s:
-            raise RuntimeError(f"recorder: no process was seen; the run ended with {running.exception()}")
+    while not (pids := _recorder_pids(os.getpid())):
+        if run_future.done() or time.monotonic() > deadline_s:
+            raise RuntimeError(f"recorder: no recording was opened; the run ended with {run_future.exception()}")
         time.sleep(0.05)
     time.sleep(SETTLE_S)
     begin_s, begin_ns = time.monotonic(), _cpu_ns(pids[0])
@@ -107,21 +108,23 @@ def _recorder_share(running: Future[Any], duration_s: float) -> float:
     return (_cpu_ns(pids[0]) - begin_ns) / (time.monotonic() - begin_s) / 1e7
 
 
-def _recorders_of(ancestor: int) -> list[int]:
-    """Recorders among the grandchildren that have opened a recording."""
+def _recorder_pids(ancestor: int) -> list[int]:
+    """Return the grandchildren of a process that have opened a recording."""
     children = [child for pid in _children(ancestor) for child in _children(pid)]
     return [pid for pid in children if any(link.endswith(".mcap.part") for link in _open_files(pid))]
 
 
 def _children(pid: int) -> list[int]:
-    found = []
+    """Return the process ids of the children of a process."""
+    pids = []
     for task in Path(f"/proc/{pid}/task").glob("*/children"):
         with suppress(OSError):
-            found += [int(child) for child in task.read_text().split()]
-    return found
+            pids += [int(child) for child in task.read_text().split()]
+    return pids
 
 
 def _open_files(pid: int) -> list[str]:
+    """Return the paths of the files that a process has opened."""
     links = []
     for fd in Path(f"/proc/{pid}/fd").glob("*"):
         with suppress(OSError):
@@ -130,6 +133,7 @@ def _open_files(pid: int) -> list[str]:
 
 
 def _cpu_ns(pid: int) -> int:
+    """Return the processor time of a process's main thread in ns."""
     return int(Path(f"/proc/{pid}/schedstat").read_text().split()[0])
 
 

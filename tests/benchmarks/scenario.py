@@ -1,4 +1,4 @@
-"""The run that is measured: the paper's closed loop on the simulated rig, in virtual time, without a recorder."""
+"""The measured loop: the paper's closed loop on the simulated rig, in virtual time, without a recorder."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ NO_RECORDER = 1 << 60
 
 
 def paper_plan() -> Plan:
-    """Steps of ±20 µm with sensor noise: every step saturates the drive."""
+    """Return the plan of the paper's loop: steps of ±20 µm, each of which saturates the drive, and sensor noise."""
     return prepare(load(PAPER), paced=False).plan
 
 
 def tripping_plan(after_ticks: int) -> Plan:
-    """The same with limits drawn closer, and then a step beyond them: a trip, and the ramp after it."""
+    """Return the paper's plan with closer limits and, after `after_ticks`, a step beyond them, which causes a trip."""
     plan = paper_plan()
     generators, coefficients = plan.generators.copy(), plan.coefficients.copy()
     dwell_ticks = int(generators["parameters"][0, 2])
@@ -38,7 +38,7 @@ def tripping_plan(after_ticks: int) -> Plan:
 
 
 def plan_of_axes(count: int) -> Plan:
-    """The paper's axis `count` times, each on a plant of its own."""
+    """Return a plan with `count` axes like the paper's, each with a separate plant."""
     plan, names = paper_plan(), tuple(f"x{i}" for i in range(count))
     return replace(
         plan,
@@ -51,7 +51,7 @@ def plan_of_axes(count: int) -> Plan:
 
 
 class Loop:
-    """The loop as `rtloop run --unpaced` has it in its process, with nobody to wait for."""
+    """The loop of `rtloop run --unpaced` in this process, which never waits for a recorder."""
 
     def __init__(self, plan: Plan, law: LawMemory) -> None:
         self.block, self.law = SharedBlock.create(plan.sizes), law
@@ -63,28 +63,28 @@ class Loop:
         self.run(0)
 
     def _functions(self, pointers: Pointers, clock: Clock) -> tuple[Pointers, Clock]:
-        """The functions of driver and clock that the loop calls."""
+        """Return the functions of driver and clock that the loop calls."""
         return pointers, clock
 
     @property
     def rows(self) -> np.ndarray[Any, Any]:
-        """Slots of the ring of records."""
+        """The records in the ring, one row a slot."""
         return self.block["ticks_slots"]
 
     def run(self, until_tick: int) -> None:
-        """Run on."""
+        """Run further ticks until `until_tick`."""
         self.assembly.run(until_tick)
 
 
 class PythonLoop(Loop):
-    """All of it compiled from Python."""
+    """The loop compiled from Python."""
 
     def __init__(self, plan: Plan) -> None:
         super().__init__(plan, law_at_rest(plan))
 
 
 class NativeLoop(Loop):
-    """The same by the C baseline, from the same bytes: loop, laws, rig and clock."""
+    """The loop in C, with the baseline's laws, rig and clock, on the same records."""
 
     def __init__(self, plan: Plan) -> None:
         super().__init__(plan, native.law_at_rest(plan))
@@ -93,5 +93,5 @@ class NativeLoop(Loop):
         return native.rig_pointers(pointers.context), native.unpaced_clock(clock)
 
     def run(self, until_tick: int) -> None:
-        """Run on."""
+        """Run further ticks until `until_tick`."""
         native.run_loop(self.assembly, until_tick)

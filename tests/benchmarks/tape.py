@@ -1,4 +1,4 @@
-"""The least that a driver and a clock can do, as C functions: what the engine costs shows best around these."""
+"""The simplest driver and clock as C functions, with which the cost of the engine itself can be measured."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ TAPE = np.dtype([("address", np.int64), ("count", np.int64), ("index", np.int64)
 
 @cfunc(SIGNATURE)
 def tape_read(context, values):
-    """The next reading [V], age 0, and two observed signals that are 0; from the beginning again after the last."""
+    """Give the next reading (V), age 0, and two observed signals of 0; the first reading follows the last."""
     tape = carray(context, 1, TAPE)[0]
     readings = carray(address_pointer(tape.address), tape.count, np.float64)
     out = carray(values, 4)
@@ -29,14 +29,14 @@ def tape_read(context, values):
 
 @cfunc(SIGNATURE)
 def tape_write(context, values):
-    """Keep what was written."""
+    """Store the drive (V) in the context."""
     carray(context, 1, TAPE)[0].written_v = carray(values, 1)[0]
     return 0
 
 
 @cfunc(SIGNATURE)
 def due_wait(context, timing):
-    """The paced clock's reading without its wait: every tick is due when it is asked for."""
+    """Read the clock like the paced clock, but do not wait: every tick is due at once."""
     clock = carray(context, 1, CONTEXT)[0]
     out = carray(timing, 4)
     now_ns = monotonic_ns(clock.timespec_address)
@@ -48,7 +48,7 @@ def due_wait(context, timing):
 
 
 class Tape:
-    """Readings as a driver, with the facts of the simulated rig."""
+    """A driver that plays an array of readings, with the facts of the simulated rig."""
 
     facts = Facts((Channel("adc0"),), (Channel("dac0"),), ("x_true_position_um", "x_hysteresis_um"), real=False)
 
@@ -57,11 +57,11 @@ class Tape:
         self._context["address"], self._context["count"] = readings_v.ctypes.data, readings_v.size
 
     def pointers(self) -> Pointers:
-        """Of the compiled functions."""
+        """Return the addresses of the compiled functions and of their context."""
         return Pointers(self._context.ctypes.data, tape_read.address, tape_write.address)
 
 
 def due_clock(rate_hz: float) -> tuple[Clock, np.recarray[Any, Any]]:
-    """Reads the clock as often as the paced one, and never waits; the context must be kept."""
+    """Return a clock that is read as often as the paced clock but never waits, and its context, which must be kept."""
     context = clock_context(rate_hz)
     return Clock(due_wait.address, paced_now.address, context.ctypes.data), context

@@ -1,4 +1,4 @@
-"""What the figures are to be: named as the results name them, from the benchmark to the figure."""
+"""Targets of the figures, by the benchmark and the names in its results."""
 
 from __future__ import annotations
 
@@ -7,24 +7,24 @@ from typing import Any, NamedTuple
 
 
 class Target(NamedTuple):
-    """A limit; `most` False is a least."""
+    """A limit of a figure: a maximum, or a minimum if `is_maximum` is False."""
 
     value: float
-    most: bool = True
+    is_maximum: bool = True
 
-    def met_by(self, figure: float) -> bool:
-        """Whether a figure keeps it."""
-        return figure <= self.value if self.most else figure >= self.value
+    def is_met(self, figure: float) -> bool:
+        """Return whether a figure keeps the limit."""
+        return figure <= self.value if self.is_maximum else figure >= self.value
 
     def __str__(self) -> str:
-        return f"{'≤' if self.most else '≥'} {self.value:g}"
+        return f"{'≤' if self.is_maximum else '≥'} {self.value:g}"
 
 
 TARGETS = {
     "law ratio": Target(1.1),
     "loop ratio": Target(1.2),
-    "loop times_real_time": Target(700.0, most=False),
-    "recorded times_real_time": Target(200.0, most=False),
+    "loop times_real_time": Target(700.0, is_maximum=False),
+    "recorded times_real_time": Target(200.0, is_maximum=False),
     "axes ns_per_further_axis": Target(70.0),
     "start to_first_tick_s": Target(0.9),
     "lateness sleeping p50_ratio": Target(1.05),
@@ -36,23 +36,23 @@ TARGETS = {
     "node same_tick ratio": Target(1.2),
     "node same_tick apart_from_wait_us": Target(2.0),
     "overhead engine_ns": Target(40.0),
-    "linear times_faster_than_forced_response": Target(20.0, most=False),
-    "linear times_faster_than_dlsim": Target(20.0, most=False),
+    "linear times_faster_than_forced_response": Target(20.0, is_maximum=False),
+    "linear times_faster_than_dlsim": Target(20.0, is_maximum=False),
     "recorder cpu_percent": Target(1.0),
     "recorder bytes_per_tick": Target(68.0),
     "writers foxglove cpu_ratio": Target(1.0),
     "writers mcap cpu_ratio": Target(1.0),
     "writers h5py_lzf cpu_ratio": Target(1.0),
-    "replay one_process times_real_time": Target(120.0, most=False),
-    "replay two_processes times_real_time": Target(220.0, most=False),
-    "replay scaling": Target(1.7, most=False),
-    "export csv times_real_time": Target(60.0, most=False),
-    "rates sim spinning overrun_hz": Target(100_000.0, most=False),
+    "replay one_process times_real_time": Target(120.0, is_maximum=False),
+    "replay two_processes times_real_time": Target(220.0, is_maximum=False),
+    "replay scaling": Target(1.7, is_maximum=False),
+    "export csv times_real_time": Target(60.0, is_maximum=False),
+    "rates sim spinning overrun_hz": Target(100_000.0, is_maximum=False),
 }
 
 
 class Figure(NamedTuple):
-    """One row of a table: a name, its value (or why there is none), its range over the repetitions, its target."""
+    """Row of a table: name, value (or the reason for a missing value), range over the repetitions, target."""
 
     name: str
     value: float | str
@@ -62,18 +62,19 @@ class Figure(NamedTuple):
 
     @property
     def verdict(self) -> str:
-        """The target and whether it is met; empty without one."""
+        """The target, and "met" or "MISSED"; an empty text without a target."""
         if self.target is None or isinstance(self.value, str):
             return ""
-        return f"{self.target} {'met' if self.target.met_by(self.value) else 'MISSED'}"
+        return f"{self.target} {'met' if self.target.is_met(self.value) else 'MISSED'}"
 
 
 def figures(benchmark: str, results: Mapping[str, Any]) -> list[Figure]:
-    """The rows of a benchmark's results, in their order."""
+    """Return the figures of a benchmark's results, in their order."""
     return [Figure(name, *value, TARGETS.get(f"{benchmark} {name}")) for name, value in _leaves(results)]
 
 
 def _leaves(results: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, tuple[Any, Any, Any]]]:
+    """Yield (name, (median, minimum, maximum)) of each spread in nested results, and (name, (value, None, None))."""
     for name, value in results.items():
         if isinstance(value, Mapping) and "median" in value:
             yield prefix + name, (value["median"], value["minimum"], value["maximum"])
@@ -84,5 +85,5 @@ def _leaves(results: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str,
 
 
 def number(value: float) -> str:
-    """Four digits, without an exponent."""
+    """Return a number as text with four digits, without an exponent."""
     return f"{value:,.0f}" if abs(value) >= 1000 else f"{value:.4g}"

@@ -1,4 +1,4 @@
-"""The trend of the benchmarks' ratios, and what is said of one that became worse."""
+"""The trend stores the ratios of the benchmarks, names a ratio that became worse, and draws them."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from tests.benchmarks.trend import TrendRow, append, draw, ratios, read, setback
 
 
 def row(figure: str, median: float, spread: float = 0.0, revision: str = "abc") -> TrendRow:
+    """Return a row of the trend with a spread around its median."""
     return TrendRow("2026-11-21T02:00:00Z", revision, "a CPU", figure, median, median - spread / 2, median + spread / 2)
 
 
@@ -30,21 +31,21 @@ def test_ratios_are_kept_and_times_are_not():
 
 
 @pytest.mark.parametrize(
-    ("figure", "now", "spread", "is_named"),
+    ("figure", "median", "spread", "is_named"),
     [
-        ("law ratio", 1.11, 0.0, True),  # a ratio of costs rose
+        ("law ratio", 1.11, 0.0, True),  # A ratio of costs rose.
         ("law ratio", 1.09, 0.0, False),
         ("law ratio", 0.5, 0.0, False),
-        ("law ratio", 1.3, 0.4, False),  # within its own spread
+        ("law ratio", 1.3, 0.4, False),  # The change is within the spread.
         ("law ratio", 1.5, 0.4, True),
-        ("replay times_real_time", 0.89, 0.0, True),  # a speed fell
+        ("replay times_real_time", 0.89, 0.0, True),  # A speed fell.
         ("replay times_real_time", 0.91, 0.0, False),
         ("replay times_real_time", 2.0, 0.0, False),
     ],
 )
-def test_a_ratio_that_is_worse_than_last_time_is_named(figure: str, now: float, spread: float, is_named: bool):
+def test_a_ratio_that_is_worse_than_last_time_is_named(figure: str, median: float, spread: float, is_named: bool):
     before = [row(figure, 9.0), row(figure, 1.0, revision="last"), row("other ratio", 0.1)]
-    sentences = setbacks(before, [row(figure, now, spread), row("new ratio", 5.0)])
+    sentences = setbacks(before, [row(figure, median, spread), row("new ratio", 5.0)])
     assert [sentence.split(":")[0] for sentence in sentences] == ([figure] if is_named else [])
     assert all("1 at revision last" in sentence for sentence in sentences)
 

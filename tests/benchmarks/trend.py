@@ -1,4 +1,4 @@
-"""The trend: the ratios of every full run, with commit and machine, in docs/benchmarks/history.csv and its picture."""
+"""The trend: ratios of every full run, with commit and machine, in docs/benchmarks/history.csv, and their picture."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from tests.benchmarks.targets import TARGETS, Figure, figures, number
 
 TABLE = ROOT / "docs" / "benchmarks" / "history.csv"
 PICTURE = TABLE.with_suffix(".svg")
-LEAST_CHANGE = 0.1
-"""Part of the last median by which a figure must be worse before it is named."""
+MIN_CHANGE = 0.1
+"""Smallest worsening that is reported, as a share of the last median."""
 
 
 class TrendRow(NamedTuple):
@@ -32,7 +32,7 @@ class TrendRow(NamedTuple):
 def ratios(entry: Mapping[str, Any]) -> list[TrendRow]:
     """Return the ratios and the times real time in an entry of the history; times and sizes are left out.
 
-    The latter depend on the machine; a ratio compares two programs on one.
+    Times and sizes depend on the machine; a ratio compares two programs on the same machine.
     """
     machine = f"{entry['host']['cpu']}, {entry['host']['cpus']} processors"
     return [
@@ -66,18 +66,18 @@ def append(rows: Iterable[TrendRow], path: Path = TABLE) -> None:
         writer.writerows([*row[:4], *(f"{value:.4g}" for value in row[4:])] for row in rows)
 
 
-def setbacks(before: Sequence[TrendRow], now: Sequence[TrendRow]) -> list[str]:
-    """Return a sentence for each ratio of `now` that is worse than its last one in `before`.
+def setbacks(before: Sequence[TrendRow], current: Sequence[TrendRow]) -> list[str]:
+    """Return a sentence for each ratio in `current` that is worse than its last value in `before`.
 
-    Worse by LEAST_CHANGE of the last median, and by more than the spread of its own repetitions.
+    A ratio is worse if it changed by more than MIN_CHANGE of the last median, and by more than its repetitions' spread.
     """
     last = {row.figure: row for row in before}
     return [
         f"{row.figure}: {number(row.median)} ({number(row.smallest)} … {number(row.largest)}), "
         f"{number(last[row.figure].median)} at revision {last[row.figure].revision}"
-        for row in now
+        for row in current
         if row.figure in last and _worsening(last[row.figure], row) > max(
-            LEAST_CHANGE * last[row.figure].median, row.largest - row.smallest
+            MIN_CHANGE * last[row.figure].median, row.largest - row.smallest
         )
     ]  # fmt: skip
 
@@ -87,7 +87,7 @@ def draw(rows: Sequence[TrendRow], path: Path = PICTURE) -> None:
     from matplotlib.backends.backend_svg import FigureCanvasSVG
     from matplotlib.figure import Figure as Picture
 
-    by_figure = {name: list(group) for name, group in groupby(sorted(rows, key=_name), key=_name)}
+    by_figure = {name: list(group) for name, group in groupby(sorted(rows, key=_figure_name), key=_figure_name)}
     picture = Picture(figsize=(12.0, 1.9 * -(-len(by_figure) // 3)), layout="constrained")
     FigureCanvasSVG(picture)
     panels = picture.subplots(-(-len(by_figure) // 3), 3, squeeze=False).flat
@@ -107,7 +107,8 @@ def draw(rows: Sequence[TrendRow], path: Path = PICTURE) -> None:
     picture.savefig(path, metadata={"Date": None})
 
 
-def _name(row: TrendRow) -> str:
+def _figure_name(row: TrendRow) -> str:
+    """Return the figure of a row, as the key of a sort."""
     return row.figure
 
 
@@ -117,7 +118,7 @@ def _is_ratio(figure: Figure) -> bool:
     return last.endswith("ratio") or last.startswith(("times_", "scaling"))
 
 
-def _worsening(before: TrendRow, now: TrendRow) -> float:
-    """By how much a median is worse: larger for a ratio of costs, smaller for a speed."""
+def _worsening(before: TrendRow, current: TrendRow) -> float:
+    """Return the worsening of a median: its increase for a ratio of costs, its decrease for a speed."""
     is_cost = before.figure.endswith("ratio")
-    return now.median - before.median if is_cost else before.median - now.median
+    return current.median - before.median if is_cost else before.median - current.median

@@ -1,4 +1,4 @@
-"""What it costs to write ticks to a file, beside the fastest writers of MCAP and HDF5 that are known."""
+"""Cost of writing ticks to a file, in comparison with the fastest known writers of MCAP and HDF5."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ from rtloop.recording.file.mcap.chunkfile import LEVEL
 from rtloop.recording.file.topics import format
 from rtloop.recording.file.topics.contents import Message
 from rtloop.recording.file.writer import Writer
-from tests.benchmarks.kernels import Differs
-from tests.benchmarks.measure import Effort, NotMeasured, in_turn, ratio, spread
+from tests.benchmarks.kernels import ResultsDiffer
+from tests.benchmarks.measure import Effort, MeasurementUnavailable, interleave, ratio, spread
 from tests.benchmarks.scenario import PythonLoop, paper_plan
 
 TICKS = 200_000
@@ -28,7 +28,7 @@ SCHEMA = "rtloop.Tick"
 
 
 class Stream:
-    """The same ticks as rows, and as encoded messages with their times."""
+    """Ticks of a closed loop as rows, and the same ticks as encoded messages with their times."""
 
     def __init__(self, ticks: int) -> None:
         plan = paper_plan()
@@ -38,7 +38,7 @@ class Stream:
             loop.run(begin + SLICE)
             slots = np.arange(begin, begin + SLICE) % loop.rows.shape[0]
             self.rows[begin : begin + SLICE] = loop.rows[slots]
-        _with_times(self.rows)
+        _add_random_times(self.rows)
         self.chunk = format.chunk_rows(self.columns)
         self.blocks = [self.rows[begin : begin + self.chunk] for begin in range(0, ticks, self.chunk)]
         records = format.blank_ticks(self.columns, ticks)
@@ -50,15 +50,15 @@ class Stream:
         self.schema = format.tick_schema(self.columns)
 
 
-def _with_times(rows: np.ndarray[Any, Any]) -> None:
-    """Measured times in place of the NaN of virtual time, in whole ns as a clock gives them: they compress badly."""
+def _add_random_times(rows: np.ndarray[Any, Any]) -> None:
+    """Replace the NaN of virtual time by random times in whole ns, which compress as badly as measured times."""
     random = np.random.default_rng(1)
     for column, typical_ns in ((2, 15_000), (3, 350), (4, 230), (5, 140), (6, 850)):
         rows[:, column] = np.rint(random.gamma(20.0, typical_ns / 20.0, len(rows))) * 1e-3
 
 
 def rtloop(stream: Stream, path: Path) -> None:
-    """The recorder's writer, with the index of messages that it writes by default."""
+    """Write by the recorder's writer, with its default index of messages."""
     writer = Writer(path, {"columns": stream.columns}, START_UNIX_NS, message_index=True)
     for block in stream.blocks:
         writer.write_ticks(block)
@@ -66,7 +66,7 @@ def rtloop(stream: Stream, path: Path) -> None:
 
 
 def foxglove(stream: Stream, path: Path) -> None:
-    """foxglove-sdk, in Rust: message by message, compressed in the same thread."""
+    """Write by foxglove-sdk (Rust), message by message, compressed in the same thread."""
     import foxglove as sdk
     from foxglove.mcap import MCAPCompression, MCAPWriteOptions
 
@@ -86,7 +86,7 @@ def foxglove(stream: Stream, path: Path) -> None:
 
 
 def mcap(stream: Stream, path: Path) -> None:
-    """The stock writer in Python, message by message."""
+    """Write by the package mcap in Python, message by message."""
     with path.open("wb") as file:
         writer = StockWriter(file, chunk_size=format.MAX_CHUNK_BYTES, compression=CompressionType.ZSTD)
         writer.start()
@@ -98,16 +98,17 @@ def mcap(stream: Stream, path: Path) -> None:
 
 
 def h5py_plain(stream: Stream, path: Path) -> None:
-    """HDF5 without compression, in chunks of rows."""
+    """Write HDF5 without compression, in chunks of rows."""
     _h5py(stream, path, chunks=(stream.chunk, len(stream.columns)))
 
 
 def h5py_lzf(stream: Stream, path: Path) -> None:
-    """HDF5, each column in chunks of its own, bytes shuffled, LZF: the fastest that comes to our size."""
+    """Write HDF5 in chunks of one column, with shuffled bytes and LZF: the fastest setting with a similar size."""
     _h5py(stream, path, chunks=(stream.chunk, 1), compression="lzf", shuffle=True)
 
 
 def _h5py(stream: Stream, path: Path, **options: Any) -> None:
+    """Write the rows to an HDF5 dataset, block by block, with the options of `create_dataset`."""
     import h5py
 
     columns = len(stream.columns)
@@ -140,41 +141,41 @@ def writers(effort: Effort) -> dict[str, Any]:
         import foxglove  # noqa: F401
         import h5py  # noqa: F401
     except ImportError as error:
-        raise NotMeasured(f"{error.name} is not installed; the extra `bench` has it") from None
+        raise MeasurementUnavailable(f"{error.name} is not installed; the extra `bench` has it") from None
     stream = Stream(TICKS)
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "ticks"
-        actions = {name: lambda write=write: _written(write, stream, path) for name, write in WRITERS.items()}
-        for name, action in actions.items():  # imports, and the first use of everything
+        actions = {name: lambda write=write: _time_writer(write, stream, path) for name, write in WRITERS.items()}
+        for name, action in actions.items():  # The first call imports, compiles and fills caches.
             action()
-            _require_whole(name, stream, path)
-        taken = in_turn(actions, effort.pairs)
-    found: dict[str, Any] = {}
-    cpu_us = {name: [1e6 * cpu_s / TICKS for cpu_s, _ in results] for name, results in taken.items()}
-    for name, results in taken.items():
-        found[name] = {"cpu_us_per_tick": spread(cpu_us[name]), "bytes_per_tick": results[0][1] / TICKS}
+            _require_complete(name, stream, path)
+        runs = interleave(actions, effort.pairs)
+    figures: dict[str, Any] = {}
+    cpu_us = {name: [1e6 * cpu_s / TICKS for cpu_s, _ in results] for name, results in runs.items()}
+    for name, results in runs.items():
+        figures[name] = {"cpu_us_per_tick": spread(cpu_us[name]), "bytes_per_tick": results[0][1] / TICKS}
         if name != "rtloop":
-            found[name]["cpu_ratio"] = ratio(cpu_us["rtloop"], cpu_us[name])
-    return found
+            figures[name]["cpu_ratio"] = ratio(cpu_us["rtloop"], cpu_us[name])
+    return figures
 
 
-def _require_whole(name: str, stream: Stream, path: Path) -> None:
-    """The file has every tick, as the library of its format sees it. Raises Differs."""
+def _require_complete(name: str, stream: Stream, path: Path) -> None:
+    """Require that the format's library reads every tick from the file. Raises ResultsDiffer."""
     if name.startswith("h5py"):
         import h5py
 
         with h5py.File(path) as file:
-            whole = np.array_equal(file["ticks"][()], stream.rows)  # type: ignore[index]
+            is_complete = np.array_equal(file["ticks"][()], stream.rows)  # type: ignore[index]
     else:
         with path.open("rb") as file:
-            found = [message.data for _, _, message in make_reader(file).iter_messages(topics=["/ticks"])]
-        whole = found == stream.messages
-    if not whole:
-        raise Differs(f"writers: the file of {name} does not hold the ticks")
+            messages = [message.data for _, _, message in make_reader(file).iter_messages(topics=["/ticks"])]
+        is_complete = messages == stream.messages
+    if not is_complete:
+        raise ResultsDiffer(f"writers: the file of {name} does not contain the ticks")
 
 
-def _written(write: Callable[[Stream, Path], None], stream: Stream, path: Path) -> tuple[float, int]:
-    """CPU seconds, and bytes of the file."""
+def _time_writer(write: Callable[[Stream, Path], None], stream: Stream, path: Path) -> tuple[float, int]:
+    """Write the stream; return the processor time in s and the size of the file in bytes."""
     path.unlink(missing_ok=True)
     begin_s = time.process_time()
     write(stream, path)

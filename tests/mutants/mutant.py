@@ -1,4 +1,4 @@
-"""A mutant: one mistake at one place of one file."""
+"""A mutant: one mistake at one place in a file."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ class Change(NamedTuple):
 
 
 class Mutant(NamedTuple):
-    """One mistake in one file; `before` and `after` are the lines that it changes."""
+    """A mistake in one file; `before` and `after` are the lines that it changes."""
 
     room: str
     file: str

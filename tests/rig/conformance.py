@@ -1,4 +1,4 @@
-"""The conformance suite on the kernel's own comedi board, whose outputs are looped back to its inputs code for code."""
+"""The drivers' conformance suite on the kernel's comedi board, whose outputs are looped back to its inputs in codes."""
 
 from __future__ import annotations
 
@@ -19,14 +19,16 @@ DEVICE = "/dev/comedi0"
 LSB_V = 20.0 / 65535
 
 
-def comedi(wiring: dict[str, Wiring], **options: object) -> ComediDriver:
+def make_driver(wiring: dict[str, Wiring], **options: object) -> ComediDriver:
+    """Return a comedi driver at 500 Hz."""
     return ComediDriver(ComediOptions.model_validate(options), wiring, 500.0)
 
 
 def looped_back_v(handle: int, channel: int) -> float:
+    """Read an input channel directly by libcomedi; return its voltage."""
     code = ctypes.c_uint()
-    where = INPUTS, channel, PLUS_MINUS_10_V, GROUND
-    assert LIBRARY.comedi_data_read(ctypes.c_void_p(handle), *where, ctypes.byref(code)) == 1
+    arguments = INPUTS, channel, PLUS_MINUS_10_V, GROUND
+    assert LIBRARY.comedi_data_read(ctypes.c_void_p(handle), *arguments, ctypes.byref(code)) == 1
     return -10.0 + code.value * LSB_V
 
 
@@ -35,10 +37,10 @@ class TestOneAxis(DriverContract):
     wiring = {"x": Wiring("ai0", "ao0")}  # noqa: RUF012
 
     def driver(self) -> Driver:
-        return comedi(self.wiring)
+        return make_driver(self.wiring)
 
     def outputs(self, driver: Driver) -> Sequence[float] | None:
-        """By a handle of the test's own; by the driver's while that has the board to itself."""
+        """Read the outputs by a separate handle, or by the driver's handle while the driver has the board open."""
         assert isinstance(driver, ComediDriver)
         channels = [int(channel.name[2:]) for channel in driver.facts.outputs]
         if driver._board is not None:
@@ -65,12 +67,12 @@ class TestThreeAxes(TestOneAxis):
 )  # fmt: skip
 def test_what_the_board_does_not_have(wiring, options, message):
     with pytest.raises(DriverError, match=message):
-        comedi(wiring, **options).open()
+        make_driver(wiring, **options).open()
 
 
 def test_a_board_in_use():
-    first = comedi(TestOneAxis.wiring)
+    first = make_driver(TestOneAxis.wiring)
     first.open()
     with pytest.raises(DriverError, match="/dev/comedi0: subdevice 0: another program uses this subdevice"):
-        comedi(TestOneAxis.wiring).open()
+        make_driver(TestOneAxis.wiring).open()
     first.close()

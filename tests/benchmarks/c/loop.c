@@ -1,9 +1,9 @@
-/* What rtloop does in a tick, in C, on the same records and with the same pointers to laws, driver and clock.
+/* The work of rtloop in a tick, in C, on the same records and with the same pointers to laws, driver and clock.
  *
  *     run_law    the law alone over arrays of readings and references
  *     run_loop   the loop of rtloop.engine.loop: commands, snapshot, wait, read, interlocks, law, write, events, record
  *
- * Left out, in favour of C: the kinds of references but constants and tables, coefficients that are loaded in a run,
+ * Left out, in favour of C: all kinds of references except constants and tables, coefficients that are loaded during a run,
  * controllers of several axes, extra channels. A run that needs them ends the program. */
 #include <time.h>
 #include "laws.h"

@@ -89,7 +89,7 @@ static inline double rig_disturbance(rig_c c, rig_s s) {
     return s->disturbance_um + c->disturbance_step_um + sine_um;
 }
 
-/* From the drive to the displacement with creep, which the disturbance and the other axes' follow. */
+/* The displacement for a drive, with creep; the caller adds the disturbance and the other axes' displacement. */
 static inline void rig_displace(rig_c c, rig_s s, double dac_v) {
     double actuator_v = changed_drive(c, s, rig_drive(c, s, dac_v)), sums_um[4] = {0};
     if (c->bw_um_per_v != 0) abort();

@@ -1,5 +1,5 @@
-/* A paced loop that does nothing, as rtloop.engine.clock paces ticks which spin all the time: what the host leaves of
- * a period. `late` is 1 where a tick ended after its period, `skipped` the periods that had passed before a tick. */
+/* An empty paced loop, which spins all the time like rtloop.engine.clock without sleep: it shows the host's own delays.
+ * `late` is 1 if a tick ended after its period; `skipped` is the number of periods that had passed before a tick. */
 #pragma once
 #include <stdint.h>
 #include <time.h>

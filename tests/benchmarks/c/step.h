@@ -1,4 +1,4 @@
-/* The step of a tick around the laws, as rtloop.kernel.step: `evaluate` before the drive is written, `update` after.
+/* The step of a tick around the laws, like rtloop.kernel.step: `evaluate` before the drive is written, `update` after.
  * A controller of several axes and extra inputs and outputs end the program: no benchmark has them. */
 #pragma once
 #include <stdlib.h>
