@@ -26,7 +26,8 @@ def _store_release(array: Any, index: int, value: int) -> None:
     array[index] = value
 
 
-def _exchanged(array: Any, index: int, expected: int, new_value: int) -> bool:
+def _compare_exchange(array: Any, index: int, expected: int, new_value: int) -> bool:
+    """Set a word if it has the expected value; return whether it had."""
     if int(array[index]) != int(expected):
         return False
     array[index] = new_value
@@ -36,7 +37,7 @@ def _exchanged(array: Any, index: int, expected: int, new_value: int) -> bool:
 _ORDERED = {
     "load_acquire": _load_acquire,
     "store_release": _store_release,
-    "exchanged": _exchanged,
+    "exchanged": _compare_exchange,
     "fence_acquire": lambda: None,
     "fence_release": lambda: None,
 }

@@ -157,7 +157,7 @@ def await_running(timeout_s: float = 60.0) -> None:
     """Wait until the unit is active and its loop drives. A trip here comes from a stalled host: record and reset it."""
     wait_until(lambda: unit_property("ActiveState") == "active", timeout_s, "active")
 
-    def running() -> bool:
+    def is_running() -> bool:
         try:
             status = ctl("status")
         except CheckFailed:
@@ -168,7 +168,7 @@ def await_running(timeout_s: float = 60.0) -> None:
             ctl("start")
         return status["state"] == "running" and status["ticks"] > 0
 
-    wait_until(running, timeout_s, "running", 0.2)
+    wait_until(is_running, timeout_s, "running", 0.2)
     wait_until(lambda: Board().drive_v > 0.1, timeout_s, "driving")
 
 
