@@ -1,4 +1,4 @@
-"""Long tests that `make test` has no time for: `make soak NAME=day FLAGS="--hours 1"`, or without NAME their list."""
+"""Tests too long for `make test`: `make soak NAME=day FLAGS="--hours 1"` runs one; without NAME it lists all."""
 
 from __future__ import annotations
 
@@ -38,10 +38,11 @@ LONG_TESTS = {
     "syscalls": ("tests.syscalls", "every system call fails, or is the last before SIGKILL; 90 minutes, needs strace"),
     "wheel": ("tests.soak.wheel", "README's commands from the wheel in a fresh environment; 5 minutes, needs an index"),
 }  # fmt: skip
+"""Module of each long test, and the description in the list: subject, duration, needs."""
 
 
 def main() -> None:
-    """Run the long test that the first argument names, with the other arguments; list all without one."""
+    """Run the long test named by the first argument with the other arguments; without arguments, list all."""
     if len(sys.argv) > 1 and sys.argv[1] in LONG_TESTS:
         sys.argv = sys.argv[1:]
         runpy.run_module(LONG_TESTS[sys.argv[0]][0], run_name="__main__")

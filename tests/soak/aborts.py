@@ -1,7 +1,7 @@
-"""Ctrl-C at random moments of experiments: outputs parked, recordings complete. `make soak NAME=aborts`.
+"""Ctrl-C at random moments of experiments parks the outputs and leaves complete recordings. `make soak NAME=aborts`.
 
-In turn all of them in virtual time, where most moments fall between two runs, and one in real time, where they fall
-into a drive.
+Interrupts alternate between all experiments in virtual time, where most fall between two runs, and one experiment in
+real time, where most fall into a run that drives the actuator.
 """
 
 from __future__ import annotations
@@ -25,13 +25,14 @@ from rtloop.recording.views.summary import summarise
 ROOT = Path(__file__).resolve().parents[2]
 TIMEOUT_S = 280.0
 PARKED_V = 1e-6
+"""Largest |drive| (V) that counts as parked."""
 CONFIG = str(ROOT / "deploy" / "paper.toml")
 ALL_S, ONE_S = 40.0, 15.0
-"""About as long as all experiments take in virtual time; within one in real time."""
+"""Latest interrupt (s) after the first recording began: of all experiments in virtual time; of one in real time."""
 
 
-class Aborted(NamedTuple):
-    """What an interrupted command left behind."""
+class InterruptedCommand(NamedTuple):
+    """Exit code, stderr and recordings of an interrupted `rtloop experiment`; `report`: whether it wrote a report."""
 
     exit_code: int
     error: str
@@ -39,8 +40,8 @@ class Aborted(NamedTuple):
     report: bool
 
 
-def abort(folder: Path, after_s: float, *arguments: str) -> Aborted:
-    """Start `rtloop experiment`, interrupt it `after_s` after its first recording began, and wait for its end."""
+def abort(folder: Path, after_s: float, *arguments: str) -> InterruptedCommand:
+    """Start `rtloop experiment`, send SIGINT `after_s` after its first recording began, and wait for its end."""
     process = subprocess.Popen(
         [sys.executable, "-m", "rtloop", "experiment", *arguments, "--out", str(folder)],
         env=os.environ | {"PYTHONPATH": str(ROOT)},
@@ -58,39 +59,42 @@ def abort(folder: Path, after_s: float, *arguments: str) -> Aborted:
     finally:
         process.kill()
         process.wait()
-    return Aborted(process.returncode, error, sorted(folder.glob("*.mcap")), (folder / "report.html").exists())
-
-
-def check(found: Aborted, folder: Path) -> str:
-    """Raise AssertionError where something is not as it must be; else a line about it."""
-    assert "Traceback" not in found.error, found.error
-    assert found.exit_code in (0, 1), found
-    too_late_for_a_run = "no report was written" in found.error
-    assert found.exit_code == 0 or too_late_for_a_run or "interrupted. The outputs are parked" in found.error, (
-        found.error
+    return InterruptedCommand(
+        process.returncode, error, sorted(folder.glob("*.mcap")), (folder / "report.html").exists()
     )
-    assert found.recordings, found.error
-    assert found.report or too_late_for_a_run, found.error
+
+
+def check(command: InterruptedCommand, folder: Path) -> str:
+    """Check exit code, recordings and parked output. Return a line of text. Raises AssertionError for a fault."""
+    assert "Traceback" not in command.error, command.error
+    assert command.exit_code in (0, 1), command
+    report_omitted = "no report was written" in command.error
+    assert command.exit_code == 0 or report_omitted or "interrupted. The outputs are parked" in command.error, (
+        command.error
+    )
+    assert command.recordings, command.error
+    assert command.report or report_omitted, command.error
     assert not list(folder.glob("*.part")), "a recording was left unfinished"
-    for path in found.recordings:
-        assert summarise(path).complete, (path, found.error)
-    last = found.recordings[int(np.argmax([path.stat().st_mtime for path in found.recordings]))]
-    drive = rtloop.load(last)["x_drive_v"]
-    summary = summarise(last)
-    if summary.ticks_logged < summary.ticks_expected:  # a run that came to its end ramps after its last record
-        assert drive.size == 0 or abs(drive[-1]) < PARKED_V, f"{last}: ends at {drive[-1]} V"
-    said = ", left out the report" if too_late_for_a_run else ""
-    return f"exit {found.exit_code}{said}, {len(found.recordings)} recordings, last {last.name} of {drive.size:,} ticks"
+    for path in command.recordings:
+        assert summarise(path).complete, (path, command.error)
+    last_recording = command.recordings[int(np.argmax([path.stat().st_mtime for path in command.recordings]))]
+    drive_v = rtloop.load(last_recording)["x_drive_v"]
+    summary = summarise(last_recording)
+    if summary.ticks_logged < summary.ticks_expected:  # A run that reached its end ramps down after its last record.
+        assert drive_v.size == 0 or abs(drive_v[-1]) < PARKED_V, f"{last_recording}: ends at {drive_v[-1]} V"
+    report_note = ", left out the report" if report_omitted else ""
+    last_text = f"last {last_recording.name} of {drive_v.size:,} ticks"
+    return f"exit {command.exit_code}{report_note}, {len(command.recordings)} recordings, {last_text}"
 
 
 def main() -> None:
-    """As many as asked for."""
+    """Interrupt `--count` experiments at random moments and print a line for each."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--count", type=int, default=20)
     parser.add_argument("--seed", type=int, default=1)
-    given = parser.parse_args()
-    random = np.random.default_rng(given.seed)
-    for number in range(given.count):
+    options = parser.parse_args()
+    random = np.random.default_rng(options.seed)
+    for number in range(options.count):
         if number % 2:
             arguments, longest_s = ("run", str(random.choice(list(EXPERIMENTS))), CONFIG, "--paced"), ONE_S
         else:
@@ -98,8 +102,8 @@ def main() -> None:
         after_s = float(random.uniform(0.0, longest_s))
         with tempfile.TemporaryDirectory() as name:
             line = check(abort(Path(name), after_s, *arguments), Path(name))
-        what = " ".join(argument for argument in arguments if argument != CONFIG)
-        print(f"{number + 1}/{given.count}: {what}, after {after_s:.2f} s: {line}", flush=True)
+        experiment = " ".join(argument for argument in arguments if argument != CONFIG)
+        print(f"{number + 1}/{options.count}: {experiment}, after {after_s:.2f} s: {line}", flush=True)
 
 
 if __name__ == "__main__":

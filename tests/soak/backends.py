@@ -1,4 +1,7 @@
-"""One configuration on every backend, [driver] alone exchanged, and what came of each. `make soak NAME=backends`."""
+"""One configuration on every backend, which differs in [driver] only: no tick is lost and every run replays.
+
+`make soak NAME=backends`
+"""
 
 from __future__ import annotations
 
@@ -43,7 +46,9 @@ dwell_s = 1.0
 
 
 class Backend(NamedTuple):
-    """`section` follows [driver]; `board` is what must run beside the loop; `rates_hz` where it is compared."""
+    """A driver under test: `section` is the text below [driver], `channels` are input and output, `board` holds the
+    arguments of the `rtloop` command that runs beside the loop, and `rates_hz` are the rates of the loop.
+    """
 
     name: str
     section: str
@@ -51,14 +56,14 @@ class Backend(NamedTuple):
     board: tuple[str, ...] | None = None
     rates_hz: tuple[int, ...] = (2_000, 10_000)
     program: tuple[str, ...] | None = None
-    """A node with a rig of its own, in place of a board."""
+    """Command of the node in C, whose inputs are its outputs, in place of a board."""
 
 
 def backends(folder: Path) -> list[Backend]:
-    """The kinds that can run on any machine, and the node in C where there is a compiler.
+    """Return the backends that run on any machine, and the node in C where there is a compiler.
 
-    A node on a busy machine answers late now and then: its limits are those at which a tick is lost. An exchange over a
-    pseudo-terminal often takes longer than 100 µs.
+    A node on a busy machine answers late now and then: PATIENT lets the loop hold its last sample meanwhile. An
+    exchange over a pseudo-terminal often takes longer than 100 µs, so that serial backends run at 2 kHz only.
     """
     bus = f'interface = "udp_multicast"\nchannel = "{GROUP}"\nsettings = {{ port = {free_port()}, hop_limit = 0 }}\n'
     return [
@@ -76,12 +81,15 @@ def backends(folder: Path) -> list[Backend]:
 
 
 def address(port: int) -> str:
-    """Options of a node at a port of this computer."""
+    """Return the options of a node at a UDP port of this computer."""
     return f'host = "127.0.0.1"\nport = {port}\n'
 
 
 def c_nodes(folder: Path) -> list[Backend]:
-    """The node in C, compiled below the folder, behind UDP and behind a pseudo-terminal; none without a compiler."""
+    """Compile the node in C below the folder; return it behind UDP and behind a pseudo-terminal.
+
+    The list is empty without a compiler.
+    """
     if not (shutil.which("cc") and shutil.which("make")):
         return []
     build = folder / "node"
@@ -98,17 +106,17 @@ def c_nodes(folder: Path) -> list[Backend]:
 
 
 @contextmanager
-def beside(backend: Backend, config: Path, environment: dict[str, str]) -> Iterator[None]:
-    """A board or node as a process of its own, for as long as it is needed."""
+def run_board(backend: Backend, config: Path, environment: dict[str, str]) -> Iterator[None]:
+    """Run the backend's board or node in a separate process to the end of the context; do nothing without one."""
     if backend.board is None and backend.program is None:
         yield
         return
     command = backend.program or [sys.executable, "-m", "rtloop", *(backend.board or ()), str(config)]
     out, err = (subprocess.PIPE, None) if backend.program else (None, subprocess.PIPE)
     with subprocess.Popen(command, env=environment, text=True, stdout=out, stderr=err) as process:
-        said_by = process.stdout or process.stderr
-        assert said_by is not None
-        said_by.readline()  # it says that it is there
+        output = process.stdout or process.stderr
+        assert output is not None
+        output.readline()  # The first line is printed when the process is ready.
         try:
             yield
         finally:
@@ -116,22 +124,22 @@ def beside(backend: Backend, config: Path, environment: dict[str, str]) -> Itera
 
 
 def measure(backend: Backend, rate_hz: int, folder: Path, environment: dict[str, str]) -> dict[str, Any]:
-    """Run, replay, judge the steps."""
+    """Run the backend and replay the recording. Return the run's summary with `identical` and `steps` added."""
     source, sink = backend.channels
     wiring = f'[driver.channels.x]\ninput = "{source}"\noutput = "{sink}"\num_per_v = 10.0\n'
     config = folder / f"{backend.name.replace(' ', '-')}.toml"
     config.write_text(f"{LAW.format(rate_hz=rate_hz, axis=one_axis(60.0))}[driver]\n{backend.section}{wiring}")
-    with beside(backend, config, environment):
-        summary = said(environment, "run", config, "--duration", DURATION_S, "--out", folder / "recordings")
-    verdict = said(environment, "replay", summary["recording"])
+    with run_board(backend, config, environment):
+        summary = run_json(environment, "run", config, "--duration", DURATION_S, "--out", folder / "recordings")
+    verdict = run_json(environment, "replay", summary["recording"])
     recording = rtloop.load(summary["recording"])
     steps = step_metrics(recording["x_reference_um"], recording["x_position_um"], rate_hz)
     assert steps is not None
     return summary | {"identical": verdict["identical"], "steps": steps}
 
 
-def said(environment: dict[str, str], *arguments: object) -> dict[str, Any]:
-    """What a command prints as JSON; it must end well."""
+def run_json(environment: dict[str, str], *arguments: object) -> dict[str, Any]:
+    """Run an `rtloop` command and return its JSON. Raises AssertionError unless the exit code is 0."""
     command = [sys.executable, "-m", "rtloop", *map(str, arguments), "--json"]
     done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
     assert done.returncode == 0, f"{' '.join(command)}: {done.returncode}: {done.stderr}{done.stdout}"
@@ -139,10 +147,10 @@ def said(environment: dict[str, str], *arguments: object) -> dict[str, Any]:
 
 
 def main() -> None:
-    """Print the table; fail where a tick is lost or a replay differs."""
-    rows = table("driver", "Hz", "ticks", "lost", "missed", "replay", "late p50 µs", "p99", "max", "overshoot %",
+    """Print a table of all runs; exit with 1 if a tick is lost or a replay differs."""
+    results = table("driver", "Hz", "ticks", "lost", "missed", "replay", "late p50 µs", "p99", "max", "overshoot %",
                  "settling ms", "static error %")  # fmt: skip
-    good = True
+    passed = True
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         path = os.pathsep.join([str(ROOT), str(install(folder))])
@@ -150,18 +158,18 @@ def main() -> None:
         for backend in backends(folder):
             for rate_hz in backend.rates_hz:
                 print(f"{backend.name} at {rate_hz} Hz", file=sys.stderr, flush=True)
-                found = measure(backend, rate_hz, folder, environment)
-                late, steps = found["lateness_us"], found["steps"]
-                good &= found["complete"] and found["ticks_lost"] == 0 and found["identical"]
-                rows.add_row(
-                    backend.name, str(rate_hz), str(found["ticks_logged"]), str(found["ticks_lost"]),
-                    str(found["periods_missed"]), "identical" if found["identical"] else "DIFFERS",
-                    *(f"{late[key]:.1f}" for key in ("p50", "p99", "max")),
+                result = measure(backend, rate_hz, folder, environment)
+                lateness_us, steps = result["lateness_us"], result["steps"]
+                passed &= result["complete"] and result["ticks_lost"] == 0 and result["identical"]
+                results.add_row(
+                    backend.name, str(rate_hz), str(result["ticks_logged"]), str(result["ticks_lost"]),
+                    str(result["periods_missed"]), "identical" if result["identical"] else "DIFFERS",
+                    *(f"{lateness_us[key]:.1f}" for key in ("p50", "p99", "max")),
                     f"{steps.overshoot_percent:.2f}", f"{steps.settling_time_ms:.1f}",
                     f"{steps.static_error_percent:.3f}",
                 )  # fmt: skip
-    Console(highlight=False, width=WIDTH).print(rows)
-    sys.exit(0 if good else 1)
+    Console(highlight=False, width=WIDTH).print(results)
+    sys.exit(0 if passed else 1)
 
 
 if __name__ == "__main__":

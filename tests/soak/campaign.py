@@ -1,4 +1,4 @@
-"""Campaigns at length: promises against rigs, coverage of intervals, efficiency and memory.
+"""Long campaigns: linear predictions against simulated rigs, coverage of intervals, efficiency and memory.
 
 make soak NAME=campaign FLAGS="prediction promise coverage efficiency memory"
 """
@@ -38,7 +38,7 @@ IDEAL = {
     'dead_band = "none"': 'dead_band = "exact"',
     '"paper-spec.toml"': f'"{ROOT / "deploy/paper-spec.toml"}"',
 }
-"""The paper's configuration without noise, rounding and hysteresis left over: what linear theory describes."""
+"""Replacements that leave the paper's configuration without noise, rounding and residual hysteresis: a linear loop."""
 STABLE = """
 configuration = "ideal.toml"
 keep_worst = 0
@@ -55,22 +55,24 @@ dwell_s = {dwell_s}
 "steps.settling_ms" = 1e9
 "steps.overshoot_percent" = 1e9
 """
+"""Campaign on ideal.toml whose limits only an unstable loop exceeds."""
 QUICK_WORKERS = {"DASK_DISTRIBUTED__WORKER__PROFILE__ENABLED": "False", "MALLOC_TRIM_THRESHOLD_": "134217728"}
 """Settings of Dask's workers that docs/campaigns.md names: no profiler, and freed memory stays with the process."""
 SPREAD = """
 "driver.plant.dynamics.damping_factor" = { log_uniform = [0.5, 2.0] }
 "driver.plant.dynamics.gain_factor" = { uniform = [0.95, 1.05] }
 """
+"""Uncertain keys beside the resonance, for the comparison rig by rig."""
 
 
-def prediction(place: Path) -> list[str]:
+def prediction(folder: Path) -> list[str]:
     """Compare stability on ideal rigs with the linear prediction: the boundary along one key, and rig by rig."""
-    _write_ideal(place)
-    campaign = place / "stable.toml"
+    _write_ideal(folder)
+    campaign = folder / "stable.toml"
     campaign.write_text(STABLE.format(keys="", uncertain="", dwell_s=20.0))
     key = "driver.plant.dynamics.resonance_shift"
-    boundary = _json("campaign", "boundary", campaign, key, "--tolerance", 1e-5, folder=place)
-    report = _json("design", "verify", place / "ideal.toml", folder=place)
+    boundary = _run_json("campaign", "boundary", campaign, key, "--tolerance", 1e-5, folder=folder)
+    report = _run_json("design", "verify", folder / "ideal.toml", folder=folder)
     low, high = report["axes"][0]["robustness_percent"]["resonance"]["running"]
     print(f"resonance until unstable: {100 * boundary['low']:.3f} … {100 * boundary['high']:.3f} % on simulated rigs, "
           f"{low:.3f} … {high:.3f} % linear", flush=True)  # fmt: skip
@@ -83,13 +85,14 @@ def prediction(place: Path) -> list[str]:
     linear, simulated = (
         sum(passed) for passed in zip(*((growth < 0, passed) for growth, passed in growths), strict=True)
     )
-    wrong = [growth for growth, passed in growths if (growth < 0) != passed]
-    print(f"of 1000 rigs {simulated} pass, {linear} by linear theory; {len(wrong)} differ, whose modes grow by at most "
-          f"{max(map(abs, wrong), default=0.0):.3f} 1/s", flush=True)  # fmt: skip
+    differing_growths = [growth for growth, passed in growths if (growth < 0) != passed]
+    print(f"of 1000 rigs {simulated} pass, {linear} by linear theory; {len(differing_growths)} differ, "
+          f"whose modes grow by at most {max(map(abs, differing_growths), default=0.0):.3f} 1/s",
+          flush=True)  # fmt: skip
     estimate = clopper_pearson(simulated, 1000)
     if not estimate.low <= linear / 1000 <= estimate.high:
         faults.append(f"linear yield {linear / 1000} outside {estimate.low:.4f} … {estimate.high:.4f}")
-    if any(abs(growth) > 2.0 for growth in wrong):
+    if any(abs(growth) > 2.0 for growth in differing_growths):
         faults.append("a rig far from the boundary has the wrong verdict")
     return faults
 
@@ -104,11 +107,11 @@ def _growth_per_s(runner: CaseRunner, rig: int) -> float:
     return float(np.log(np.max(np.abs(loop.poles))) * configuration.loop.rate_hz)
 
 
-def promise(place: Path) -> list[str]:
+def promise(folder: Path) -> list[str]:
     """Run the shipped robust configuration on 5,000 rigs: its limits hold on at least 99.9 %."""
-    report = _json(
+    report = _run_json(
         "campaign", "run", ROOT / "deploy/campaign.toml", "--config", ROOT / "deploy/robust.toml", "--rigs", 5000,
-        "--out", place / "robust", folder=place,
+        "--out", folder / "robust", folder=folder,
     )  # fmt: skip
     estimate = report["yield_of_rigs"]
     print(
@@ -120,10 +123,10 @@ def promise(place: Path) -> list[str]:
     return [] if estimate["share"] >= 0.999 else [f"yield {estimate['share']}"]
 
 
-def coverage(place: Path) -> list[str]:
+def coverage(folder: Path) -> list[str]:
     """Run 200 campaigns of 200 rigs with a known probability of failure; 93 to 97 % of the intervals cover it."""
-    _write_ideal(place)
-    campaign = place / "offset.toml"
+    _write_ideal(folder)
+    campaign = folder / "offset.toml"
     key = "driver.plant.sensor.offset_um"
     campaign.write_text(
         STABLE.format(keys="rigs = 200", uncertain="", dwell_s=0.03)
@@ -133,7 +136,7 @@ def coverage(place: Path) -> list[str]:
         )
         .replace('"steps.static_error_percent" = 1e9', '"steps.static_error_percent" = 18.0')
     )
-    boundary = _json("campaign", "boundary", campaign, key, folder=place)
+    boundary = _run_json("campaign", "boundary", campaign, key, folder=folder)
     probability, covered = boundary["high"], 0
     loaded = load_campaign(campaign)
     for seed in range(200):
@@ -146,34 +149,35 @@ def coverage(place: Path) -> list[str]:
     return [] if 186 <= covered <= 194 else [f"{covered} of 200 intervals cover the yield; allowed: 186 … 194"]
 
 
-def efficiency(place: Path) -> list[str]:
-    """Time one process against two, and two Dask workers against two processes, in three alternating rounds."""
-    rigs, times = 4000, {"1 process": [], "2 processes": [], "Dask, 2 workers": []}
-    with dask_cluster(place, 2, QUICK_WORKERS) as address:
+def efficiency(folder: Path) -> list[str]:
+    """Time one process against two, and two Dask workers against two processes, in three rounds after a warm-up."""
+    rigs, durations_s = 4000, {"1 process": [], "2 processes": [], "Dask, 2 workers": []}
+    with dask_cluster(folder, 2, QUICK_WORKERS) as address:
         choices = {
             "1 process": ("--jobs", 1),
             "2 processes": ("--jobs", 2),
             "Dask, 2 workers": ("--scheduler", address),
         }
-        for pair in range(4):
+        for round_number in range(4):
             for name, options in choices.items():
-                times[name].append(_rigs_s(place / f"{name} {pair}", rigs, options))
-    one, two, dask = (np.array(values[1:]) for values in times.values())
-    for name, values in times.items():
+                durations_s[name].append(_rigs_s(folder / f"{name} {round_number}", rigs, options))
+    one_s, two_s, dask_s = (np.array(values[1:]) for values in durations_s.values())
+    for name, values in durations_s.items():
         print(f"{rigs} rigs with {name}: {np.median(values[1:]):.2f} s", flush=True)
     print(
-        f"2 processes are {np.median(one / two):.2f} × as fast as 1, Dask {np.median(two / dask):.2f} × as 2 processes"
+        f"2 processes are {np.median(one_s / two_s):.2f} × as fast as 1, "
+        f"Dask {np.median(two_s / dask_s):.2f} × as 2 processes"
     )
     runner = CaseRunner(load_campaign(ROOT / "deploy/campaign.toml"))
     for rig in range(20):
         runner.run(rig)
-    begin = time.process_time()
+    begin_s = time.process_time()
     for rig in range(200):
         runner.run(rig)
-    print(f"a rig costs {5 * (time.process_time() - begin):.2f} ms of processor with its ticks", flush=True)
-    return ["two processes are less than 1.8 × as fast"] * bool(np.median(one / two) < 1.8) + [
+    print(f"a rig costs {5 * (time.process_time() - begin_s):.2f} ms of processor with its ticks", flush=True)
+    return ["two processes are less than 1.8 × as fast"] * bool(np.median(one_s / two_s) < 1.8) + [
         "Dask is less than 0.9 × as fast as processes"
-    ] * bool(np.median(two / dask) < 0.9)
+    ] * bool(np.median(two_s / dask_s) < 0.9)
 
 
 def _rigs_s(folder: Path, rigs: int, options: tuple[object, ...]) -> float:
@@ -185,16 +189,16 @@ def _rigs_s(folder: Path, rigs: int, options: tuple[object, ...]) -> float:
     return max(path.stat().st_mtime for path in files) - files[0].stat().st_mtime
 
 
-def memory(place: Path) -> list[str]:
+def memory(folder: Path) -> list[str]:
     """Run 100,000 rigs and read the largest memory of the coordinator."""
-    campaign = place / "many.toml"
-    _write_ideal(place)
+    campaign = folder / "many.toml"
+    _write_ideal(folder)
     campaign.write_text(STABLE.format(keys="rigs = 100_000", uncertain="", dwell_s=0.002))
     process = subprocess.Popen(
-        [sys.executable, "-m", "rtloop", "campaign", "run", str(campaign), "--out", str(place / "many")],
+        [sys.executable, "-m", "rtloop", "campaign", "run", str(campaign), "--out", str(folder / "many")],
         stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env={**os.environ, "PYTHONPATH": str(ROOT)},
     )  # fmt: skip
-    begin, peak_mib = time.monotonic(), 0.0
+    begin_s, peak_mib = time.monotonic(), 0.0
     while process.poll() is None:
         with suppress(OSError):
             for line in Path(f"/proc/{process.pid}/status").read_text().splitlines():
@@ -202,24 +206,24 @@ def memory(place: Path) -> list[str]:
                     peak_mib = max(peak_mib, int(line.split()[1]) / 1024)
         time.sleep(0.5)
     print(
-        f"100,000 rigs in {time.monotonic() - begin:.0f} s; the coordinator needs {peak_mib:.0f} MiB at most",
+        f"100,000 rigs in {time.monotonic() - begin_s:.0f} s; the coordinator needs {peak_mib:.0f} MiB at most",
         flush=True,
     )
     print(process.communicate()[0].splitlines()[0])
     return [] if peak_mib <= 300 else [f"{peak_mib:.0f} MiB; allowed: 300 MiB"]
 
 
-def _write_ideal(place: Path) -> None:
-    """Write the paper's configuration without noise, rounding and left hysteresis."""
+def _write_ideal(folder: Path) -> None:
+    """Write ideal.toml: the paper's configuration with the replacements of IDEAL."""
     text = PAPER.read_text()
     for old, new in IDEAL.items():
         assert old in text
         text = text.replace(old, new, 1)
-    (place / "ideal.toml").write_text(text)
+    (folder / "ideal.toml").write_text(text)
 
 
-def _json(*arguments: object, folder: Path) -> dict:
-    """Run the command line and return its JSON."""
+def _run_json(*arguments: object, folder: Path) -> dict:
+    """Run an `rtloop` command and return its JSON. Raises AssertionError without output."""
     process = rtloop(*arguments, "--json", folder=folder)
     output, errors = process.communicate(timeout=3600)
     assert output, errors
@@ -229,10 +233,11 @@ def _json(*arguments: object, folder: Path) -> dict:
 PARTS: dict[str, Callable[[Path], list[str]]] = {
     function.__name__: function for function in (prediction, promise, coverage, efficiency, memory)
 }
+"""Parts of this test by name. Each works in a folder and returns a sentence for each bound that it misses."""
 
 
 def main() -> int:
-    """Run the named parts, or all; return 1 if one misses its bound."""
+    """Run the named parts, or all; return 1 if a bound is missed."""
     parser = argparse.ArgumentParser(prog="campaign", description=__doc__)
     parser.add_argument("parts", nargs="*", choices=[*PARTS, []], default=list(PARTS))
     faults = []

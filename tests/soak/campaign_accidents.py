@@ -1,4 +1,4 @@
-"""Accidents of campaigns and archives: the tests of tests/campaigns that are too long for `make test`."""
+"""Run the tests of tests/campaigns that are too long for `make test`: accidents of campaigns and archives."""
 
 from __future__ import annotations
 

@@ -1,10 +1,10 @@
-"""From two recordings to a controller that runs, on rigs drawn at random (`modal_rigs`). `make soak NAME=chain`.
+"""Record, identify, design and run, on rigs drawn at random (`modal_rigs`). `make soak NAME=chain`.
 
-Each rig is recorded under a slow sine and under steps, designed for as `rtloop design auto` does, and what was written
-then runs steps of 10 µm on that rig, in virtual time, with noise and quantisation on. A row says what became of it: the
-specification met, or by how much it is missed; or the refusal. Ends with 1 where an error other than a refusal came,
-a loop tripped, or a run was further from what `check` promises than LIMITS. Settling is shown, but not judged: a notch
-leaves a lightly damped mode undamped, and what the inverse leaves of the hysteresis makes it ring.
+Each rig is recorded under a slow sine and under steps, and a controller is designed as by `rtloop design auto`. The
+designed configuration then runs steps of 10 µm on that rig, in virtual time, with noise and quantisation. A row tells
+whether the specification is met, or by how much it is missed, or the refusal. The exit code is 1 where an error other
+than a refusal occurred, a loop tripped, or a run was further than LIMITS from the promise of `check`. Settling is
+printed, not judged: a notch leaves a lightly damped mode undamped, and the residual hysteresis makes it ring.
 """
 
 from __future__ import annotations
@@ -29,44 +29,47 @@ from rtloop.linear.discretise import discretise_controller
 from rtloop.signals import trip_causes
 from tests.design.modal_rigs import RATE_HZ, SINE_S, SPECIFICATION, STEPS_S, ModalRig, modal_rig
 from tests.recording.real_loop import record
-from tests.soak.draws import every_draw
+from tests.soak.draws import check_draws
 
 STEP_UM, DWELL_S = 10.0, 0.2
 LIMITS = {"overshoot_percent": 20.0, "static_percent": 2.0}
-"""How far a run may be from the promise."""
+"""Largest distance of a run from its promise, in percentage points."""
 
 
 def main() -> int:
-    """Every draw, a line each."""
+    """Check every drawn rig and print a line for each; return 1 if one fails."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--draws", type=int, default=40)
     parser.add_argument("--seed", type=int, default=1)
-    given = parser.parse_args()
-    seeds = range(given.seed, given.seed + given.draws)
-    return every_draw(seeds, lambda seed, folder: one(modal_rig(seed), folder))
+    options = parser.parse_args()
+    seeds = range(options.seed, options.seed + options.draws)
+    return check_draws(seeds, lambda seed, folder: design_and_run(modal_rig(seed), folder))
 
 
-def one(rig: ModalRig, folder: Path) -> tuple[bool, str]:
-    """Whether the rig was designed for and ran as promised, or was refused by code 1; and what there is to say."""
-    drawn = f"{rig.hz.size} modes from {rig.hz[0]:4.0f} Hz, ζ ≥ {rig.damping.min():.4f}, delay {rig.delay_ticks}:"
+def design_and_run(rig: ModalRig, folder: Path) -> tuple[bool, str]:
+    """Return whether the design ran as promised or was refused with code 1, and a line of text."""
+    rig_text = f"{rig.hz.size} modes from {rig.hz[0]:4.0f} Hz, ζ ≥ {rig.damping.min():.4f}, delay {rig.delay_ticks}:"
     try:
-        chain, written = designed_for(rig, folder)
+        chain, designed = designed_for(rig, folder)
     except RtloopError as error:
-        return error.exit_code == 1, f"{drawn} refused, {error.exit_code}: {error}"
-    running = prepare(load(written)).checks[0].running
+        return error.exit_code == 1, f"{rig_text} refused, {error.exit_code}: {error}"
+    running = prepare(load(designed)).checks[0].running
     assert running is not None
-    trips, distances = run(written, running)
-    far = [name for name, limit in LIMITS.items() if not abs(distances[name]) <= limit]
-    found = (
-        f"{drawn} found delay {chain.stage.dynamics.delay_ticks}, {chain.stage.dynamics.model.order} poles; "
+    trips, distances = run(designed, running)
+    missed = [name for name, limit in LIMITS.items() if not abs(distances[name]) <= limit]
+    text = (
+        f"{rig_text} identified delay {chain.stage.dynamics.delay_ticks}, {chain.stage.dynamics.model.order} poles; "
         f"γ {chain.synthesis.achieved:.3f}, order {chain.synthesis.controller.order}; {verdict(chain)}; "
         + ", ".join(f"{name} {value:+.2f}" for name, value in distances.items())
     )
-    return not trips and not far, found + (f"; tripped: {', '.join(trips)}" if trips else "")
+    return not trips and not missed, text + (f"; tripped: {', '.join(trips)}" if trips else "")
 
 
 def designed_for(rig: ModalRig, folder: Path, order: int | None = None) -> tuple[Chain, Path]:
-    """Two recordings, and the configuration that `design auto` writes. Raises RtloopError."""
+    """Record a rig twice and design for it as `design auto` does. Return the chain and the path of the configuration.
+
+    Raises RtloopError.
+    """
     sine = record(folder / "sine.mcap", rig.configuration(sine=True), round(SINE_S * 1000))[0]
     steps = record(folder / "steps.mcap", rig.configuration(sine=False), round(STEPS_S * RATE_HZ))[0]
     specification, out = folder / "spec.toml", folder / "designed.toml"
@@ -75,13 +78,15 @@ def designed_for(rig: ModalRig, folder: Path, order: int | None = None) -> tuple
 
 
 def verdict(chain: Chain) -> str:
-    """ "meets it", or what is missed: achieved against required, as it runs."""
-    output = chain.design.controller
-    controller = discretise_controller(chain.synthesis.controller, 1 / output.rate_hz, output.method, output.prewarp_hz)
+    """Return "meets it", or each missed limit with the value of the discretised loop."""
+    options = chain.design.controller
+    controller = discretise_controller(
+        chain.synthesis.controller, 1 / options.rate_hz, options.method, options.prewarp_hz
+    )
     assert chain.design.plant is not None
     loop = discrete_loop(controller, chain.design.plant.transfer(), chain.design.plant.delay_ticks)
-    asked = chain.design.specification
-    values, required = specified_quantities(loop, asked), required_limits(asked)
+    specification = chain.design.specification
+    values, required = specified_quantities(loop, specification), required_limits(specification)
     missed = [
         f"{name} {values[name]:.4g} for {limit.value:g}"
         for name, limit in required.items()
@@ -90,17 +95,17 @@ def verdict(chain: Chain) -> str:
     return "misses " + ", ".join(missed) if missed else "meets it"
 
 
-def with_steps(text: str, levels: list[float], dwell_s: float) -> str:
-    """A configuration's text whose first axis follows steps between `levels` in µm, each held for `dwell_s`."""
+def replace_reference_by_steps(text: str, levels: list[float], dwell_s: float) -> str:
+    """Return a configuration's text with steps between `levels` (µm), each held for `dwell_s`, on its first axis."""
     configuration = tomlkit.parse(text).unwrap()
     configuration["axis"][0]["reference"] = {"kind": "steps", "levels": levels, "dwell_s": dwell_s}
     return tomlkit.dumps(configuration)
 
 
-def run(written: Path, promised: LoopAnalysis) -> tuple[list[str], dict[str, float]]:
-    """Trips, and how far the first step of 10 µm up is from what was promised."""
-    text = with_steps(written.read_text(encoding="utf-8"), [0.0, STEP_UM, 0.0], DWELL_S)
-    path = record(written.with_name("run.mcap"), text, round(3 * DWELL_S * RATE_HZ))[0]
+def run(designed: Path, promised: LoopAnalysis) -> tuple[list[str], dict[str, float]]:
+    """Run a step of STEP_UM up and down. Return the trips, and the distances of the step up from the promise."""
+    text = replace_reference_by_steps(designed.read_text(encoding="utf-8"), [0.0, STEP_UM, 0.0], DWELL_S)
+    path = record(designed.with_name("run.mcap"), text, round(3 * DWELL_S * RATE_HZ))[0]
     recording = rtloop.load(path)
     flags = np.unique(recording["flags"])
     trips = sorted({cause for value in flags for cause in trip_causes(value)})

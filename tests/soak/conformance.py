@@ -2,7 +2,7 @@
 
     python -m tests.soak.conformance [MOST]
 
-MOST: only those with up to so many features, or without up to so many of all.
+MOST: only variants with at most MOST features, or with all features but at most MOST.
 """
 
 from __future__ import annotations
@@ -16,18 +16,18 @@ from tests.interchange.test_conformance import check
 
 
 def main() -> int:
-    """Print how many variants were tried, and what was wrong with any."""
-    wrong, tried, most = [], 0, int(sys.argv[1]) if len(sys.argv) > 1 else len(FEATURES)
+    """Print the number of variants and the fault of each wrong one; return 1 if there is a fault."""
+    faults, count, max_features = [], 0, int(sys.argv[1]) if len(sys.argv) > 1 else len(FEATURES)
     with tempfile.TemporaryDirectory() as folder:
-        for variant in variants(most):
-            tried += 1
+        for variant in variants(max_features):
+            count += 1
             try:
                 check(variant, Path(folder))
             except AssertionError as error:
-                wrong.append(f"{variant}: {error}")
-    print(f"{tried} variants, {len(wrong)} wrong")
-    print("\n".join(wrong))
-    return int(bool(wrong))
+                faults.append(f"{variant}: {error}")
+    print(f"{count} variants, {len(faults)} wrong")
+    print("\n".join(faults))
+    return int(bool(faults))
 
 
 if __name__ == "__main__":

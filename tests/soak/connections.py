@@ -1,7 +1,7 @@
-"""A service under clients that mean it no good, and an operator who stops and starts it. `make soak NAME=connections`.
+"""A service under slow and hostile clients, while an operator stops and starts it. `make soak NAME=connections`.
 
-Thousands of connections that say nothing or a byte a second, every hostile value in every place of every request,
-tables that are FIFOs: meanwhile `/stop` and `/start` go round, and how long a stop takes is what counts.
+Thousands of connections send nothing, or a byte a second. Other clients send every hostile value in every place of
+every request, and tables that are FIFOs. Meanwhile `/stop` and `/start` alternate; no stop may be refused.
 """
 
 from __future__ import annotations
@@ -24,15 +24,16 @@ from tests.service.hostile import EXPENSIVE, HOSTILE, every
 from tests.service.http import exchange
 
 STOPS_S = 0.5
+"""Pause (s) before the next stop and start."""
 WORKERS = 4
 
 
-def silent(path: Path, over: threading.Event, count: int, each_s: float) -> None:
-    """`count` connections; each gets a byte of a request in `each_s`, and is replaced when it is closed."""
+def hold_connections(path: Path, end: threading.Event, count: int, period_s: float) -> None:
+    """Hold `count` connections until `end` is set; reopen closed ones. Every other sends a byte in `period_s`."""
     with contextlib.ExitStack() as stack:
         clients: list[socket.socket | None] = [None] * count
         head, number = b"POST /stop HTTP/1.1\r\nHost: x\r\nContent-Length: 2\r\n\r\n{}", 0
-        while not over.is_set():
+        while not end.is_set():
             for index, client in enumerate(clients):
                 try:
                     if client is None:
@@ -46,16 +47,19 @@ def silent(path: Path, over: threading.Event, count: int, each_s: float) -> None
                         client.close()
                     clients[index] = None
             number += 1
-            over.wait(each_s)
+            end.wait(period_s)
 
 
-def hostile(path: Path, over: threading.Event, answers: dict[int, int], lot: int) -> None:
-    """Every hostile request of this worker's share, again and again."""
-    while not over.is_set():
-        requests = [*every(HOSTILE), *((path_, json.dumps(body).encode()) for path_, body in EXPENSIVE.items())]
+def send_hostile_requests(path: Path, end: threading.Event, answers: dict[int, int], worker: int) -> None:
+    """Send this worker's share of the hostile requests again and again; count the status codes in `answers`.
+
+    Code 0 counts requests without a valid answer.
+    """
+    while not end.is_set():
+        requests = [*every(HOSTILE), *((resource, json.dumps(body).encode()) for resource, body in EXPENSIVE.items())]
         fifo = ("/reference", b'{"axis": "x", "reference": {"kind": "table", "file": "fifo"}}')
         for number, (resource, body) in enumerate([*requests, *[fifo] * 40]):
-            if over.is_set() or number % WORKERS != lot:
+            if end.is_set() or number % WORKERS != worker:
                 continue
             try:
                 code, _ = exchange(path, "POST", resource, body)
@@ -65,52 +69,59 @@ def hostile(path: Path, over: threading.Event, answers: dict[int, int], lot: int
 
 
 def rss_mib(pid: int) -> float:
-    """Memory of a process."""
+    """Return the resident memory (MiB) of a process."""
     return int(Path(f"/proc/{pid}/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 2**20
 
 
 def main() -> None:
-    """Run, print, and fail where a stop was refused, the service died or a request was answered by a 500."""
+    """Run and print durations of stops, answers and memory.
+
+    Raises AssertionError if a stop was refused, the service failed or a request was answered with status 500.
+    """
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seconds", type=float, default=60.0)
     parser.add_argument("--connections", type=int, default=2000)
-    given = parser.parse_args()
-    over, answers, stops_ms, failed, largest_mib = threading.Event(), {}, [], [], 0.0
+    options = parser.parse_args()
+    end, answers, stops_ms, refusals, largest_mib = threading.Event(), {}, [], [], 0.0
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         with Bench(folder) as bench:
             os.mkfifo(folder / "fifo")
             path, before_mib = bench.client.path, rss_mib(bench.pid("service"))
             threads = [
-                threading.Thread(target=silent, args=(path, over, given.connections // 2, 1.0)) for _ in range(2)
+                threading.Thread(target=hold_connections, args=(path, end, options.connections // 2, 1.0))
+                for _ in range(2)
             ]
-            threads += [threading.Thread(target=hostile, args=(path, over, answers, lot)) for lot in range(WORKERS)]
+            threads += [
+                threading.Thread(target=send_hostile_requests, args=(path, end, answers, worker))
+                for worker in range(WORKERS)
+            ]
             for thread in threads:
                 thread.start()
-            end_s = time.monotonic() + given.seconds
+            end_s = time.monotonic() + options.seconds
             while time.monotonic() < end_s:
                 for resource in ("/stop", "/reset", "/start"):
-                    began_s = time.monotonic()
+                    begin_s = time.monotonic()
                     try:
                         bench.client.post(resource)
                     except RtloopError as error:
-                        if resource == "/stop":  # there is nothing to reset, and what is stopped starts again
-                            failed.append(str(error))
+                        if resource == "/stop":  # /reset may find no trip, and /start a running loop.
+                            refusals.append(str(error))
                     if resource == "/stop":
-                        stops_ms.append(1e3 * (time.monotonic() - began_s))
+                        stops_ms.append(1e3 * (time.monotonic() - begin_s))
                 largest_mib = max(largest_mib, rss_mib(bench.pid("service")))
-                over.wait(STOPS_S)
-            over.set()
+                end.wait(STOPS_S)
+            end.set()
             for thread in threads:
                 thread.join()
             bench.client.post("/stop")
             code, lost = bench.stop(), account(folder / "recordings", bench.blocks).lost
             log = bench.log()
     print(f"{len(stops_ms)} stops: median {statistics.median(stops_ms):.1f} ms, worst {max(stops_ms):.1f} ms")
-    print(f"answers: {dict(sorted(answers.items()))} (0: hung up)")
+    print(f"answers: {dict(sorted(answers.items()))} (0: no valid answer)")
     print(f"memory of the service: {before_mib:.0f} MiB before, at most {largest_mib:.0f} MiB; ticks lost: {lost}")
     assert code == 0, log[-2000:]
-    assert not failed, failed[:5]
+    assert not refusals, refusals[:5]
     assert 500 not in answers
     assert "Traceback" not in log, log[-2000:]
 

@@ -1,6 +1,6 @@
-"""How often ± of an identification covers the truth, by parameter: many recordings of one rig, each with its own noise.
+"""Coverage of the truth by the ± of identified parameters: many recordings of one rig, each with other noise.
 
-Once the actuator is known and has no hysteresis, so that the static gain has a truth; once it is identified as well.
+First the actuator is known and has no hysteresis, so that the static gain has a true value; then it is identified too.
 """
 
 from __future__ import annotations
@@ -21,35 +21,36 @@ from tests.recording.real_loop import record
 from tests.soak.lagged_rig import DAMPING, HZ, Rig
 
 NORMAL_95 = 1.96
+"""Half-width of a 95 % interval, in standard deviations."""
 LEAST_COVERED, MOST_COVERED = 0.90, 0.99
 KNOWN_UM_PER_V, KNOWN_STEP_V = 2.0, 7.5
-"""An actuator without hysteresis, and a step that the converter of 16 bits has exactly."""
+"""Gain of an actuator without hysteresis, and a step that a converter of 16 bits represents exactly."""
 
 
 class Estimate(NamedTuple):
-    """A parameter, its error and its stated standard deviation."""
+    """Name of a parameter, error of its estimate, and stated standard deviation."""
 
     parameter: str
     error: float
     std: float
 
 
-def estimates(fit: DynamicsFit, rig: Rig, gain: float | None) -> list[Estimate]:
-    """Errors beside standard deviations; of the static gain where its truth is known."""
-    light = min(fit.modes, key=lambda mode: mode.damping)
-    found = [
-        Estimate("frequency", light.frequency_hz - HZ, light.frequency_std_hz),
-        Estimate("damping", light.damping - DAMPING, light.damping_std),
+def list_estimates(fit: DynamicsFit, rig: Rig, gain: float | None) -> list[Estimate]:
+    """Return the estimates of resonance and lag, and of the static gain where its true value `gain` is given."""
+    resonance = min(fit.modes, key=lambda mode: mode.damping)
+    estimates = [
+        Estimate("frequency", resonance.frequency_hz - HZ, resonance.frequency_std_hz),
+        Estimate("damping", resonance.damping - DAMPING, resonance.damping_std),
     ]
-    others = [mode for mode in fit.modes if mode is not light]
-    if others:
-        lag = max(others, key=lambda mode: mode.static_share)
-        found.append(Estimate("lag", lag.frequency_hz - rig.lag_hz, lag.frequency_std_hz))
-    return found if gain is None else [*found, Estimate("gain", fit.static_gain - gain, fit.static_gain_std)]
+    other_modes = [mode for mode in fit.modes if mode is not resonance]
+    if other_modes:
+        lag = max(other_modes, key=lambda mode: mode.static_share)
+        estimates.append(Estimate("lag", lag.frequency_hz - rig.lag_hz, lag.frequency_std_hz))
+    return estimates if gain is None else [*estimates, Estimate("gain", fit.static_gain - gain, fit.static_gain_std)]
 
 
-def with_known_actuator(rig: Rig, seed: int, folder: Path) -> DynamicsFit:
-    """Identify from the drive of an actuator without hysteresis."""
+def identify_with_known_actuator(rig: Rig, seed: int, folder: Path) -> DynamicsFit:
+    """Identify the dynamics from the drive of an actuator without hysteresis."""
     text = rig.text("own-stage", seed).replace("value = 10.0", f"value = {KNOWN_STEP_V}")
     text = re.sub(
         r"thresholds_v = \[.*\]\nweights_um_per_v = \[1.3.*\]",
@@ -60,41 +61,44 @@ def with_known_actuator(rig: Rig, seed: int, folder: Path) -> DynamicsFit:
     return identify_dynamics(Excitation(run.name, run.drive_v, run.position_um, run.period_s))
 
 
-def with_identified_actuator(rig: Rig, seed: int, folder: Path) -> DynamicsFit:
-    """Identify both from a slow sine and a step up and down, as `design auto` does."""
+def identify_with_actuator(rig: Rig, seed: int, folder: Path) -> DynamicsFit:
+    """Identify actuator and dynamics from a slow sine and a step up and down, as `design auto` does."""
     sine = record(folder / f"sine-{seed}.mcap", rig.text("own-stage-sine", seed), 25_000)[0]
     steps = record(folder / f"steps-{seed}.mcap", rig.text("own-stage", seed), 10_000)[0]
     return identify_stage(read_axis_recording(sine, None), read_axis_recording(steps, None)).dynamics
 
 
-def coverage(rig: Rig, draws: int) -> bool:
-    """Print how often ± covers the truth; whether it does in 90 to 99 of 100 of all, and the delay is right."""
-    good = True
+def check_coverage(rig: Rig, draws: int) -> bool:
+    """Print how often ± covers the truth. Return whether 90 to 99 % of all estimates do, and each delay is right."""
+    passed = True
     for name, identify, gain in (
-        ("actuator known", with_known_actuator, KNOWN_UM_PER_V),
-        ("actuator identified", with_identified_actuator, None),
+        ("actuator known", identify_with_known_actuator, KNOWN_UM_PER_V),
+        ("actuator identified", identify_with_actuator, None),
     ):
         fits: list[DynamicsFit] = []
         for seed in range(1, draws + 1):
             with tempfile.TemporaryDirectory() as folder:
                 fits.append(identify(rig, seed, Path(folder)))
-        rows = [row for fit in fits for row in estimates(fit, rig, gain)]
-        delays = sum(fit.delay_ticks == rig.delay_ticks for fit in fits)
-        white = sum(fit.tests.is_white for fit in fits)
-        print(f"{name}: {draws} draws, delay right in {delays}, residuals white in {white}")
-        for parameter in dict.fromkeys(row.parameter for row in rows):
-            of_it = [row for row in rows if row.parameter == parameter]
-            errors, stds = np.array([row.error for row in of_it]), np.array([row.std for row in of_it])
+        estimates = [estimate for fit in fits for estimate in list_estimates(fit, rig, gain)]
+        right_delays = sum(fit.delay_ticks == rig.delay_ticks for fit in fits)
+        white_residuals = sum(fit.tests.is_white for fit in fits)
+        print(f"{name}: {draws} draws, delay right in {right_delays}, residuals white in {white_residuals}")
+        for parameter in dict.fromkeys(estimate.parameter for estimate in estimates):
+            of_parameter = [estimate for estimate in estimates if estimate.parameter == parameter]
+            errors, stds = (
+                np.array([estimate.error for estimate in of_parameter]),
+                np.array([estimate.std for estimate in of_parameter]),
+            )
             print(
                 f"  {parameter:10} mean error {errors.mean():+.3g}, spread {errors.std():.3g}, stated "
-                f"{np.median(stds):.3g}, covered {100 * covered(of_it):.0f} % of {len(of_it)}"
+                f"{np.median(stds):.3g}, covered {100 * covered_share(of_parameter):.0f} % of {len(of_parameter)}"
             )
-        share = covered(rows)
-        good &= LEAST_COVERED <= share <= MOST_COVERED and delays == draws
-        print(f"  together {100 * share:.1f} %", flush=True)
-    return good
+        share = covered_share(estimates)
+        passed &= LEAST_COVERED <= share <= MOST_COVERED and right_delays == draws
+        print(f"  all parameters {100 * share:.1f} %", flush=True)
+    return passed
 
 
-def covered(rows: list[Estimate]) -> float:
-    """The part of all estimates whose ± at 95 % covers the truth."""
-    return float(np.mean([abs(row.error) <= NORMAL_95 * row.std for row in rows]))
+def covered_share(estimates: list[Estimate]) -> float:
+    """Return the share of the estimates whose ± at 95 % covers the truth."""
+    return float(np.mean([abs(estimate.error) <= NORMAL_95 * estimate.std for estimate in estimates]))

@@ -1,4 +1,4 @@
-"""Rigs drawn at random, one after the other."""
+"""A check of rigs that are drawn at random by seed."""
 
 from __future__ import annotations
 
@@ -8,14 +8,17 @@ from collections.abc import Callable
 from pathlib import Path
 
 
-def every_draw(seeds: range, one: Callable[[int, Path], tuple[bool, str]]) -> int:
-    """Print what `one` says of each seed, in a folder of its own; 1 where any was bad."""
-    bad = 0
+def check_draws(seeds: range, check: Callable[[int, Path], tuple[bool, str]]) -> int:
+    """Call `check` with each seed and a new folder; it returns whether the rig passed, and a text, which is printed.
+
+    Return 1 if a rig failed, else 0.
+    """
+    failures = 0
     for seed in seeds:
-        started = time.perf_counter()
+        start_s = time.perf_counter()
         with tempfile.TemporaryDirectory() as folder:
-            good, words = one(seed, Path(folder))
-        bad += not good
-        print(f"{seed:3} {words}  [{time.perf_counter() - started:.0f} s]{'' if good else '  BAD'}", flush=True)
-    print(f"{len(seeds)} rigs, {bad} bad")
-    return int(bad > 0)
+            passed, text = check(seed, Path(folder))
+        failures += not passed
+        print(f"{seed:3} {text}  [{time.perf_counter() - start_s:.0f} s]{'' if passed else '  BAD'}", flush=True)
+    print(f"{len(seeds)} rigs, {failures} bad")
+    return int(failures > 0)

@@ -1,6 +1,6 @@
-"""Forged recordings by the thousand through every command, in workers of their own: `… [COUNT] [FIRST]`.
+"""Thousands of forged recordings through every command, in worker processes: `… [COUNT] [FIRST]`.
 
-A worker that dies or hangs has died of the file that it had begun: it is named, and another one goes on behind it.
+When a worker dies, the file that it had begun is reported, and another worker continues with the next file.
 """
 
 from __future__ import annotations
@@ -18,75 +18,79 @@ from tests.recording.forged_worker import CODES
 
 ROOT = Path(__file__).resolve().parents[2]
 COUNT, BATCH, EVERY = 10_000, 500, 40
-MOST_MIB = 600
+"""Files; files of a worker; one in so many also runs the slow commands."""
+MAX_MIB = 600
 
 
 class Table:
-    """How often each command ended how, and what must not have been."""
+    """Counts of the outcomes by command, and a line for each outcome that is not allowed."""
 
     def __init__(self) -> None:
         self.counts: defaultdict[str, Counter[str]] = defaultdict(Counter)
-        self.wrong: list[str] = []
+        self.faults: list[str] = []
         self.peak_mib = 0
 
-    def add(self, what: str, line: dict[str, object]) -> None:
-        """One file that a worker has got through."""
+    def add(self, forgery: str, line: dict[str, object]) -> None:
+        """Count the outcomes of one file, from a worker's line of JSON."""
         self.peak_mib = max(self.peak_mib, int(str(line["peak_mib"])))
         outcomes = line["outcomes"]
         assert isinstance(outcomes, dict)
-        for use, outcome in outcomes.items():
-            good = outcome.isdigit() and int(outcome) in CODES
-            self.counts[use][f"exit {outcome}" if good else outcome.split()[0]] += 1
-            if not good:
-                self.wrong.append(f"{line['number']} ({what}): {use}: {outcome}")
-                print(self.wrong[-1], flush=True)
+        for command, outcome in outcomes.items():
+            is_allowed = outcome.isdigit() and int(outcome) in CODES
+            self.counts[command][f"exit {outcome}" if is_allowed else outcome.split()[0]] += 1
+            if not is_allowed:
+                self.faults.append(f"{line['number']} ({forgery}): {command}: {outcome}")
+                print(self.faults[-1], flush=True)
 
     def show(self) -> None:
-        """Command by command."""
-        for use, counts in self.counts.items():
-            print(f"{use:15} {sum(counts.values()):6}  " + ", ".join(f"{k}: {n}" for k, n in sorted(counts.items())))
+        """Print the outcomes of each command, the largest memory and the faults."""
+        for command, counts in self.counts.items():
+            print(
+                f"{command:15} {sum(counts.values()):6}  " + ", ".join(f"{k}: {n}" for k, n in sorted(counts.items()))
+            )
         print(f"largest worker: {self.peak_mib} MiB")
-        print("\n".join(self.wrong) or "no crash, no hang, no traceback, nothing wrongly identical")
+        print("\n".join(self.faults) or "no crash, no hang, no traceback, no false verdict of identity")
 
 
-def work(table: Table, first: int, count: int) -> int:
-    """One worker; returns the number of the next file."""
-    with tempfile.TemporaryDirectory(dir=_quick_folder()) as folder:
+def run_worker(table: Table, first: int, count: int) -> int:
+    """Run one worker for `count` files from number `first`. Return the number of the next file."""
+    with tempfile.TemporaryDirectory(dir=_memory_folder()) as folder:
         command = [sys.executable, "-m", "tests.recording.forged_worker", folder, first, count, EVERY]
         worker = subprocess.Popen([str(word) for word in command], cwd=ROOT, stdout=subprocess.PIPE, text=True)
-        begun: dict[str, object] = {"number": first - 1, "what": "before the first file"}
-        ended = first - 1
-        for text in worker.stdout or ():
-            line = json.loads(text)
+        current: dict[str, object] = {"number": first - 1, "what": "before the first file"}
+        last_done = first - 1
+        for line_text in worker.stdout or ():
+            line = json.loads(line_text)
             if "what" in line:
-                begun = line
+                current = line
             else:
-                table.add(str(begun["what"]), line)
-                ended = int(line["number"])
+                table.add(str(current["what"]), line)
+                last_done = int(line["number"])
         code = worker.wait()
     if code == 0:
         return first + count
     name = signal.Signals(-code).name if code < 0 else f"exit {code}"
     table.counts["worker"][name] += 1
-    table.wrong.append(f"{begun['number']} ({begun['what']}): the worker ended with {name}")
-    return max(ended, int(str(begun["number"]))) + 1
+    table.faults.append(f"{current['number']} ({current['what']}): the worker ended with {name}")
+    return max(last_done, int(str(current["number"]))) + 1
 
 
-def _quick_folder() -> str | None:
+def _memory_folder() -> str | None:
+    """Return a folder in memory, None where there is none."""
     return "/dev/shm" if Path("/dev/shm").is_dir() else None
 
 
 def main() -> int:
-    """The table; 1 where something was wrong."""
+    """Print the outcomes; return 1 for a fault, or a worker that needed more than MAX_MIB."""
     count, first = (int(word) for word in (*sys.argv[1:], *(str(COUNT), "0")[len(sys.argv) - 1 :]))
-    table, number, begun_s = Table(), first, time.monotonic()
+    table, number, begin_s = Table(), first, time.monotonic()
     while number < first + count:
-        number = work(table, number, min(BATCH, first + count - number))
+        number = run_worker(table, number, min(BATCH, first + count - number))
         print(
-            f"{number - first} of {count} in {time.monotonic() - begun_s:.0f} s, {len(table.wrong)} wrong", flush=True
+            f"{number - first} of {count} in {time.monotonic() - begin_s:.0f} s, {len(table.faults)} wrong", flush=True
         )
     table.show()
-    return 1 if table.wrong or table.peak_mib > MOST_MIB else 0
+    return 1 if table.faults or table.peak_mib > MAX_MIB else 0
 
 
 if __name__ == "__main__":

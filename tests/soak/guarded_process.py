@@ -1,6 +1,6 @@
-"""The loop's process with a canary before and behind every record of the law: `python -m tests.soak.guarded_process`.
+"""The loop's process with a canary before and after every record of the law: `python -m tests.soak.guarded_process`.
 
-When the loop has ended it reports how many bytes of the canaries are no longer what they were.
+When the loop has ended, the process reports how many canary bytes were overwritten.
 """
 
 from __future__ import annotations
@@ -17,44 +17,45 @@ from rtloop.kernel import memory
 from rtloop.kernel.layout import LINE_BYTES, Records
 
 CANARY_BYTES, CANARY = 1 << 16, 0xA5
-_guarded: list[tuple[np.ndarray[Any, Any], int, int]] = []
+_buffers: list[tuple[np.ndarray[Any, Any], int, int]] = []
+"""Each buffer with the first byte and the end of its records; all other bytes are canaries."""
 
 
-def guarded_records(dtype: np.dtype[Any], count: int) -> Records:
-    """As `memory.records`, between two canaries."""
-    room = np.full(2 * CANARY_BYTES + count * dtype.itemsize + LINE_BYTES, CANARY, np.uint8)
-    begin = CANARY_BYTES + -(room.ctypes.data + CANARY_BYTES) % LINE_BYTES
+def new_guarded_records(dtype: np.dtype[Any], count: int) -> Records:
+    """Return zeroed records as `memory.new_records` does, between two canaries."""
+    buffer = np.full(2 * CANARY_BYTES + count * dtype.itemsize + LINE_BYTES, CANARY, np.uint8)
+    begin = CANARY_BYTES + -(buffer.ctypes.data + CANARY_BYTES) % LINE_BYTES
     end = begin + count * dtype.itemsize
-    room[begin:end] = 0
-    _guarded.append((room, begin, end))
-    return room[begin:end].view(dtype).view(np.recarray)
+    buffer[begin:end] = 0
+    _buffers.append((buffer, begin, end))
+    return buffer[begin:end].view(dtype).view(np.recarray)
 
 
-def guarded() -> int:
-    """Allocations of records so far, each between canaries of its own."""
-    return len(_guarded)
+def guarded_count() -> int:
+    """Return the number of allocations of records so far, each between two canaries."""
+    return len(_buffers)
 
 
-def broken() -> int:
-    """Bytes of all canaries that something wrote to."""
-    return sum(int(np.count_nonzero(np.delete(room, np.s_[begin:end]) != CANARY)) for room, begin, end in _guarded)
+def overwritten_bytes() -> int:
+    """Return the number of canary bytes that were overwritten."""
+    return sum(int(np.count_nonzero(np.delete(buffer, np.s_[begin:end]) != CANARY)) for buffer, begin, end in _buffers)
 
 
 @contextmanager
-def guarding() -> Iterator[None]:
-    """Records that are made meanwhile have canaries, and are kept for ever."""
-    memory.new_records, usual = guarded_records, memory.new_records
+def guard_records() -> Iterator[None]:
+    """Allocate records between canaries within the context; their buffers are never freed."""
+    memory.new_records, original = new_guarded_records, memory.new_records
     try:
         yield
     finally:
-        memory.new_records = usual
+        memory.new_records = original
 
 
 def main() -> int:
-    """The loop's process, and then the canaries."""
-    with guarding():
+    """Run the loop's process, then report the canaries; return the exit code of the loop."""
+    with guard_records():
         code = process.main()
-    process.report("canaries", records=guarded(), broken=broken())
+    process.report("canaries", records=guarded_count(), broken=overwritten_bytes())
     return code
 
 

@@ -14,13 +14,13 @@ HZ, DAMPING, NOISE_UM = 800.0, 0.02, 0.020
 
 
 class Rig(NamedTuple):
-    """The lag in Hz and the samples of delay."""
+    """Corner frequency (Hz) of the lag, and samples of delay."""
 
     lag_hz: float
     delay_ticks: int
 
     def text(self, name: str, seed: int) -> str:
-        """A configuration of deploy/ with this rig and noise of its own."""
+        """Return the configuration `name` of deploy/ with this rig, NOISE_UM of noise and the noise's seed."""
         rate = 2 * np.pi * self.lag_hz
         omega = 2 * np.pi * HZ
         factors = [[1.0, 2 * DAMPING * omega, omega**2], [1.0, rate]]
@@ -32,7 +32,7 @@ class Rig(NamedTuple):
             "noise_um": NOISE_UM,
             **({"latency_ticks": self.delay_ticks} if "latency_ticks" in text else {}),
         }.items():
-            text = with_value(text, key, value)
+            text = replace_value(text, key, value)
         return text
 
 
@@ -42,8 +42,8 @@ RIGS = (
 )  # fmt: skip
 
 
-def with_value(text: str, key: str, value: object) -> str:
-    """`text` with another value of a key that stands in it once."""
+def replace_value(text: str, key: str, value: object) -> str:
+    """Return `text` with another value of a key. Raises AssertionError unless `text` has the key once."""
     changed, count = re.subn(rf"(?m)^{key} = .*$", f"{key} = {value!r}", text)
     assert count == 1, (key, count)
     return changed

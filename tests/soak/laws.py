@@ -1,9 +1,9 @@
-"""A thousand live changes of every shipped controller: its numbers, modes, and other laws. `make soak NAME=laws`.
+"""A thousand live changes of every shipped controller: parameters, modes, and other laws. `make soak NAME=laws`.
 
-Without a slew limit, so that the drive does what the law says, and judged by the demand, which nothing has limited yet.
-In the tick of a change in closed loop it must go on from the drive in force; from tick to tick it may move by half as
-much again as under C(z) alone, changed as often. The recording must replay identical: whole, in several files, and cut
-off anywhere and recovered. Nothing may be written outside a record.
+There is no slew limit, so that the drive follows the law; the demand, before all limits, is judged. In the tick of a
+change in closed loop the demand must continue from the drive in force; from tick to tick it may move by half as much
+again as under C(z) alone, changed as often. The recording must replay identical: in one file, in several files, and
+recovered after a cut at any byte. No write may fall outside a record.
 """
 
 from __future__ import annotations
@@ -29,49 +29,53 @@ from tests.laws.changing import (
     change_at_random,
     steps_of,
 )
-from tests.soak.guarded_process import broken, guarded, guarding
+from tests.soak.guarded_process import guard_records, guarded_count, overwritten_bytes
 
 CHANGES, ROTATE_S = 1000, 5.0
 LAWS = [*CONTROLLERS, "coupled"]
 
 
-def changed(folder: Path, sections: dict[str, str], seed: int) -> tuple[LawChanges, Path, list[Path]]:
-    """The changes of one run, its recording in one file, and in several."""
-    whole, parts = folder / "whole.mcap", folder / "parts.mcap"
-    files = {whole: Options(min_free_bytes=0), parts: Options(min_free_bytes=0, rotate_s=ROTATE_S)}
-    with guarding():
+def record_changes(folder: Path, sections: dict[str, str], seed: int) -> tuple[LawChanges, Path, list[Path]]:
+    """Record a run with random changes. Return the changes, the recording in one file, and in several files."""
+    single_file, part_files = folder / "whole.mcap", folder / "parts.mcap"
+    files = {single_file: Options(min_free_bytes=0), part_files: Options(min_free_bytes=0, rotate_s=ROTATE_S)}
+    with guard_records():
         changes = change_at_random(folder, sections, files, seed=seed, count=CHANGES, model=True)
-    return changes, whole, sorted(folder.glob("parts-*.mcap"))
+    return changes, single_file, sorted(folder.glob("parts-*.mcap"))
 
 
 def steps_alone(seed: int) -> Steps:
-    """Of C(z), changed as often, with no other law beside it."""
+    """Return the largest steps of the demand under C(z) alone, changed as often, without another law."""
     with tempfile.TemporaryDirectory(prefix="rtloop-laws-") as name:
-        _, whole, _ = changed(Path(name), {"transfer": CONTROLLERS["transfer"]}, seed)
-        return steps_of(rtloop.load(whole))
+        _, path, _ = record_changes(Path(name), {"transfer": CONTROLLERS["transfer"]}, seed)
+        return steps_of(rtloop.load(path))
 
 
-def cut_off(path: Path, chance: Random) -> Path:
-    """A copy that ends after any byte of the last four fifths, recovered."""
+def cut_and_recover(path: Path, random: Random) -> Path:
+    """Cut a copy of the file at a random byte of the last four fifths; return the path of the recovered copy."""
     data, part = path.read_bytes(), path.with_name("cut.mcap.part")
-    part.write_bytes(data[: round(len(data) * chance.uniform(0.2, 1.0))])
+    part.write_bytes(data[: round(len(data) * random.uniform(0.2, 1.0))])
     return Path(recover(part)["output"])
 
 
-def soak(first: str, seed: int, alone: Steps) -> None:
-    """The run that begins with one law, judged."""
-    beside = TOGETHER if first in TOGETHER else CONTROLLERS
-    sections = {first: beside[first]} | beside
+def check_law(first: str, seed: int, alone: Steps) -> None:
+    """Check a run that begins with the law `first` and print its figures. Raises AssertionError for a fault."""
+    controllers = TOGETHER if first in TOGETHER else CONTROLLERS
+    sections = {first: controllers[first]} | controllers
     with tempfile.TemporaryDirectory(prefix="rtloop-laws-") as name:
         (Path(name) / "pair.py").write_text(PAIR, encoding="utf-8")
-        changes, whole, parts = changed(Path(name), sections, seed)
-        recording = rtloop.load(whole)
+        changes, path, part_paths = record_changes(Path(name), sections, seed)
+        recording = rtloop.load(path)
         steps = steps_of(recording)
         trips = [event["what"] for event in recording.events if event["kind"] == "tripped"]
-        kinds = {"whole": whole, "recovered": cut_off(whole, Random(seed)), f"{len(parts)} files": parts}
+        kinds = {
+            "one file": path,
+            "recovered": cut_and_recover(path, Random(seed)),
+            f"{len(part_paths)} files": part_paths,
+        }
         trust = TrustedLaws(recorded=True)
         verdicts = {kind: replay(rtloop.load(files), trust=trust) for kind, files in kinds.items()}
-    said = ", ".join(
+    replay_text = ", ".join(
         f"{kind} {'identical' if verdict.identical else verdict.first_difference or verdict.not_verified} "
         f"({verdict.ticks} ticks)"
         for kind, verdict in verdicts.items()
@@ -81,31 +85,31 @@ def soak(first: str, seed: int, alone: Steps) -> None:
         f"{changes.refused} refused, {len(trips)} trips\n"
         f"  largest |Δdemand| {steps.at_change_v:.1e} V at a change, {steps.largest_v:.4f} V in any tick "
         f"(allowed {AT_CHANGE_V:g} V, {MORE * alone.largest_v:.4f} V), {steps.limited} ticks limited\n"
-        f"  replay: {said}; {broken()} bytes written beside {guarded()} records",
+        f"  replay: {replay_text}; {overwritten_bytes()} bytes overwritten around {guarded_count()} records",
         flush=True,
     )
     assert not trips
     assert steps.at_change_v <= AT_CHANGE_V
     assert steps.largest_v <= MORE * alone.largest_v
     assert steps.limited == 0
-    assert len(parts) > 2
-    assert verdicts["whole"].ticks == verdicts[f"{len(parts)} files"].ticks > verdicts["recovered"].ticks
+    assert len(part_paths) > 2
+    assert verdicts["one file"].ticks == verdicts[f"{len(part_paths)} files"].ticks > verdicts["recovered"].ticks
     assert all(verdict.identical and not verdict.problems for verdict in verdicts.values())
-    assert guarded()
-    assert broken() == 0
+    assert guarded_count()
+    assert overwritten_bytes() == 0
 
 
 def main() -> None:
-    """Every controller with every seed."""
+    """Check every controller with every seed."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("seeds", nargs="*", type=int, default=[14])
     parser.add_argument("--laws", nargs="*", choices=LAWS, default=list(LAWS))
-    given = parser.parse_args()
-    for seed in given.seeds:
+    options = parser.parse_args()
+    for seed in options.seeds:
         alone = steps_alone(seed)
         print(f"C(z) alone, seed {seed}: {alone.at_change_v:.1e} V at a change, {alone.largest_v:.4f} V in any tick")
-        for first in given.laws:
-            soak(first, seed, alone)
+        for first in options.laws:
+            check_law(first, seed, alone)
 
 
 if __name__ == "__main__":

@@ -1,7 +1,7 @@
-"""A law that is changed all the time, at random, in everything that may change under way.
+"""A law under continuous random changes of every parameter that may change while the loop runs.
 
-Two axes in virtual time, as fast as the loop goes, changed by the very code that a service uses. Nothing may be written
-outside a record (canaries lie around each, and every index is checked), no drive may leave its limits or its slew, and
+Two axes in virtual time, as fast as the loop runs, changed by the code that a service uses. No write may fall outside
+a record (canaries surround each record, and every index is checked), no drive may exceed its limits or its slew, and
 the recording must replay identical.
 """
 
@@ -41,7 +41,7 @@ TRIP = ("trip_slew_v_per_s = 1000.0", f"trip_slew_v_per_s = {TRIP_SLEW_V_PER_S}"
 
 
 class GuardedProcesses(Processes):
-    """With canaries around the loop's records."""
+    """Processes of a run, with canaries around the loop's records."""
 
     def __init__(self) -> None:
         self.fd = SharedBlock.reserve()
@@ -51,10 +51,10 @@ class GuardedProcesses(Processes):
 
 
 class EveryChange(Changes):
-    """Of everything that may change under way, on either axis."""
+    """Random changes, on either axis, of every parameter that may change while the loop runs."""
 
     def kinds(self) -> Sequence[Callable[[], object]]:
-        """All of them."""
+        """Return a method for each kind of change."""
         kinds = self._prefilter, self._controller, self._limits, self._interlocks, self._mode, self._reference
         return (*kinds, self._waveform, self._tare, self._reset)
 
@@ -75,7 +75,7 @@ class EveryChange(Changes):
         self._live.tune(self._axis, "prefilter", values)
 
     def _controller(self) -> None:
-        """An integrator with up to 23 more poles and zeros, all beyond the crossover; any number is stable."""
+        """Load an integrator with up to 23 more poles and zeros, all above the crossover: always a stable loop."""
         order = self._chance.randrange(0, 24)
         poles = [-self._chance.uniform(3e3, 2e4) for _ in range(order)]
         zeros = [pole * self._chance.uniform(0.9, 1.1) for pole in poles]
@@ -105,9 +105,9 @@ class EveryChange(Changes):
         self._desk.submit(Kind.SET_MODE, values=[float(self._chance.choice(list(Mode)))])
 
     def _reference(self) -> None:
-        amplitude, offset = self._chance.uniform(0.0, 9.0), self._chance.uniform(-9.0, 9.0)
+        amplitude_um, offset_um = self._chance.uniform(0.0, 9.0), self._chance.uniform(-9.0, 9.0)
         reference: dict[str, Any] = {"kind": self._chance.choice(("sine", "triangle")), "frequency_hz": 40.0}
-        reference |= {"amplitude": amplitude, "offset": offset}
+        reference |= {"amplitude": amplitude_um, "offset": offset_um}
         if self._chance.random() < 0.4:
             levels = [self._chance.uniform(-9.0, 9.0) for _ in range(self._chance.randrange(1, 50))]
             reference = {"kind": "steps", "levels": levels, "dwell_s": 0.01}
@@ -130,9 +130,10 @@ class EveryChange(Changes):
 
 
 def record(folder: Path, ticks: int, seed: int) -> tuple[list[Path], EveryChange, dict[str, Any]]:
-    """Run so many ticks under changes; the recording's files, the changes, what the canaries say."""
+    """Run `ticks` ticks under changes. Return the recording's files, the changes and the report on the canaries."""
     text = TEXT.replace(*LIMITS).replace(*TRIP)
-    text = MODEL.sub("", text[: text.index("[recording]")])  # without margins to find, a change takes milliseconds
+    # Without a model no margins are computed, and a change takes milliseconds.
+    text = MODEL.sub("", text[: text.index("[recording]")])
     text += f'[recording]\nfolder = "{folder}"\nrotate_mib = {ROTATE_MIB}\nmin_free_mib = 0.0\n'
     with GuardedProcesses() as processes:
         prepared = prepare(parse(text, "changes", folder, "changes"), duration_s=ticks / RATE_HZ, paced=False)
@@ -147,54 +148,55 @@ def record(folder: Path, ticks: int, seed: int) -> tuple[list[Path], EveryChange
                 if supervisor.ticks:
                     changes.one()
 
-        changing = threading.Thread(target=change)
-        changing.start()
+        changer = threading.Thread(target=change)
+        changer.start()
         try:
             result = supervisor.run()
         finally:
             ended.set()
-            changing.join()
+            changer.join()
         assert result.outcome == "done", result
         return result.recordings, changes, supervisor._reports["canaries"]
 
 
-def judge(paths: list[Path]) -> dict[str, float]:
-    """Largest drive and largest change of it in a tick, as the recording shows them."""
-    found = {"drive_v": 0.0, "step_v": 0.0}
+def largest_drives(paths: list[Path]) -> dict[str, float]:
+    """Return the largest recorded |drive| (drive_v) and its largest change in a tick (step_v), in V, over both axes."""
+    largest = {"drive_v": 0.0, "step_v": 0.0}
     recording = rtloop.load(paths)
     for axis in "xy":
         drive_v = recording[f"{axis}_drive_v"]
-        found["drive_v"] = max(found["drive_v"], float(np.abs(drive_v).max()))
-        found["step_v"] = max(found["step_v"], float(np.abs(np.diff(drive_v, prepend=0.0)).max()))
-    return found
+        largest["drive_v"] = max(largest["drive_v"], float(np.abs(drive_v).max()))
+        largest["step_v"] = max(largest["step_v"], float(np.abs(np.diff(drive_v, prepend=0.0)).max()))
+    return largest
 
 
 def main() -> None:
-    """Run, judge, print."""
+    """Run, replay and print in parts of ten million ticks. Raises AssertionError for a fault."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--ticks", type=int, default=100_000_000)
     parser.add_argument("--seed", type=int, default=14)
-    given = parser.parse_args()
+    options = parser.parse_args()
     ticks = changed = refused = 0
-    for number in range(-(-given.ticks // BLOCK_TICKS // 10)):
+    for number in range(-(-options.ticks // BLOCK_TICKS // 10)):
         with tempfile.TemporaryDirectory(prefix="rtloop-changes-") as name:
-            paths, changes, canaries = record(Path(name), 10 * BLOCK_TICKS, given.seed + number)
-            found, verdict = judge(paths), replay(rtloop.load(paths))
+            paths, changes, canaries = record(Path(name), 10 * BLOCK_TICKS, options.seed + number)
+            largest, verdict = largest_drives(paths), replay(rtloop.load(paths))
         ticks, changed, refused = ticks + verdict.ticks, changed + changes.done.total(), refused + changes.refused
         print(
-            f"seed {given.seed + number}: {verdict.ticks} ticks, {changes.done.total()} changes {dict(changes.done)}, "
-            f"{changes.refused} refused; {canaries['broken']} bytes written beside {canaries['records']} records; "
-            f"largest |drive| {found['drive_v']:.6f} of {DRIVE_V} V, largest step {found['step_v']:.6f} of "
+            f"seed {options.seed + number}: {verdict.ticks} ticks, {changes.done.total()} changes "
+            f"{dict(changes.done)}, {changes.refused} refused; "
+            f"{canaries['broken']} bytes overwritten around {canaries['records']} records; "
+            f"largest |drive| {largest['drive_v']:.6f} of {DRIVE_V} V, largest step {largest['step_v']:.6f} of "
             f"{SLEW_V_PER_S / RATE_HZ} V; replay {'identical' if verdict.identical else verdict.first_difference}",
             flush=True,
         )
         assert canaries["records"]
         assert canaries["broken"] == 0
-        assert found["drive_v"] <= DRIVE_V
-        assert found["step_v"] <= SLEW_V_PER_S / RATE_HZ * (1 + 1e-9)
+        assert largest["drive_v"] <= DRIVE_V
+        assert largest["step_v"] <= SLEW_V_PER_S / RATE_HZ * (1 + 1e-9)
         assert verdict.identical
         assert not verdict.problems
-    print(f"{ticks} ticks, {changed} changes, {refused} refused: nothing outside a record, all replay identical")
+    print(f"{ticks} ticks, {changed} changes, {refused} refused: no write outside a record, all replay identical")
 
 
 if __name__ == "__main__":

@@ -20,7 +20,7 @@ from rtloop.recording.file.topics.format import chunk_rows
 from tests.recording.hand_made_loop import COLUMNS
 from tests.recording.killing import kill_a_run, recovered_ticks
 from tests.recording.real_loop import ROOT, TWO_AXES, record, scheduled
-from tests.soak.damage import damaged_files
+from tests.soak.damage import judge_damaged_files
 
 LONGEST_LIFE_S = 1.5
 PROCESSORS = ("generic", "nehalem", "haswell", "znver4")
@@ -103,7 +103,7 @@ def main() -> None:
     random = np.random.default_rng(given.seed)
     parts: dict[str, Callable[[Path], None]] = {
         "killed": lambda _: killed_runs(given.killed, random),
-        "damaged": lambda _: damaged_files(given.damaged, random, _say),
+        "damaged": lambda _: judge_damaged_files(given.damaged, random, _say),
         "processors": other_processors,
         "hour": one_hour,
     }

@@ -32,8 +32,8 @@ from rtloop.hil.options import RigOptions
 from rtloop.signals import trip_causes
 from tests.design.modal_rigs import RATE_HZ, SINE_S, SPECIFICATION, STEPS_S, ModalRig, noisy_rig
 from tests.recording.real_loop import record
-from tests.soak.chain import with_steps
-from tests.soak.draws import every_draw
+from tests.soak.chain import replace_reference_by_steps
+from tests.soak.draws import check_draws
 
 HEIGHTS_UM = (1.0, 5.0, 20.0, 40.0)
 CYCLES, DRAWS, KEPT = 12, 8, 0.95
@@ -93,7 +93,7 @@ def main() -> int:
     parser.add_argument("--generations", type=int, default=300)
     given = parser.parse_args()
     seeds = range(given.seed, given.seed + given.draws)
-    return every_draw(seeds, lambda seed, folder: one(noisy_rig(seed), folder, given.restarts, given.generations))
+    return check_draws(seeds, lambda seed, folder: one(noisy_rig(seed), folder, given.restarts, given.generations))
 
 
 def one(rig: ModalRig, folder: Path, restarts: int, generations: int) -> tuple[bool, str]:
@@ -155,7 +155,7 @@ def both(written: Path) -> Iterator[tuple[Steps, Steps]]:
 
 def ran(written: Path, levels: Sequence[float], dwell_s: float, draw: int) -> rtloop.Recording:
     """The true rig going through levels."""
-    text = with_steps(written.read_text(encoding="utf-8"), [*levels], dwell_s)
+    text = replace_reference_by_steps(written.read_text(encoding="utf-8"), [*levels], dwell_s)
     rig = load(written).driver_options
     assert isinstance(rig, RigOptions)
     text = text.replace(f"seed = {rig.seed}", f"seed = {rig.seed + 1000 + draw}")
