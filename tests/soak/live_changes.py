@@ -60,9 +60,11 @@ class EveryChange(Changes):
 
     @property
     def _axis(self) -> str:
+        """Name of a random axis."""
         return self._chance.choice("xy")
 
     def _prefilter(self) -> None:
+        """Set random taps, command taps and sections."""
         count, sections = self._chance.choice((0, 1, 2, 7, 48, 127, 128)), self._chance.choice((0, 0, 1, 3, 12))
         taps = [self._chance.uniform(0, 1) for _ in range(count)]
         poles = [self._chance.uniform(0.05, 0.9) for _ in range(sections)]
@@ -89,10 +91,12 @@ class EveryChange(Changes):
         self._live.load_controller(self._axis, controller)
 
     def _limits(self) -> None:
+        """Set a random command limit and bump time."""
         values = {"command_um": self._chance.uniform(10.0, 42.0), "bump_s": self._chance.uniform(0.001, 0.1)}
         self._live.tune(self._axis, "limits", values)
 
     def _interlocks(self) -> None:
+        """Set random thresholds of the interlocks."""
         values = {
             "position_um": self._chance.choice((20.0, 60.0, 60.0, 60.0)),
             "oscillation_swings": self._chance.choice((0, 8)),
@@ -102,9 +106,11 @@ class EveryChange(Changes):
         self._live.tune(self._axis, "interlocks", values)
 
     def _mode(self) -> None:
+        """Set a random mode."""
         self._desk.submit(Kind.SET_MODE, values=[float(self._chance.choice(list(Mode)))])
 
     def _reference(self) -> None:
+        """Set a random sine, triangle or sequence of steps."""
         amplitude_um, offset_um = self._chance.uniform(0.0, 9.0), self._chance.uniform(-9.0, 9.0)
         reference: dict[str, Any] = {"kind": self._chance.choice(("sine", "triangle")), "frequency_hz": 40.0}
         reference |= {"amplitude": amplitude_um, "offset": offset_um}
@@ -114,6 +120,7 @@ class EveryChange(Changes):
         self._live.references.set(self._axis, reference)
 
     def _waveform(self) -> None:
+        """Set a waveform of constant samples, with one or two columns."""
         count = self._chance.choice((1, 2, 1000, SPARE_SAMPLES // 4))
         columns = [self._chance.uniform(-9.0, 9.0) for _ in range(self._chance.choice((1, 2)))]
         samples = np.tile(columns, (count, 1))
@@ -122,9 +129,11 @@ class EveryChange(Changes):
         )
 
     def _tare(self) -> None:
+        """Shift the reading of a random axis by up to 0.05."""
         self._live.tare(self._chance.randrange(2), self._chance.uniform(-0.05, 0.05))
 
     def _reset(self) -> None:
+        """Reset the trip and close the loop."""
         self._desk.submit(Kind.RESET_TRIP)
         self._desk.submit(Kind.SET_MODE, values=[float(Mode.CLOSED_LOOP)])
 
@@ -144,6 +153,7 @@ def record(folder: Path, ticks: int, seed: int) -> tuple[list[Path], EveryChange
         ended = threading.Event()
 
         def change() -> None:
+            """Make changes to the end of the run."""
             while not ended.is_set() and not supervisor.ended:
                 if supervisor.ticks:
                     changes.one()

@@ -1,12 +1,12 @@
 """Loop and node in C with a bad wire between them: `make soak NAME=node-wire`.
 
-A library preloaded into the node delays its answers, or loses frames at random in both directions and writes down
-which. Exit code 0 only if
+A library preloaded into the node delays its answers, or loses frames at random in both directions and logs them. The
+exit code is 0 only if
 
-- each delay is what the self-test's exchanges take longer, within ALLOWED_US;
-- at 10 kHz the recording shows exactly the losses: the tick that awaited the answer held its sample, and the count of
-  lost ones rose once for each. Ticks without their answer for another reason, such as a machine that stalled, are shown
-  and not judged.
+- each delay lengthens the self-test's exchanges by this delay, within ALLOWED_US;
+- at 10 kHz the recording shows exactly the logged losses: the tick that awaited the answer held its sample, and the
+  count of lost samples rose by one for each loss. Ticks without an answer for another reason, such as a stalled
+  machine, are printed and not judged.
 """
 
 from __future__ import annotations
@@ -37,11 +37,12 @@ WIRE = Path(__file__).with_name("wire.c")
 DELAYS_US = (100.0, 300.0, 1000.0)
 ALLOWED_US = 20.0
 EXCHANGES, MEASURING_HZ = 2000, 1000.0
-NEVER = ("node_reordered_samples", "node_duplicated_samples", "node_invalid_frames", "node_foreign_frames")
+OTHER_COUNTS = ("node_reordered_samples", "node_duplicated_samples", "node_invalid_frames", "node_foreign_frames")
+"""Columns of counts that the lost frames must not raise; a stalled node may raise that of invalid frames."""
 
 
 class Losses(NamedTuple):
-    """What the preloaded library wrote: the first DRIVE with codes, frames that came to it, sequences of lost ones."""
+    """Log of the preloaded library: sequence of the first DRIVE with codes, frame counts, sequences of lost frames."""
 
     first: int
     drives: int
@@ -50,14 +51,14 @@ class Losses(NamedTuple):
 
 
 def build(folder: Path) -> None:
-    """Compile the node and the library below the folder."""
+    """Compile the node and the preloaded library into the folder."""
     subprocess.run(["make", "-s", "-C", ROOT / "deploy/node", "all", f"BUILD={folder}"], check=True)
     compile_it = ["cc", "-std=gnu11", "-O2", "-Wall", "-Wextra", "-Werror", "-shared", "-fPIC"]
     subprocess.run([*compile_it, "-o", folder / "wire.so", WIRE, "-ldl"], check=True)
 
 
 def read_losses(file: Path) -> Losses:
-    """Return what the library wrote."""
+    """Return the log in the file of the preloaded library."""
     data = file.read_bytes()
     first, count, drives, samples = struct.unpack_from("<IIQQ", data)
     return Losses(first, drives, samples, list(struct.unpack_from(f"<{count}I", data, 24)))
@@ -65,7 +66,7 @@ def read_losses(file: Path) -> Losses:
 
 @contextmanager
 def node(programs: Path, log: Path, loss: float = 0.0, seed: int = 1, delay_us: float = 0.0) -> Iterator[int]:
-    """Run the node behind a bad wire, on processor 0 before all that does not run in real time; yield its port."""
+    """Run the node behind a bad wire, in real time on processor 0; yield its port."""
     environment = os.environ | {
         "LD_PRELOAD": str(programs / "wire.so"), "WIRE_FILE": str(log), "WIRE_LOSS": f"{loss:.17g}",
         "WIRE_SEED": str(seed), "WIRE_DELAY_US": f"{delay_us:g}",
@@ -74,8 +75,8 @@ def node(programs: Path, log: Path, loss: float = 0.0, seed: int = 1, delay_us: 
         yield port
 
 
-def delays_are_kept(programs: Path, folder: Path) -> bool:
-    """Print the median exchange for each delay; return whether it is longer than without by the delay."""
+def check_delays(programs: Path, folder: Path) -> bool:
+    """Print the median exchange for each delay; return whether each delay lengthens it as much, within ALLOWED_US."""
     medians = dict[float, float]()
     for delay_us in (0.0, *DELAYS_US):
         with node(programs, folder / "delays", delay_us=delay_us) as port:
@@ -88,64 +89,65 @@ def delays_are_kept(programs: Path, folder: Path) -> bool:
 
 
 def dropped_by_system(port: int) -> int:
-    """Return how many datagrams Linux has dropped at a UDP port, because its program stood still."""
+    """Return how many datagrams Linux has dropped at a UDP port because its program did not read them."""
     rows = [line.split() for line in Path("/proc/net/udp").read_text().splitlines()[1:]]
     return sum(int(row[-1]) for row in rows if int(row[1].rpartition(":")[2], 16) == port)
 
 
 def judge(recording: rtloop.Recording, losses: Losses, overflows: int) -> dict[str, Any]:
-    """Return the figures of a run, with `good`: whether each loss is where it must be, and each lost answer explained.
+    """Return the figures of a run; `good`: each logged loss held its tick, and each lost answer is explained.
 
-    Linux drops drives of a node that stands still; an answer to one of more than a thousand drives ago is invalid.
+    Linux drops drives while the node stands still; an answer to a drive more than a thousand drives old is invalid.
     """
-    ticks, lost, status, exchange_us, missed = recording.read(
+    ticks, lost_samples, status, exchange_us, periods_missed = recording.read(
         "tick", "node_lost_samples", "driver_status", "node_exchange_us", "periods_missed"
     )
-    held = set(ticks[status == 1].astype(int).tolist())
+    held_ticks = set(ticks[status == 1].astype(int).tolist())
     # Tick k sends the drive first + k; the next tick awaits its answer.
-    due = {sequence - losses.first + 1 for sequence in losses.lost}
-    due = {tick for tick in due if tick <= ticks[-1]}
-    others = {name: int(recording[name][-1]) for name in NEVER}
-    is_unknown = int(ticks[-1]) in due  # The last answer counts as lost with the next sample only.
-    explained = len(due) - is_unknown + overflows + others["node_invalid_frames"]
-    good = due <= held and int(lost[-1]) == explained
-    good = good and not any(others[name] for name in NEVER if name != "node_invalid_frames")
+    due_ticks = {sequence - losses.first + 1 for sequence in losses.lost}
+    due_ticks = {tick for tick in due_ticks if tick <= ticks[-1]}
+    other_counts = {name: int(recording[name][-1]) for name in OTHER_COUNTS}
+    is_last_due = int(ticks[-1]) in due_ticks  # The last answer counts as lost with the next sample only.
+    explained_losses = len(due_ticks) - is_last_due + overflows + other_counts["node_invalid_frames"]
+    is_good = due_ticks <= held_ticks and int(lost_samples[-1]) == explained_losses
+    is_good = is_good and not any(other_counts[name] for name in OTHER_COUNTS if name != "node_invalid_frames")
     return {
-        "good": good, "ticks": len(ticks), "ticks_not_recorded": int(ticks[-1] - ticks[0]) + 1 - len(ticks),
+        "good": is_good, "ticks": len(ticks), "ticks_not_recorded": int(ticks[-1] - ticks[0]) + 1 - len(ticks),
         "datagrams": losses.drives + losses.samples, "lost_by_network": len(losses.lost),
-        "dropped_by_system": overflows, "lost_by_loop": int(lost[-1]), "held_ticks": len(held),
-        "held_without_loss": len(held - due), "periods_missed": int(np.sum(missed)),
+        "dropped_by_system": overflows, "lost_by_loop": int(lost_samples[-1]), "held_ticks": len(held_ticks),
+        "held_without_loss": len(held_ticks - due_ticks), "periods_missed": int(np.sum(periods_missed)),
         "exchange_p50_us": round(float(np.median(exchange_us)), 2),
-        "exchange_p99_us": round(float(np.percentile(exchange_us, 99)), 2), **others,
+        "exchange_p99_us": round(float(np.percentile(exchange_us, 99)), 2), **other_counts,
     }  # fmt: skip
 
 
 def main() -> None:
-    """Measure the delays, then run with losses; print the figures."""
+    """Check the delays, then a run with losses; print the figures and exit with 1 for a fault."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--datagrams", type=float, default=1e7, help="in both directions")
     parser.add_argument("--rate-hz", type=float, default=10_000.0)
     parser.add_argument("--loss", type=float, default=1e-6, help="share of the datagrams")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--only", choices=["delays", "losses"], help="by default both")
-    given = parser.parse_args()
-    good = True
+    options = parser.parse_args()
+    passed = True
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         programs = folder / "programs"
         build(programs)
-        if given.only != "losses":
-            good &= delays_are_kept(programs, folder)
-        if given.only != "delays":
-            with node(programs, folder / "losses", loss=given.loss, seed=given.seed) as port:
+        if options.only != "losses":
+            passed &= check_delays(programs, folder)
+        if options.only != "delays":
+            with node(programs, folder / "losses", loss=options.loss, seed=options.seed) as port:
                 driver = RIG, DRIVER.format(port=port, answer="next tick")
-                duration_s, changes = given.datagrams / 2 / given.rate_hz, (at_rate(given.rate_hz), *pinned(last_cpu()))
+                duration_s = options.datagrams / 2 / options.rate_hz
+                changes = at_rate(options.rate_hz), *pinned(last_cpu())
                 recording = record(folder, duration_s, driver, *changes)
                 overflows = dropped_by_system(port)
-            found = judge(recording, read_losses(folder / "losses"), overflows)
-            print(json.dumps(found, indent=1))
-            good &= found["good"]
-    sys.exit(0 if good else 1)
+            figures = judge(recording, read_losses(folder / "losses"), overflows)
+            print(json.dumps(figures, indent=1))
+            passed &= figures["good"]
+    sys.exit(0 if passed else 1)
 
 
 if __name__ == "__main__":

@@ -1,7 +1,7 @@
-"""Steps of one tick's width, each to be found by the panel's trigger at its tick: `make soak NAME=panel-triggers`.
+"""The panel's trigger finds each pulse of one tick at its tick: `make soak NAME=panel-triggers`.
 
-A service on a simulated board plays pulses of one tick as its reference, PULSES of them at uneven distances. A panel's
-feed reads it as it does for a browser, with a scope that looks for edges; what it found is compared with the recording.
+A service on a simulated board plays PULSES pulses of one tick as its reference, at uneven distances. A panel's feed
+reads the service as for a browser, with a scope that triggers; the triggers are compared with the recording.
 """
 
 from __future__ import annotations
@@ -25,8 +25,10 @@ from rtloop.panel.views.scope import Scope
 from tests.faults.bench import Bench
 from tests.faults.evidence import wait_for
 
-PULSES, A_TABLE = 10_000, 500
+PULSES, TABLE_PULSES = 10_000, 500
+"""Pulses in all, and in one table of samples."""
 LEAST_TICKS, MOST_TICKS = 20, 60
+"""Distance from one pulse to the next."""
 BASE_UM, PULSE_UM = 20.0, 0.5
 KINDS: dict[str, dict[str, Any]] = {
     "edge": {"kind": "edge", "level": BASE_UM + PULSE_UM / 2},
@@ -34,8 +36,10 @@ KINDS: dict[str, dict[str, Any]] = {
 }
 
 
-class Found(NamedTuple):
-    """Pulses that are recorded; triggers that were missed, made up or more than a tick away; ticks that were lost."""
+class TriggerCounts(NamedTuple):
+    """Recorded pulses; pulses without a trigger within a tick; triggers without a pulse within a tick (`made_up`);
+    largest distance of the other triggers from their pulses; ticks lost by the feed.
+    """
 
     pulses: int
     missed: int
@@ -44,11 +48,11 @@ class Found(NamedTuple):
     lost_ticks: int
 
 
-class Catcher:
-    """A viewer of the feed that keeps all that its scope finds."""
+class SweepCollector:
+    """A viewer of the feed that stores all sweeps of its scope."""
 
     def __init__(self, trigger: dict[str, Any]) -> None:
-        self._wish = validate_field(
+        self._subscription = validate_field(
             "view",
             {"signals": ["x_reference_um"], "seconds": 0.001, "pixels": 100,
              "trigger": {"mode": "normal", "source": "x_reference_um", "pre_percent": 25, **trigger}},
@@ -57,75 +61,84 @@ class Catcher:
         self.sweeps: list[Sweep] = []
 
     def begin(self, loop: Description) -> None:
-        self._scope = Scope(self._wish, loop)
+        """Build the scope of a run."""
+        self._scope = Scope(self._subscription, loop)
 
     def feed(self, stretch: Stretch, commands: Any) -> None:
+        """Store the sweeps in a stretch of ticks."""
         assert self._scope is not None
         self.sweeps += self._scope.feed(stretch, commands)
 
     def end_run(self, past: TickHistory) -> None:
-        """There is one run."""
+        """Do nothing: the service has only one run."""
 
 
-def caught(folder: Path, pulses: int, seed: int = 1) -> dict[str, Found]:
-    """What became of `pulses`, by the kind of trigger."""
+def caught(folder: Path, pulses: int, seed: int = 1) -> dict[str, TriggerCounts]:
+    """Play `pulses` pulses; return the counts by kind of trigger."""
     random = np.random.default_rng(seed)
-    hold = ('kind = "sine"\namplitude = 8.0\noffset = 20.0\nfrequency_hz = 5.0', f'kind = "hold"\nvalue = {BASE_UM}')
-    with Bench(folder, hold) as bench:
+    change = ('kind = "sine"\namplitude = 8.0\noffset = 20.0\nfrequency_hz = 5.0', f'kind = "hold"\nvalue = {BASE_UM}')
+    with Bench(folder, change) as bench:
         bench.await_state("running")
         feed = Feed(Service(bench.client.path))
-        catchers = {name: Catcher(trigger) for name, trigger in KINDS.items()}
+        collectors = {name: SweepCollector(trigger) for name, trigger in KINDS.items()}
         feed.start()
         try:
-            for catcher in catchers.values():
-                feed.add_viewer(catcher)  # type: ignore[arg-type]
+            for collector in collectors.values():
+                feed.add_viewer(collector)  # type: ignore[arg-type]
             wait_for(lambda: feed.past is not None and feed.past.end > 0, "the feed")
-            for first in range(0, pulses, A_TABLE):
-                samples = table(random, min(A_TABLE, pulses - first))
+            for first in range(0, pulses, TABLE_PULSES):
+                samples = pulse_samples(random, min(TABLE_PULSES, pulses - first))
                 body = {"axis": "x", "samples": samples.tolist()}
-                behind = bench.client.post("/waveform", body)["tick"] + samples.size + 10
-                wait_for(lambda behind=behind: bench.ticks > behind, "the end of a table", 600)
+                end_tick = bench.client.post("/waveform", body)["tick"] + samples.size + 10
+                wait_for(lambda end_tick=end_tick: bench.ticks > end_tick, "the end of a table", 600)
             end = bench.ticks
             wait_for(lambda: feed.past is not None and feed.past.end >= end, "the last ticks")
-            lost = feed.lost_ticks
+            lost_ticks = feed.lost_ticks
         finally:
             feed.stop()
         assert bench.stop() == 0
     recording = load(sorted((folder / "recordings").glob("*.mcap")))
     high = recording["x_reference_um"] > BASE_UM + PULSE_UM / 2
-    at = recording["tick"][np.flatnonzero(high[1:] & ~high[:-1]) + 1].astype(int)
-    return {name: compared(at, catcher.sweeps, lost) for name, catcher in catchers.items()}
+    pulse_ticks = recording["tick"][np.flatnonzero(high[1:] & ~high[:-1]) + 1].astype(int)
+    return {name: compare_triggers(pulse_ticks, collector.sweeps, lost_ticks) for name, collector in collectors.items()}
 
 
-def table(random: np.random.Generator, pulses: int) -> np.ndarray:
-    """Samples, a tick each, with pulses of one of them; it ends as it began."""
+def pulse_samples(random: np.random.Generator, pulses: int) -> np.ndarray:
+    """Return samples (µm), one a tick, with `pulses` pulses of one sample; the first and the last are BASE_UM."""
     places = np.cumsum(random.integers(LEAST_TICKS, MOST_TICKS, pulses))
     samples = np.full(int(places[-1]) + MOST_TICKS, BASE_UM)
     samples[places] += PULSE_UM
     return samples
 
 
-def compared(at: np.ndarray, sweeps: list[Sweep], lost: int) -> Found:
-    """Triggers with the pulses that are recorded."""
+def compare_triggers(pulse_ticks: np.ndarray, sweeps: list[Sweep], lost_ticks: int) -> TriggerCounts:
+    """Compare the triggers with the ticks of the recorded pulses."""
     triggers = np.array([sweep.trigger for sweep in sweeps], int)
-    near = np.array([np.abs(triggers - tick).min(initial=1 << 30) for tick in at])
-    alone = np.array([np.abs(at - tick).min(initial=1 << 30) for tick in triggers])
-    furthest = int(near[near <= 1].max(initial=0))
-    return Found(at.size, int(np.sum(near > 1)), int(np.sum(alone > 1)), furthest, lost)
+    pulse_distances = np.array([np.abs(triggers - tick).min(initial=1 << 30) for tick in pulse_ticks])
+    trigger_distances = np.array([np.abs(pulse_ticks - tick).min(initial=1 << 30) for tick in triggers])
+    furthest_ticks = int(pulse_distances[pulse_distances <= 1].max(initial=0))
+    return TriggerCounts(
+        pulse_ticks.size,
+        int(np.sum(pulse_distances > 1)),
+        int(np.sum(trigger_distances > 1)),
+        furthest_ticks,
+        lost_ticks,
+    )
 
 
 def main() -> int:
-    """The verdict as an exit code."""
+    """Print the counts; return 1 if a pulse was missed or a trigger has no pulse."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--pulses", type=int, default=PULSES)
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
-        found = caught(Path(folder), options.pulses)
-    for name, one in found.items():
-        print(f"{name}: {one.pulses} pulses of one tick, {one.missed} missed, {one.made_up} made up, placed within "
-              f"{one.furthest_ticks} ticks; {one.lost_ticks} ticks lost by the reader")  # fmt: skip
-    good = all(one.pulses == options.pulses and one.missed == one.made_up == 0 for one in found.values())
-    return 0 if good else 1
+        counts = caught(Path(folder), options.pulses)
+    for name, count in counts.items():
+        print(f"{name}: {count.pulses} pulses of one tick, {count.missed} missed, {count.made_up} triggers "
+              f"without a pulse, placed within {count.furthest_ticks} ticks; "
+              f"{count.lost_ticks} ticks lost by the reader")  # fmt: skip
+    passed = all(count.pulses == options.pulses and count.missed == count.made_up == 0 for count in counts.values())
+    return 0 if passed else 1
 
 
 if __name__ == "__main__":

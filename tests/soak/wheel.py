@@ -2,7 +2,7 @@
 
     make soak NAME=wheel FLAGS="--pip-args='--no-index --find-links FOLDER'"
 
-Commands that serve until Ctrl-C, or that README gives in part, are printed as skipped.
+Commands of SKIPPED are printed as skipped; commands that README gives in part are ignored.
 """
 
 from __future__ import annotations
@@ -23,21 +23,21 @@ import pytest
 from tests.packaging.distribution import ROOT, build, copy_tree
 
 COMMAND = re.compile(r"`(rtloop [^`]+)`")
-WHOLE = re.compile(r"deploy/[\w-]+\.toml|recordings/FILE\.mcap")
-"""A command that names a shipped file or a recording is given as a whole."""
+COMPLETE = re.compile(r"deploy/[\w-]+\.toml|recordings/FILE\.mcap")
+"""A command that names a shipped file or a recording is complete."""
 SKIPPED = ("panel", "serve", "hil", "experiment all", "archive", "campaign")
 """Services, and commands that take minutes or need other recordings."""
 JUDGES_HOST = "rtloop doctor"
-"""The command that ends with 1 where the host has a fault, as most do."""
+"""Command that ends with 1 where the host has a fault, as most hosts do."""
 PATIENCE_S = 900.0
 FEWEST = 6
-"""Commands that README must give as a whole; fewer mean that they are no longer found."""
+"""Least number of complete commands in README; fewer mean that COMMAND no longer finds them."""
 
 
 def readme_commands() -> list[str]:
-    """Return the commands of README that are given as a whole, a run before those that read its recording."""
+    """Return the complete commands of README; the commands that read a recording come last."""
     text = (ROOT / "README.md").read_text(encoding="utf-8")
-    commands = [command for command in dict.fromkeys(COMMAND.findall(text)) if WHOLE.search(command)]
+    commands = [command for command in dict.fromkeys(COMMAND.findall(text)) if COMPLETE.search(command)]
     return ["rtloop laws", "rtloop drivers", *sorted(commands, key=lambda command: "recordings/" in command)]
 
 
@@ -52,19 +52,19 @@ def install_wheel(folder: Path, pip_args: list[str]) -> Path:
     return programs
 
 
-def run_command(command: str, programs: Path, place: Path) -> bool:
-    """Run a command of README in the folder `place`; print it with its exit code. Returns whether it succeeded."""
-    recording = next(iter(sorted(place.glob("recordings/*.mcap"))), None)
-    words = shlex.split(command.replace("recordings/FILE.mcap", str(recording)))
+def run_command(command: str, programs: Path, folder: Path) -> bool:
+    """Run a command of README in `folder`; print it with its exit code. Returns whether it succeeded."""
+    recording = next(iter(sorted(folder.glob("recordings/*.mcap"))), None)
+    arguments = shlex.split(command.replace("recordings/FILE.mcap", str(recording)))
     environment = {name: value for name, value in os.environ.items() if not name.startswith("PYTHON")}
-    done = subprocess.run(
-        [str(programs / words[0]), *words[1:]], cwd=place, capture_output=True, text=True, timeout=PATIENCE_S,
-        env=environment | {"XDG_CACHE_HOME": str(place / "cache"), "MPLBACKEND": "agg"},
+    result = subprocess.run(
+        [str(programs / arguments[0]), *arguments[1:]], cwd=folder, capture_output=True, text=True, timeout=PATIENCE_S,
+        env=environment | {"XDG_CACHE_HOME": str(folder / "cache"), "MPLBACKEND": "agg"},
     )  # fmt: skip
-    print(f"{done.returncode:3}  {command}", flush=True)
-    is_expected = done.returncode == 0 or (done.returncode == 1 and command.startswith(JUDGES_HOST))
-    if not is_expected or "Traceback" in done.stderr:
-        print(done.stderr[-2000:])
+    print(f"{result.returncode:3}  {command}", flush=True)
+    is_expected = result.returncode == 0 or (result.returncode == 1 and command.startswith(JUDGES_HOST))
+    if not is_expected or "Traceback" in result.stderr:
+        print(result.stderr[-2000:])
         return False
     return True
 
@@ -75,15 +75,15 @@ def main() -> int:
     parser.add_argument("--pip-args", type=shlex.split, default=[], help="For pip, where there is no network.")
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as name:
-        place = Path(name) / "place"
-        shutil.copytree(ROOT / "deploy", place / "deploy")
+        folder = Path(name) / "place"
+        shutil.copytree(ROOT / "deploy", folder / "deploy")
         programs = install_wheel(Path(name), options.pip_args)
         results = []
         for command in readme_commands():
             if command.removeprefix("rtloop ").startswith(SKIPPED):
                 print(f"skipped: {command}")
             else:
-                results.append(run_command(command, programs, place))
+                results.append(run_command(command, programs, folder))
     if not all(results) or len(results) < FEWEST:
         return 1
     return pytest.main(["-m", "soak", str(ROOT / "tests/packaging")])

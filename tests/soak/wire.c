@@ -1,8 +1,8 @@
-/* A bad wire for one program: its frames come late, or are lost at random and written down.
+/* A bad wire for one program: its frames are late, or are lost at random and logged.
  *
  * Preloaded into rtloop-node (LD_PRELOAD). WIRE_FILE names a file for the counts and losses, WIRE_LOSS is the share of
  * frames to lose, WIRE_SEED begins the random numbers, WIRE_DELAY_US delays each SAMPLE. Only DRIVEs with codes and the
- * SAMPLEs after the first of them are lost: the opening and the parking of a session are no subject here. */
+ * SAMPLEs after the first of them are lost: opening and parking of a session are not disturbed. */
 #define _GNU_SOURCE
 #include <dlfcn.h>
 #include <errno.h>
@@ -15,22 +15,23 @@
 #include <time.h>
 #include <unistd.h>
 
-enum { DRIVE = 0x72, SAMPLE = 0x73, FORMAT_AT = 2, SEQUENCE_AT = 4, BITS_AT = 12, APPLY = 2, ANSWER = 4, MOST = 4096 };
+enum { DRIVE = 0x72, SAMPLE = 0x73, FORMAT_AT = 2, SEQUENCE_AT = 4, BITS_AT = 12, APPLY = 2, ANSWER = 4 };
+enum { MAX_LOST = 4096 };
 
-/* What the test reads; losses are the sequences of the frames lost, DRIVEs and SAMPLEs together. */
+/* Log that the test reads; `lost` holds the sequences of lost frames, DRIVEs and SAMPLEs together. */
 static struct log {
     uint32_t first; /* sequence of the first DRIVE with codes */
     uint32_t losses;
     uint64_t drives;
     uint64_t samples;
-    uint32_t lost[MOST];
-} *written;
+    uint32_t lost[MAX_LOST];
+} *shared_log;
 
 static uint64_t limit;
 static uint64_t state;
 static int64_t delay_ns;
 
-/* Open the file; end the program without it. */
+/* Map the log file and read the settings; abort the program if one is missing. */
 __attribute__((constructor)) static void begin(void)
 {
     const char *name = getenv("WIRE_FILE");
@@ -38,11 +39,11 @@ __attribute__((constructor)) static void begin(void)
     const char *seed = getenv("WIRE_SEED");
     const char *delay_us = getenv("WIRE_DELAY_US");
     int file = name == NULL ? -1 : open(name, O_RDWR | O_CREAT, 0600);
-    if (file < 0 || share == NULL || seed == NULL || delay_us == NULL || ftruncate(file, sizeof *written) != 0) {
+    if (file < 0 || share == NULL || seed == NULL || delay_us == NULL || ftruncate(file, sizeof *shared_log) != 0) {
         abort();
     }
-    written = mmap(NULL, sizeof *written, PROT_READ | PROT_WRITE, MAP_SHARED, file, 0);
-    if (written == MAP_FAILED) {
+    shared_log = mmap(NULL, sizeof *shared_log, PROT_READ | PROT_WRITE, MAP_SHARED, file, 0);
+    if (shared_log == MAP_FAILED) {
         abort();
     }
     close(file);
@@ -51,7 +52,7 @@ __attribute__((constructor)) static void begin(void)
     state = strtoull(seed, NULL, 10) * 2 + 1;
 }
 
-/* Whether to lose the next frame (xorshift64*, Vigna 2016). */
+/* Return whether to lose the next frame (xorshift64*, Vigna 2016). */
 static int draw(void)
 {
     state ^= state >> 12;
@@ -72,18 +73,18 @@ static int lose(const uint8_t *frame, size_t length, uint8_t format, uint64_t *c
         if (frame[BITS_AT] != (APPLY | ANSWER)) {
             return 0;
         }
-        written->first = written->first == 0 ? sequence : written->first;
-    } else if (written->first == 0 || sequence < written->first) {
+        shared_log->first = shared_log->first == 0 ? sequence : shared_log->first;
+    } else if (shared_log->first == 0 || sequence < shared_log->first) {
         return 0;
     }
     ++*count;
     if (!draw()) {
         return 0;
     }
-    if (written->losses == MOST) {
+    if (shared_log->losses == MAX_LOST) {
         abort();
     }
-    written->lost[written->losses++] = sequence;
+    shared_log->lost[shared_log->losses++] = sequence;
     return 1;
 }
 
@@ -95,7 +96,7 @@ static int64_t clock_ns(void)
     return (int64_t)now.tv_sec * 1000000000 + now.tv_nsec;
 }
 
-/* Wait, without sleep, as long as a frame is on its way. */
+/* Wait for the delay of a frame, without sleep. */
 static void wait_on_the_way(void)
 {
     for (int64_t end_ns = clock_ns() + delay_ns; clock_ns() < end_ns;) {
@@ -109,7 +110,7 @@ ssize_t recvfrom(int file, void *data, size_t size, int flags, struct sockaddr *
         real = dlsym(RTLD_NEXT, "recvfrom");
     }
     ssize_t length = real(file, data, size, flags, sender, sender_size);
-    if (length > 0 && lose(data, (size_t)length, DRIVE, &written->drives)) {
+    if (length > 0 && lose(data, (size_t)length, DRIVE, &shared_log->drives)) {
         errno = EAGAIN;
         return -1;
     }
@@ -122,7 +123,7 @@ ssize_t sendto(int file, const void *data, size_t size, int flags, const struct 
     if (real == NULL) {
         real = dlsym(RTLD_NEXT, "sendto");
     }
-    if (lose(data, size, SAMPLE, &written->samples)) {
+    if (lose(data, size, SAMPLE, &shared_log->samples)) {
         return (ssize_t)size;
     }
     wait_on_the_way();

@@ -1,4 +1,4 @@
-"""The loops by themselves: damping of the resonance, |S|, disturbances, rest; linear ones over all scenarios."""
+"""Rows of the comparison for loops: damping, |S| and rejection over all scenarios; disturbance and rest on the rig."""
 
 from __future__ import annotations
 
@@ -19,114 +19,126 @@ from rtloop.experiments.lockin import tone
 from rtloop.foundation.arrays import Real
 from rtloop.hil.options import DisturbanceOptions
 from rtloop.linear.discretise import DiscreteController
-from tests.soak.flagship.stage import PERIOD_S, RATE_HZ, TRUTH, bench, controller_of, shifted, specification
+from tests.soak.flagship.stage import (
+    PERIOD_S,
+    RATE_HZ,
+    TRUTH,
+    linear_controller,
+    rig_bench,
+    shifted_plant,
+    specification,
+)
 from tests.soak.flagship.table import Row
 
 LARGEST_UM, HELD_UM, ASKED_HZ = 3.285, 0.1, 10.0
+"""Amplitude of the disturbance before D, amplitude that may remain, and its required frequency."""
 PLACES_UM = (1.0, 2.0, 5.0, 10.0, 15.0, 20.0, 30.0, 40.0)
 HZ = np.geomspace(0.1, 1000.0, 4001)
 SHOWN_HZ = np.unique(np.concatenate([np.geomspace(1.0, 4900.0, 600), np.linspace(400.0, 800.0, 400)]))
 
 
 def family_loops(controller: DiscreteController, family: Family) -> list[Loop]:
-    """On the model, then in every scenario that is certified."""
+    """Return the closed loops of a controller: on the model, then in every certified scenario."""
     scenarios = [
         family.nominal,
         *family.corner_scenarios(),
         *family.sweep_scenarios(SWEEP_POINTS),
         *family.random_scenarios(RANDOM_PLANTS, specification().robust.seed),
     ]
-    return [discrete_loop(controller, family.plant(one), one.delay_ticks) for one in dict.fromkeys(scenarios)]
+    return [
+        discrete_loop(controller, family.plant(scenario), scenario.delay_ticks) for scenario in dict.fromkeys(scenarios)
+    ]
 
 
 def slowest_ringing_ms(loops: Iterable[Loop]) -> float:
-    """Time constant of the slowest pair of modes that turns faster than it decays, at any frequency."""
-    found = 0.0
+    """Return the time constant (ms) of the slowest mode that turns faster than it decays; infinite if unstable."""
+    slowest_ms = 0.0
     for loop in loops:
         if not loop.is_stable:
             return math.inf
         ringing = loop.rates[np.abs(loop.rates.imag) > np.abs(loop.rates.real)]
-        found = max(found, float(np.max(-1e3 / ringing.real, initial=0.0)))
-    return found
+        slowest_ms = max(slowest_ms, float(np.max(-1e3 / ringing.real, initial=0.0)))
+    return slowest_ms
 
 
-def held_up_to_hz(loops: Iterable[Loop]) -> float:
-    """Below it 3.285 µm of displacement leave at most 0.1 µm, in each of these loops; 0 where one is unstable."""
-    found = math.inf
+def rejection_limit_hz(loops: Iterable[Loop]) -> float:
+    """Return the frequency below which LARGEST_UM leave at most HELD_UM in each loop; 0 where one is unstable."""
+    limit_hz = math.inf
     for loop in loops:
-        beyond = np.flatnonzero(loop.sensitivity(HZ) * LARGEST_UM > HELD_UM) if loop.is_stable else np.array([0])
-        found = min(found, float(HZ[max(beyond[0] - 1, 0)]) if loop.is_stable else 0.0)
-    return found
+        exceeded = np.flatnonzero(loop.sensitivity(HZ) * LARGEST_UM > HELD_UM) if loop.is_stable else np.array([0])
+        limit_hz = min(limit_hz, float(HZ[max(exceeded[0] - 1, 0)]) if loop.is_stable else 0.0)
+    return limit_hz
 
 
 def linear_rows(paper: Configuration, ours: Configuration) -> tuple[list[Row], dict[str, Any]]:
-    """Certificate and disturbance; curves for the picture."""
-    design, proofs, curves, held, ringing = specification(), {}, {}, {}, {}
+    """Return the rows of certificate and rejection, and the curves of each loop for the picture."""
+    design, certificates, curves, limits_hz, ringing_ms = specification(), {}, {}, {}, {}
     assert design.plant is not None
     family = Family(design.plant.transfer(), 0, design.scenarios, PERIOD_S)
-    for name, one in (("paper", paper), ("ours", ours)):
-        linear = controller_of(one)
-        proofs[name] = certify(linear, family, design_walls(design), design.robust.seed)
-        others = family_loops(linear, family)
-        model, ringing[name] = others[0], slowest_ringing_ms(others)
-        held[name] = held_up_to_hz([model]), held_up_to_hz(others)
-        answers = np.array([20 * np.log10(np.abs(other.open(SHOWN_HZ))) for other in others])
-        sensitivities = np.array([other.sensitivity(SHOWN_HZ) for other in others if other.is_stable])
+    for name, configuration in (("paper", paper), ("ours", ours)):
+        controller = linear_controller(configuration)
+        certificates[name] = certify(controller, family, design_walls(design), design.robust.seed)
+        loops = family_loops(controller, family)
+        model, ringing_ms[name] = loops[0], slowest_ringing_ms(loops)
+        limits_hz[name] = rejection_limit_hz([model]), rejection_limit_hz(loops)
+        gains_db = np.array([20 * np.log10(np.abs(loop.open(SHOWN_HZ))) for loop in loops])
+        sensitivities = np.array([loop.sensitivity(SHOWN_HZ) for loop in loops if loop.is_stable])
         curves[name] = {
             "hz": SHOWN_HZ, "open": 20 * np.log10(np.abs(model.open(SHOWN_HZ))),
             "phase": np.rad2deg(np.unwrap(np.angle(model.open(SHOWN_HZ)))),
-            "open_band": (answers.min(axis=0), answers.max(axis=0)), "sensitivity": model.sensitivity(SHOWN_HZ),
+            "open_band": (gains_db.min(axis=0), gains_db.max(axis=0)), "sensitivity": model.sensitivity(SHOWN_HZ),
             "sensitivity_band": (sensitivities.min(axis=0), sensitivities.max(axis=0)),
-            "stable": len(sensitivities), "of": len(others),
+            "stable": len(sensitivities), "of": len(loops),
         }  # fmt: skip
-    limits = stability_range(
-        loop_builder(controller_of(paper)), TRUTH.model, PlantChange(shift_resonance, 12.0, 12.0, 0.25)
+    paper_range = stability_range(
+        loop_builder(linear_controller(paper)), TRUTH.model, PlantChange(shift_resonance, 12.0, 12.0, 0.25)
     )
-    ours_limits = stability_range(loop_builder(controller_of(ours)), TRUTH.model,
+    ours_range = stability_range(loop_builder(linear_controller(ours)), TRUTH.model,
                                  PlantChange(shift_resonance, 45.0, 45.0, 0.25))  # fmt: skip
     return [
-        Row("slowest resonance mode in every scenario", "ms", 1.5, proofs["paper"].decay_ms.value,
-            proofs["ours"].decay_ms.value, note=f"{proofs['ours'].plants} plants: {proofs['ours'].decay_ms.scenario}"),
-        Row("  slowest oscillation at any frequency", "ms", None, ringing["paper"], ringing["ours"]),
-        Row("largest |S| in every scenario", "", 2.0, proofs["paper"].sensitivity.value,
-            proofs["ours"].sensitivity.value, note=str(proofs["ours"].sensitivity.scenario)),
-        Row("resonance may rise before it is unstable", "%", None, limits.up, ours_limits.up or 45.0),
-        Row("resonance may fall", "%", None, limits.down, ours_limits.down or 45.0,
+        Row("slowest resonance mode in every scenario", "ms", 1.5, certificates["paper"].decay_ms.value,
+            certificates["ours"].decay_ms.value,
+            note=f"{certificates['ours'].plants} plants: {certificates['ours'].decay_ms.scenario}"),
+        Row("  slowest oscillation at any frequency", "ms", None, ringing_ms["paper"], ringing_ms["ours"]),
+        Row("largest |S| in every scenario", "", 2.0, certificates["paper"].sensitivity.value,
+            certificates["ours"].sensitivity.value, note=str(certificates["ours"].sensitivity.scenario)),
+        Row("resonance may rise before it is unstable", "%", None, paper_range.up, ours_range.up or 45.0),
+        Row("resonance may fall", "%", None, paper_range.down, ours_range.down or 45.0,
             note="up and down, 45 % is as far as is looked"),
-        Row("3.285 µm held to 0.1 µm up to: the model", "Hz", 10.0, held["paper"][0], held["ours"][0], True),
-        Row("  in every scenario", "Hz", 10.0, held["paper"][1], held["ours"][1], True),
+        Row("3.285 µm held to 0.1 µm up to: the model", "Hz", 10.0, limits_hz["paper"][0], limits_hz["ours"][0], True),
+        Row("  in every scenario", "Hz", 10.0, limits_hz["paper"][1], limits_hz["ours"][1], True),
     ], curves  # fmt: skip
 
 
-def disturbed(configuration: Configuration, truth_percent: float) -> float:
-    """Amplitude in µm that a sine of 3.285 µm at 10 Hz, before D, leaves of x on the rig; infinite if it trips."""
+def residual_um(configuration: Configuration, truth_percent: float) -> float:
+    """Return the amplitude (µm) of x on the rig under a sine of LARGEST_UM before D; infinite if the loop trips."""
     sine = DisturbanceOptions(sine_um=LARGEST_UM, sine_hz=ASKED_HZ, start_s=0.2)
-    run = bench(configuration, shifted(truth_percent), disturbance=sine).run("x", (0.0,), 2.2)
+    run = rig_bench(configuration, shifted_plant(truth_percent), disturbance=sine).run("x", (0.0,), 2.2)
     if int(np.bitwise_or.reduce(run["flags"].astype(np.int64))) != 0:
         return math.inf
     return abs(tone(run["x_true_position_um"][-round(RATE_HZ) :], ASKED_HZ, RATE_HZ).amplitude)
 
 
-def at_rest(configuration: Configuration, name: str) -> float:
-    """rms in nm about the mean, over places of the range, of one signal."""
-    squares = []
+def rest_rms_nm(configuration: Configuration, signal: str) -> float:
+    """Return the rms (nm) about the mean of a signal at rest, over PLACES_UM."""
+    variances_um2 = []
     for place_um in PLACES_UM:
-        run = bench(configuration).run("x", (place_um,), SETTLING_S + REST_S)
-        squares.append(run[name][round(SETTLING_S * RATE_HZ) :].var())
-    return 1e3 * float(np.sqrt(np.mean(squares)))
+        run = rig_bench(configuration).run("x", (place_um,), SETTLING_S + REST_S)
+        variances_um2.append(run[signal][round(SETTLING_S * RATE_HZ) :].var())
+    return 1e3 * float(np.sqrt(np.mean(variances_um2)))
 
 
 def rig_rows(paper: Configuration, ours: Configuration) -> list[Row]:
-    """Disturbance and rest, as the rig has them."""
-    left = {name: max(disturbed(one, percent) for percent in (-10.0, 0.0, 10.0))
-            for name, one in (("paper", paper), ("ours", ours))}  # fmt: skip
-    still: dict[str, Real] = {
-        signal: np.array([at_rest(one, f"x_{signal}") for one in (paper, ours)])
+    """Return the rows of disturbance and rest, measured on the rig."""
+    residuals_um = {name: max(residual_um(configuration, percent) for percent in (-10.0, 0.0, 10.0))
+                    for name, configuration in (("paper", paper), ("ours", ours))}  # fmt: skip
+    rest_nm: dict[str, Real] = {
+        signal: np.array([rest_rms_nm(configuration, f"x_{signal}") for configuration in (paper, ours)])
         for signal in ("true_position_um", "position_um", "command_um")
     }
     rows = [Row("3.285 µm before D at 10 Hz, resonance −10, 0, +10 %: left, on the rig", "µm", HELD_UM,
-                left["paper"], left["ours"])]  # fmt: skip
-    rows.append(Row("x at rest, sensor of 10 nm: true", "nm", 5.0, *still["true_position_um"].tolist()))
-    rows.append(Row("  measured", "nm", None, *still["position_um"].tolist()))
-    rows.append(Row("  v", "nm", None, *still["command_um"].tolist()))
+                residuals_um["paper"], residuals_um["ours"])]  # fmt: skip
+    rows.append(Row("x at rest, sensor of 10 nm: true", "nm", 5.0, *rest_nm["true_position_um"].tolist()))
+    rows.append(Row("  measured", "nm", None, *rest_nm["position_um"].tolist()))
+    rows.append(Row("  v", "nm", None, *rest_nm["command_um"].tolist()))
     return rows

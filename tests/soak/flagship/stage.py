@@ -1,4 +1,4 @@
-"""The project's rig with another truth, the loops that run on it, and what their steps come to, between ticks too."""
+"""The simulated rig with another true plant, the loops on it, and figures of their steps, between ticks too."""
 
 from __future__ import annotations
 
@@ -35,15 +35,15 @@ RATE_HZ, PERIOD_S = 1e4, 1e-4
 LEVELS_UM = (0.0, 10.0, 0.0, 20.0, -20.0, 20.0, 40.0, 0.0, -40.0)
 """Rest, then eight steps: 10, 10, 20, 40, 40, 20, 40, 40 µm."""
 DWELL_S, SHORT_S = 0.3, 0.1
-"""Of a level: where static errors are judged, and where hundreds of runs are."""
+"""Durations (s) of a level: where static errors are judged, and for hundreds of runs."""
 NOMINAL = Scenario((0.0,), 1.0, 0.0, 0)
 TRUTH = Family(Transfer(*zeros_poles_gain(DynamicsOptions())), 0, ScenarioOptions(), PERIOD_S)
-"""Eq (5), and every plant around it: the rig's dynamics, which no loop is told."""
+"""Eq (5) and the plants around it: true dynamics of the rig, which no loop knows."""
 
 
 class Steps(NamedTuple):
-    """Of each step its height in µm, settling in ms, overshoot and static error in %; over all the largest |u| in V,
-    what limited and what tripped.
+    """Figures of a run. `table` has a row for each step: height (µm), settling (ms), overshoot and static error (%).
+    `peak_v` is the largest |u|; `limited` and `trips` name the limits that acted and the trips.
     """
 
     table: Real
@@ -53,117 +53,122 @@ class Steps(NamedTuple):
 
     @property
     def settling_ms(self) -> float:
-        """The slowest."""
+        """Longest settling time; infinite after a trip."""
         return np.inf if self.trips else float(self.table[:, 1].max())
 
     def overshoot(self, height_um: float | None = None) -> float:
-        """The largest in %, of steps of one height or of all."""
+        """Return the largest overshoot (%), of steps of one height or of all; infinite after a trip."""
         rows = self.table if height_um is None else self.table[self.table[:, 0] == height_um]
         return np.inf if self.trips else float(rows[:, 2].max())
 
     @property
     def static_percent(self) -> float:
-        """The largest."""
+        """Largest static error; infinite after a trip."""
         return np.inf if self.trips else float(self.table[:, 3].max())
 
 
-def shifted(percent: float) -> Scenario:
-    """Another resonance, all else as it is."""
+def shifted_plant(percent: float) -> Scenario:
+    """Return the nominal plant with its resonance shifted by `percent`."""
     return NOMINAL._replace(resonance=(percent,))
 
 
-def loop(name: str) -> Configuration:
-    """One of those in deploy/."""
+def load_loop(name: str) -> Configuration:
+    """Load a configuration of deploy/."""
     return load(DEPLOY / f"{name}.toml")
 
 
 def specification() -> DesignOptions:
-    """Of deploy/robust.toml."""
+    """Load the specification of deploy/robust.toml."""
     return load_specification(DEPLOY / "robust-spec.toml").design
 
 
-def check_of(configuration: Configuration) -> AxisCheck:
-    """Of its one axis."""
+def axis_check(configuration: Configuration) -> AxisCheck:
+    """Return the check of a configuration's only axis."""
     (check,) = check_axes(configuration, Findings())
     return check
 
 
-def controller_of(configuration: Configuration) -> DiscreteController:
-    """C(z) of its one axis."""
-    found = check_of(configuration).linear
-    assert isinstance(found, DiscreteController)
-    return found
+def linear_controller(configuration: Configuration) -> DiscreteController:
+    """Return C(z) of a configuration's only axis."""
+    controller = axis_check(configuration).linear
+    assert isinstance(controller, DiscreteController)
+    return controller
 
 
-def changed(configuration: Configuration, **sections: Any) -> Configuration:
-    """With other sections of its one axis."""
+def replace_sections(configuration: Configuration, **sections: Any) -> Configuration:
+    """Return a configuration with other sections of its only axis."""
     (axis,) = configuration.axes
     return replace(configuration, axes=(axis.model_copy(update=sections),))
 
 
-def with_taps(configuration: Configuration, taps: Taps) -> Configuration:
-    """With both rows."""
+def replace_taps(configuration: Configuration, taps: Taps) -> Configuration:
+    """Return a configuration with both rows of taps replaced."""
     rows = {"taps": tuple(taps.reference.tolist()), "command_taps": tuple(taps.command.tolist())}
-    return changed(configuration, prefilter=configuration.axes[0].prefilter.model_copy(update=rows))
+    return replace_sections(configuration, prefilter=configuration.axes[0].prefilter.model_copy(update=rows))
 
 
-def bench(
+def rig_bench(
     configuration: Configuration, truth: Scenario = NOMINAL, seed: int = 1, noise_um: float | None = None, **plant: Any
 ) -> Bench:
-    """On the rig with this truth; `plant` are further sections of it, such as a disturbance."""
-    given = configuration.driver_options
-    assert isinstance(given, RigOptions)
+    """Return a bench of the rig with this true plant; `plant`: further sections of the rig, such as a disturbance."""
+    options = configuration.driver_options
+    assert isinstance(options, RigOptions)
     if truth != NOMINAL:
         plant["dynamics"] = _dynamics(truth)
     if noise_um is not None:
-        plant["sensor"] = given.plant.sensor.model_copy(update={"noise_um": noise_um})
-    rig = given.model_copy(update={"seed": seed, "plant": given.plant.model_copy(update=plant)})
+        plant["sensor"] = options.plant.sensor.model_copy(update={"noise_um": noise_um})
+    rig = options.model_copy(update={"seed": seed, "plant": options.plant.model_copy(update=plant)})
     return Bench(replace(configuration, driver_options=rig), {})
 
 
-def steps(on: Bench, dwell_s: float = DWELL_S) -> Steps:
-    """Eight of them, each judged by itself."""
-    run = on.run("x", LEVELS_UM, dwell_s)
-    position, reference = on.true_positions(run, "x").ravel(), np.repeat(run["x_reference_um"], POINTS)
+def run_steps(bench: Bench, dwell_s: float = DWELL_S) -> Steps:
+    """Run eight steps; return the figures of each."""
+    run = bench.run("x", LEVELS_UM, dwell_s)
+    position, reference = bench.true_positions(run, "x").ravel(), np.repeat(run["x_reference_um"], POINTS)
     starts = np.flatnonzero(np.diff(reference)) + 1
     rows = []
     for start, end in zip(starts, [*starts[1:], reference.size], strict=True):
-        one = step_metrics(reference[start - 1 : end], position[start - 1 : end], POINTS * RATE_HZ)
-        if one is not None:
+        metrics = step_metrics(reference[start - 1 : end], position[start - 1 : end], POINTS * RATE_HZ)
+        if metrics is not None:
             height = abs(reference[start] - reference[start - 1])
-            rows.append((height, one.settling_time_ms, one.overshoot_percent, one.static_error_percent))
-    ever = int(np.bitwise_or.reduce(run["flags"].astype(np.int64)))
+            rows.append((height, metrics.settling_time_ms, metrics.overshoot_percent, metrics.static_error_percent))
+    flags = int(np.bitwise_or.reduce(run["flags"].astype(np.int64)))
     return Steps(
         np.array(rows), float(np.abs(run["x_drive_v"]).max()),
-        tuple(name for flag, name in LIMIT_FLAGS.items() if ever & flag), tuple(trip_causes(ever)),
+        tuple(name for flag, name in LIMIT_FLAGS.items() if flags & flag), tuple(trip_causes(flags)),
     )  # fmt: skip
 
 
-def trace(on: Bench, height_um: float) -> tuple[Real, Real]:
-    """Time since it in ms, and the position in µm, between ticks too, of one step from rest."""
-    run = on.run("x", (0.0, height_um), DWELL_S)
-    position = on.true_positions(run, "x").ravel()[round(DWELL_S * RATE_HZ) * POINTS :]
+def trace_step(bench: Bench, height_um: float) -> tuple[Real, Real]:
+    """Run one step from rest. Return the time since the step (ms) and the position (µm), between ticks too."""
+    run = bench.run("x", (0.0, height_um), DWELL_S)
+    position = bench.true_positions(run, "x").ravel()[round(DWELL_S * RATE_HZ) * POINTS :]
     return np.arange(position.size) / np.float64(POINTS * RATE_HZ / 1e3), position
 
 
-def subject(configuration: Configuration) -> Subject:
-    """What taps of it are made for, by its specification."""
+def tap_subject(configuration: Configuration) -> Subject:
+    """Return the subject for which taps of a configuration are designed, by the specification of robust.toml."""
     return build_subject(
-        configuration.axes[0], check_of(configuration), specification(), driver_delay_ticks(configuration)
+        configuration.axes[0], axis_check(configuration), specification(), driver_delay_ticks(configuration)
     )
 
 
-def taps_for(
-    about: Subject, plant: Transfer, within_percent: float, overshoot: float, settling_ms: float | None = None
+def design_taps_within(
+    subject: Subject, plant: Transfer, within_percent: float, overshoot: float, settling_ms: float | None = None
 ) -> Taps:
-    """Both rows, for a resonance within so much of a plant's. Raises NoDesign."""
+    """Design both rows of taps for a resonance within `within_percent` of the plant's. Raises NoDesign."""
     scenarios = ScenarioOptions(resonance_percent=within_percent, damping=(1.0,), gain_percent=0.0)
-    options = about.options.model_copy(update={"settling_ms": settling_ms, "scenarios": scenarios})
-    return design_taps(replace(about, plant=plant, overshoot=overshoot, options=options)).taps
+    options = subject.options.model_copy(update={"settling_ms": settling_ms, "scenarios": scenarios})
+    return design_taps(replace(subject, plant=plant, overshoot=overshoot, options=options)).taps
 
 
-def written(configuration_name: str, truth_percent: float, folder: Path, gain_percent: float = 0.0) -> Path:
-    """A file of one of deploy/'s loops on a rig whose resonance and gain are elsewhere, for what runs files."""
+def write_shifted_configuration(
+    configuration_name: str, truth_percent: float, folder: Path, gain_percent: float = 0.0
+) -> Path:
+    """Write a configuration of deploy/ with shifts of the rig's resonance and gain; return its path.
+
+    Its specification is copied beside it.
+    """
     text = (DEPLOY / f"{configuration_name}.toml").read_text(encoding="utf-8")
     text = text.replace("# [driver.plant.dynamics]", "[driver.plant.dynamics]")
     text = text.replace("# resonance_shift = 0.0", "resonance_shift = 0.0")
@@ -180,7 +185,7 @@ def written(configuration_name: str, truth_percent: float, folder: Path, gain_pe
 
 
 def _dynamics(truth: Scenario) -> DynamicsOptions:
-    """The rig's dynamics with another truth."""
-    there = TRUTH.plant(truth)
-    zeros, poles = ([(root.real, root.imag) for root in roots.tolist()] for roots in (there.zeros, there.poles))
-    return DynamicsOptions(form="zpk", gain=there.gain, zeros=tuple(zeros), poles=tuple(poles))
+    """Return the rig's dynamics with another true plant."""
+    plant = TRUTH.plant(truth)
+    zeros, poles = ([(root.real, root.imag) for root in roots.tolist()] for roots in (plant.zeros, plant.poles))
+    return DynamicsOptions(form="zpk", gain=plant.gain, zeros=tuple(zeros), poles=tuple(poles))

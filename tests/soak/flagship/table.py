@@ -1,4 +1,4 @@
-"""Rows of the comparison: what is asked, what each loop does, and whether ours keeps it."""
+"""Rows of the comparison: the goal, the figure of each loop, and whether rtloop's own loop meets the goal."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ HEADINGS = ("", "goal", "paper", "ours", "met")
 
 
 class Row(NamedTuple):
-    """A quantity; without a goal it is said and not judged. Infinite stands for a loop that is unstable or trips,
-    nan for a search that found none."""
+    """A quantity; without a goal it is printed and not judged. Infinity stands for a loop that is unstable or trips,
+    nan for a search that found no controller."""
 
     name: str
     unit: str
@@ -22,29 +22,30 @@ class Row(NamedTuple):
     note: str = ""
 
     @property
-    def met(self) -> bool | None:
-        """Whether ours keeps the goal, to the digits that it is given with; None without one."""
+    def is_met(self) -> bool | None:
+        """Whether rtloop's own loop meets the goal; None without a goal."""
         if self.goal is None:
             return None
         return self.ours >= self.goal if self.at_least else self.ours <= self.goal
 
     @property
     def cells(self) -> tuple[str, ...]:
-        """For people."""
+        """Cells of the printed table."""
         sign = "≥" if self.at_least else "≤"
         goal = "–" if self.goal is None else f"{sign} {self.goal:g} {self.unit}"
-        met = {None: "", True: "yes", False: "NO"}[self.met]
-        return self.name, goal, _said(self.paper, self.unit), _said(self.ours, self.unit), met
+        met = {None: "", True: "yes", False: "NO"}[self.is_met]
+        return self.name, goal, _format_value(self.paper, self.unit), _format_value(self.ours, self.unit), met
 
     def as_dict(self) -> dict[str, Any]:
-        """For JSON, which has no infinity."""
+        """Return the row for JSON, which has no infinity: such values become text."""
         values = {name: value if value is None or math.isfinite(value) else str(value)
                   for name, value in (("goal", self.goal), ("paper", self.paper), ("ours", self.ours))}  # fmt: skip
-        return {"name": self.name, "unit": self.unit, **values, "at_least": self.at_least, "met": self.met,
+        return {"name": self.name, "unit": self.unit, **values, "at_least": self.at_least, "met": self.is_met,
                 "note": self.note}  # fmt: skip
 
 
-def _said(value: float | None, unit: str) -> str:
+def _format_value(value: float | None, unit: str) -> str:
+    """Return a value with three digits and its unit, or a word for None, nan and infinity."""
     if value is None:
         return "–"
     if math.isnan(value):
@@ -52,13 +53,13 @@ def _said(value: float | None, unit: str) -> str:
     return f"{value:.3g} {unit}".strip() if math.isfinite(value) else "unstable"
 
 
-def text(rows: Sequence[Row]) -> str:
-    """All of them, in columns, and what is noted of them."""
+def format_table(rows: Sequence[Row]) -> str:
+    """Return the rows as text in columns, their notes, and the count of goals that are met."""
     cells = [HEADINGS, *(row.cells for row in rows)]
     widths = [max(len(row[column]) for row in cells) for column in range(len(HEADINGS))]
     lines = ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in cells]
-    judged = [row for row in rows if row.met is not None]
-    missed = [row.name for row in judged if not row.met]
+    rows_with_goal = [row for row in rows if row.is_met is not None]
+    missed = [row.name for row in rows_with_goal if not row.is_met]
     notes = [f"{row.name}: {row.note}" for row in rows if row.note]
-    kept = f"{len(judged) - len(missed)} of {len(judged)} goals are met"
-    return "\n".join([*lines, "", *notes, f"{kept}; missed: {', '.join(missed)}" if missed else kept])
+    summary = f"{len(rows_with_goal) - len(missed)} of {len(rows_with_goal)} goals are met"
+    return "\n".join([*lines, "", *notes, f"{summary}; missed: {', '.join(missed)}" if missed else summary])

@@ -1,4 +1,4 @@
-"""Packets on an interface as the kernel saw them, and what a socket behind it gets of them."""
+"""Packets on an interface as the kernel saw them, and the datagrams that a socket receives from them."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ UDP = 17
 
 
 class Datagram(NamedTuple):
-    """A UDP datagram that a socket would get."""
+    """A UDP datagram that a socket would receive, with its source and destination ports."""
 
     content: bytes
     source: int
@@ -23,7 +23,7 @@ class Datagram(NamedTuple):
 
 
 class Capture:
-    """Packets of an interface of this thread's namespace; the kernel keeps them until they are read."""
+    """Packets of an interface of this thread's namespace; the kernel stores them until `end`."""
 
     def __init__(self, link: str) -> None:
         self._socket = socket.socket(socket.AF_PACKET, socket.SOCK_DGRAM, socket.htons(ALL_PACKETS))
@@ -36,7 +36,7 @@ class Capture:
         """Packets whose hardware address was damaged: the host drops them."""
 
     def end(self) -> None:
-        """Read all packets. AssertionError if the kernel had no room for one."""
+        """Read all packets into the lists. Raises AssertionError if the kernel had no room for one."""
         try:
             while True:
                 packet, address = self._socket.recvfrom(65_536)
@@ -50,7 +50,7 @@ class Capture:
         assert struct.unpack("II", statistics)[1] == 0, "packets that the capture had no room for"
 
 
-def datagram(packet: bytes) -> Datagram | None:
+def parse_datagram(packet: bytes) -> Datagram | None:
     """Return the datagram of an IPv4 packet, None if a checksum or a length is wrong, as the kernel judges it."""
     if len(packet) < 28 or packet[0] != 0x45 or packet[9] != UDP or _ones_sum(packet[:20]) != 0xFFFF:
         return None

@@ -1,4 +1,4 @@
-"""One run of the driver through the wire, and what captures at both ends say that driver and node must have counted."""
+"""One run of the driver through netem, and the counts that driver and node must show by captures at both ends."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from rtloop.drivers.node.driver import UdpDriver
 from rtloop.drivers.node.options import UdpOptions
 from tests.drivers.node_calls import open_calls
 from tests.node.frames import SAMPLE, Sample, parse
-from tests.soak.netem.capture import Capture, datagram
+from tests.soak.netem.capture import Capture, parse_datagram
 from tests.soak.netem.namespaces import NODE_ADDRESS, Network
 
 PORT = 5747
@@ -29,7 +29,7 @@ DIGITAL = 4
 """Digital inputs and outputs of the node."""
 AGE = 1 + DIGITAL
 COUNTS = slice(AGE + 1, AGE + 6)
-"""Places of the age, and of lost, late, doubled, invalid and foreign, in what `read` returns."""
+"""Indices in the values of `read`: the age; the counts of lost, late, doubled, invalid and foreign samples."""
 SETTLE_S = 0.5
 LONG_US = 10_000_000
 
@@ -40,7 +40,7 @@ def node_program(network: Network, program: Path, witness: Path, *more: str) -> 
     options = ["--port", str(PORT), "--loopback", "--hold", str(LONG_US), "--witness", str(witness), *more]
     process = network.start("node", str(program), *options)
     assert process.stdout is not None
-    process.stdout.readline()  # it is ready
+    process.stdout.readline()  # The first line is printed when the node is ready.
     try:
         yield process
     finally:
@@ -48,8 +48,8 @@ def node_program(network: Network, program: Path, witness: Path, *more: str) -> 
         process.communicate()
 
 
-def driver_of(rate_hz: float, **options: object) -> UdpDriver:
-    """A driver, not open, of the node at the far end."""
+def build_driver(rate_hz: float, **options: object) -> UdpDriver:
+    """Return a driver, not yet open, of the node at the far end."""
     values = {"host": NODE_ADDRESS, "port": PORT, "wait_s": 30.0, "error_limit": 1_000_000, "hold_ticks": HOLD_TICKS,
               "watchdog_ms": 5000.0, "output_range_v": [-10.0, 9.9997], "input_range_v": [-10.0, 9.9997],
               "digital_inputs": DIGITAL, "digital_outputs": DIGITAL}  # fmt: skip
@@ -58,7 +58,7 @@ def driver_of(rate_hz: float, **options: object) -> UdpDriver:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What one run counted: by the driver, by the node, and by the captures at both ends."""
+    """Counts of one run: by the driver, by the node, and by the captures at both ends."""
 
     drives: int
     at_node: int
@@ -80,18 +80,18 @@ class Outcome:
     passed: bool
     """Whether netem's own counts agree with the captures."""
     wrong: int
-    """Samples that show an output that is not the one of the drive of its sequence."""
+    """Faults of samples: codes that differ from the applied drive, or another drive than the sample's own."""
 
     @property
     def is_equal(self) -> bool:
-        """Whether all counts of one thing are equal."""
+        """Whether driver, node and netem counted as the captures did."""
         return (self.driver, self.node, self.stale) == (self.capture, self.node_capture, self.stale_due) and self.passed
 
 
 def run(network: Network, program: Path, folder: Path, netem: list[str], rate_hz: float, ticks: int) -> Outcome:
-    """Run a good network for the opening, then `ticks` ticks behind netem, then wait for what is still on its way."""
+    """Open the driver without netem, run `ticks` ticks behind netem, and wait for frames on their way."""
     with node_program(network, program, folder / "witness") as process:
-        driver = driver_of(rate_hz)
+        driver = build_driver(rate_hz)
         with network.inside("loop"):
             calls = open_calls(driver)
         calls.read()
@@ -108,8 +108,8 @@ def run(network: Network, program: Path, folder: Path, netem: list[str], rate_hz
             results.append(calls.read())
         time.sleep(SETTLE_S)
         values = calls.read()[1]
-        while (again := calls.read()[1])[COUNTS] != values[COUNTS]:
-            values = again
+        while (next_values := calls.read()[1])[COUNTS] != values[COUNTS]:
+            values = next_values
         for capture in captures:
             capture.end()
         dropped = [network.netem_counts(link) if netem else (0, 0) for link in ("wire1", "wire0")]
@@ -124,7 +124,7 @@ def _judge(
     first: int, results: list[tuple[int, list[float]]], values: list[float], loop: Capture, node: Capture,
     dropped: list[tuple[int, int]], counters: dict[str, int],
 ) -> Outcome:  # fmt: skip
-    """Compare what driver and node counted with the captures."""
+    """Return the counts of driver and node, and the counts that the captures demand."""
     sent = [content for packet in loop.sent if (content := _content(packet))]
     at_node = [content for packet in node.received if (content := _content(packet))]
     samples = [content for packet in node.sent if (content := _content(packet))]
@@ -141,40 +141,43 @@ def _judge(
         drives=len(sent), at_node=len(at_node), samples=len(samples), at_loop=len(at_loop),
         broken=sum(len(end.received) + len(end.lost) for end in (node, loop)) - len(at_node) - len(at_loop),
         netem=(dropped[0][1], dropped[1][1]), driver=[int(value) for value in values[COUNTS]],
-        capture=_counts(at_loop, first), node=[counters["invalid"], counters["old"]],
-        node_capture=_node_counts(at_node, first), held=statuses.count(1), stale=stale,
+        capture=_driver_counts_due(at_loop, first), node=[counters["invalid"], counters["old"]],
+        node_capture=_node_counts_due(at_node, first), held=statuses.count(1), stale=stale,
         stale_due=sum(max(0, length - HOLD_TICKS) for length in runs), passed=passed,
         wrong=_wrong_drives(samples, drives),
     )  # fmt: skip
 
 
 def _is_conserved(sent: list[bytes], samples: list[bytes], dropped: list[tuple[int, int]]) -> bool:
-    """Whether netem passed or dropped at least as many packets as came: it may double, not lose, without a count."""
-    return all(count + lost >= len(before) for (count, lost), before in zip(dropped, (sent, samples), strict=True))
+    """Return whether netem passed or dropped at least as many packets as came: it doubles packets without a count."""
+    return all(
+        count + dropped_count >= len(packets)
+        for (count, dropped_count), packets in zip(dropped, (sent, samples), strict=True)
+    )
 
 
 def _content(packet: bytes) -> bytes | None:
-    """Return the content of a packet that the kernel hands on, None for others."""
-    received = datagram(packet)
+    """Return the content of a packet that the kernel passes to a socket, None for other packets."""
+    received = parse_datagram(packet)
     return None if received is None else received.content
 
 
 def _is_frame(content: bytes) -> bool:
-    """Whether the check of a frame is right."""
+    """Return whether the checksum of a frame is right."""
     return len(content) > 12 and struct.unpack("<I", content[-4:])[0] == zlib.crc32(content[:-4])
 
 
-def _counts(arrived: list[bytes], first: int) -> list[int]:
+def _driver_counts_due(arrived: list[bytes], first: int) -> list[int]:
     """Return lost, late, doubled, invalid and foreign samples by the order of the arrivals at the loop."""
-    whole = [content for content in arrived if _is_frame(content) and content[2] == SAMPLE]
-    numbers = [struct.unpack_from("<I", content, 4)[0] for content in whole]
-    firsts = list(dict.fromkeys(numbers))
-    late = sum(number < highest for number, highest in zip(firsts, accumulate(firsts, max), strict=True))
-    lost = max(firsts, default=first) - first - len(firsts)
-    return [lost, late, len(numbers) - len(firsts), len(arrived) - len(whole), 0]
+    samples = [content for content in arrived if _is_frame(content) and content[2] == SAMPLE]
+    numbers = [struct.unpack_from("<I", content, 4)[0] for content in samples]
+    distinct = list(dict.fromkeys(numbers))
+    late = sum(number < highest for number, highest in zip(distinct, accumulate(distinct, max), strict=True))
+    lost = max(distinct, default=first) - first - len(distinct)
+    return [lost, late, len(numbers) - len(distinct), len(arrived) - len(samples), 0]
 
 
-def _node_counts(arrived: list[bytes], first: int) -> list[int]:
+def _node_counts_due(arrived: list[bytes], first: int) -> list[int]:
     """Return invalid and old drives by the order of the arrivals at the node."""
     newest, old, invalid = first, 0, 0
     for content in arrived:
@@ -188,13 +191,15 @@ def _node_counts(arrived: list[bytes], first: int) -> list[int]:
 
 
 def _wrong_drives(samples: list[bytes], drives: dict[int, bytes]) -> int:
-    """Return how many samples show an output that is not the drive that the sample before called its own."""
-    wrong, applied = 0, 0
+    """Return the number of faults: codes that differ from the drive that the previous sample applied, or a sample
+    that did not apply the drive of the same sequence.
+    """
+    faults, applied = 0, 0
     for content in samples:
         sample = parse(content)
         assert isinstance(sample, Sample)
         if applied:
-            wrong += sample.codes != struct.unpack_from("<i", drives[applied], 24)
-        wrong += sample.applied != sample.sequence or sample.applied <= applied
+            faults += sample.codes != struct.unpack_from("<i", drives[applied], 24)
+        faults += sample.applied != sample.sequence or sample.applied <= applied
         applied = sample.applied
-    return wrong
+    return faults

@@ -1,6 +1,6 @@
-"""Three network namespaces in a row, loop – wire – node: what is between them is this computer's, and no other traffic.
+"""Three network namespaces in a row on this computer, loop – wire – node, without other traffic.
 
-`tc netem` acts at the wire's two ends, so that both ends of a cable see whole traffic: before it and behind it.
+`tc netem` acts at the wire's two ends, so that captures at loop and node see the traffic before netem and behind it.
 """
 
 from __future__ import annotations
@@ -29,10 +29,10 @@ class Network:
         self.names = {place: f"rtloop-{os.getpid()}-{place}" for place in ("loop", "wire", "node")}
 
     def build(self) -> None:
-        """Make namespaces, interfaces, addresses and routes; neighbours are fixed, so that frames alone cross."""
+        """Make namespaces, interfaces, addresses and routes; neighbours are fixed, so that no ARP packets cross."""
         for name in self.names.values():
             _run("ip", "netns", "add", name)
-            self._in(name, "ip", "link", "set", "lo", "up")
+            self._run_in(name, "ip", "link", "set", "lo", "up")
         for end, inner, place in (("loop0", "wire0", "loop"), ("node0", "wire1", "node")):
             wire = self.names["wire"]
             _run(
@@ -63,10 +63,10 @@ class Network:
             _write_setting("/proc/sys/net/ipv4/ip_forward", "1")
         self.run("loop", "ip", "route", "add", "default", "via", WIRE_ADDRESSES[0])
         self.run("node", "ip", "route", "add", "default", "via", WIRE_ADDRESSES[1])
-        for link, other in (("loop0", "wire0"), ("wire0", "loop0"), ("node0", "wire1"), ("wire1", "node0")):
-            place, address = addresses[other]
+        for link, peer in (("loop0", "wire0"), ("wire0", "loop0"), ("node0", "wire1"), ("wire1", "node0")):
+            place, address = addresses[peer]
             with self.inside(place):
-                hardware = _hardware_address(other)
+                hardware = _hardware_address(peer)
             self.run(
                 addresses[link][0],
                 "ip",
@@ -82,39 +82,40 @@ class Network:
             )
 
     def remove(self) -> None:
-        """Remove the namespaces, and with them all that is in them."""
+        """Remove the namespaces with their interfaces."""
         for name in self.names.values():
             subprocess.run(["ip", "netns", "delete", name], capture_output=True, check=False)
 
     def run(self, place: str, *command: str) -> str:
         """Run a command in a namespace and return its output. Raises CalledProcessError."""
-        return self._in(self.names[place], *command)
+        return self._run_in(self.names[place], *command)
 
-    def _in(self, name: str, *command: str) -> str:
+    def _run_in(self, name: str, *command: str) -> str:
+        """Run a command in the namespace of this full name; return its output."""
         return _run("ip", "netns", "exec", name, *command)
 
     def start(self, place: str, *command: str) -> subprocess.Popen[str]:
-        """Start a program in a namespace."""
-        whole = ["ip", "netns", "exec", self.names[place], *command]
-        return subprocess.Popen(whole, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+        """Start a program in a namespace; return its process, with pipes for its output."""
+        arguments = ["ip", "netns", "exec", self.names[place], *command]
+        return subprocess.Popen(arguments, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
 
     @contextmanager
     def inside(self, place: str) -> Iterator[None]:
         """Let this thread open its sockets in a namespace; they stay there."""
-        with open("/proc/thread-self/ns/net") as own, open(f"/run/netns/{self.names[place]}") as other:
-            _enter(other.fileno())
+        with open("/proc/thread-self/ns/net") as own_namespace, open(f"/run/netns/{self.names[place]}") as target:
+            _enter(target.fileno())
             try:
                 yield
             finally:
-                _enter(own.fileno())
+                _enter(own_namespace.fileno())
 
     def disturb(self, *netem: str) -> None:
-        """Let netem act in both directions; without arguments, on none."""
+        """Let netem act in both directions; remove it without arguments."""
         for link in ("wire0", "wire1"):
             self.disturb_one(link, *netem)
 
     def disturb_one(self, link: str, *netem: str) -> None:
-        """Let netem act on what leaves the wire at one end, "wire0" to the loop or "wire1" to the node."""
+        """Let netem act on packets that leave the wire at one end: "wire0" to the loop, "wire1" to the node."""
         with suppress(subprocess.CalledProcessError):
             self.run("wire", "tc", "qdisc", "delete", "dev", link, "root")
         if netem:
@@ -128,17 +129,17 @@ class Network:
 
 @contextmanager
 def network() -> Iterator[Network]:
-    """Yield the namespaces; they are removed at the end, also after a failure."""
-    built = Network()
+    """Yield three connected namespaces; remove them at the end, also after a failure."""
+    namespaces = Network()
     try:
-        built.build()
-        yield built
+        namespaces.build()
+        yield namespaces
     finally:
-        built.remove()
+        namespaces.remove()
 
 
-def reason_without() -> str | None:
-    """Return the reason why there can be no netem here, None if there can."""
+def missing_requirement() -> str | None:
+    """Return the reason why netem cannot run here, None if it can."""
     if os.geteuid() != 0:
         return "network namespaces need root"
     if missing := [name for name in ("ip", "tc") if shutil.which(name) is None]:
@@ -155,6 +156,7 @@ def reason_without() -> str | None:
 
 
 def _run(*command: str) -> str:
+    """Run a command and return its output. Raises CalledProcessError."""
     return subprocess.run(command, capture_output=True, text=True, check=True).stdout
 
 
@@ -165,21 +167,23 @@ def _enter(file: int) -> None:
 
 
 def _write_setting(path: str, text: str) -> None:
+    """Write a setting of the kernel, if the kernel has it."""
     with suppress(FileNotFoundError):
         Path(path).write_text(text)
 
 
 def _interface_request(link: str, number: int, content: bytes) -> bytes:
-    """Make an ioctl on a network interface of this thread's namespace."""
+    """Make the ioctl `number` on an interface of this thread's namespace; return its result."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as any_socket:
         return fcntl.ioctl(any_socket, number, struct.pack("16s", link.encode()) + content)
 
 
 def _set_checksums_in_software(link: str) -> None:
-    """Let the sender compute the UDP checksum, as a card on a real cable does; veth leaves it out else."""
+    """Let the sender compute the UDP checksum, as a real network card does; veth omits it otherwise."""
     value = ctypes.create_string_buffer(struct.pack("II", ETHTOOL_STXCSUM, 0))
     _interface_request(link, SIOCETHTOOL, struct.pack("P", ctypes.addressof(value)) + bytes(16))
 
 
 def _hardware_address(link: str) -> str:
+    """Return the MAC address of an interface."""
     return _interface_request(link, 0x8927, bytes(24))[18:24].hex(":")
