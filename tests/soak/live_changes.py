@@ -129,7 +129,7 @@ class EveryChange(Changes):
         )
 
     def _tare(self) -> None:
-        """Shift the reading of a random axis by up to 0.05."""
+        """Set a random offset, of up to 0.05 V, of the reading of one axis."""
         self._live.tare(self._chance.randrange(2), self._chance.uniform(-0.05, 0.05))
 
     def _reset(self) -> None:
