@@ -1,4 +1,4 @@
-"""Faults on real processes, and what came of them, as a table: `make faults`. Exit code 0 if every verdict holds."""
+"""Inject every fault into real processes and print a table of the verdicts: `make faults`. Exit code 0 if all hold."""
 
 from __future__ import annotations
 
@@ -20,38 +20,38 @@ COLUMNS = ("fault", "what must happen", "safe after (host stalled)", "lost / exe
            "largest |drive|; step, change in 1 ms (allowed)", "verdict")  # fmt: skip
 
 LONGEST = 120
-"""Characters of a problem in the table; all of it goes to stderr."""
+"""Longest text of a problem in the table, in characters; stderr shows the whole text."""
 
 
 def cells(row: Row) -> tuple[str, ...]:
-    """A row as text."""
-    measured, ticks = row.measured, row.account
-    safe = "—" if measured.safe_ms is None else (
-        f"{measured.safe_ms:.1f} ms, {measured.safe_ms * row.bounds.rate_hz / 1000:.0f} ticks ({row.stalled_ms:.1f} ms)"
+    """Return the texts of a row, one for each of COLUMNS."""
+    outcome, ticks = row.outcome, row.account
+    safe = "—" if outcome.safe_ms is None else (
+        f"{outcome.safe_ms:.1f} ms, {outcome.safe_ms * row.bounds.rate_hz / 1000:.0f} ticks ({row.stalled_ms:.1f} ms)"
     )  # fmt: skip
     step, window = f"{row.step_v:.3f} V ({row.bounds.step_v:.3f})", f"{row.window_v:.3f} V ({row.bounds.window_v:.3f})"
     drive = f"{row.largest_v:.2f} V; {step}, {window}"
     verdict = f"not possible here: {row.skipped}" if row.skipped else ("holds" if not row.problems else "FAILS")
-    notes = filter(None, (measured.note,))
+    notes = filter(None, (outcome.note,))
     return (row.fault.name, row.fault.must, safe, f"{ticks.lost} / {ticks.executed}", drive,
             "; ".join([verdict, *notes, *(problem[:LONGEST] for problem in row.problems)]))  # fmt: skip
 
 
 def main() -> int:
-    """All faults, or those whose name contains one of the words given."""
+    """Measure all faults, or those whose name contains one of the words on the command line; return the exit code."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("words", nargs="*")
     parser.add_argument("--json", action="store_true", help="print names and problems alone")
-    given = parser.parse_args()
-    words = given.words
-    chosen = [fault for fault in FAULTS if not words or any(word in fault.name for word in words)]
+    arguments = parser.parse_args()
+    words = arguments.words
+    faults = [fault for fault in FAULTS if not words or any(word in fault.name for word in words)]
     rows = []
-    for number, fault in enumerate(chosen, start=1):
-        print(f"{number}/{len(chosen)} {fault.name}", file=sys.stderr, flush=True)
+    for number, fault in enumerate(faults, start=1):
+        print(f"{number}/{len(faults)} {fault.name}", file=sys.stderr, flush=True)
         rows.append(measure(fault))
         if rows[-1].problems:
             print("   " + "\n   ".join(rows[-1].problems), file=sys.stderr, flush=True)
-    if given.json:
+    if arguments.json:
         print(json.dumps([{"fault": row.fault.name, "problems": row.problems} for row in rows]))
         return int(any(row.problems for row in rows))
     table = Table(*COLUMNS, title=f"{len(rows)} faults")

@@ -1,4 +1,4 @@
-"""A service on a board, both real processes in a folder of their own, and the evidence that the board keeps."""
+"""Bench of the fault suite: service and board as real processes in one folder, and the board's record of its output."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ from tests.faults.evidence import TIMEOUT_S, Evidence, wait_for
 from tests.faults.host import HostWitness
 
 START_POLL_S = 0.05
-"""While processes start, who looks often takes the processor from them."""
+"""Longer than POLL_S: frequent polling would take the processor from the processes that start."""
 
 
 class Bench(Evidence):
     """`with Bench(folder) as bench`: a service that runs in closed loop on a board, or on a plain card.
 
-    Where `strict`, a process that stands still for 50 ms is killed, as in a laboratory. For tests of other things it is
-    patient: a host that holds up the loop does not end it.
+    With `strict`, a process that stands still for 50 ms is killed, as in a laboratory. Without it, the service waits
+    PATIENCE_S: a host that stalls the loop does not end the run.
     """
 
     def __init__(
@@ -56,7 +56,7 @@ class Bench(Evidence):
         self.service: subprocess.Popen[str] | None = None
         self.blocks: list[SharedBlock] = []
         self.stderr: int | None = None
-        """Where processes that are started from now on complain, if not to the log."""
+        """Descriptor that processes started from now on get as stderr; None: the log."""
         self._started: list[subprocess.Popen[str]] = []
         if card:
             plain_card.install(folder)
@@ -87,7 +87,7 @@ class Bench(Evidence):
     # processes
 
     def rtloop(self, *arguments: str | Path) -> subprocess.Popen[str]:
-        """Start a command; what it says goes to a log that `log` shows."""
+        """Start `rtloop ARGUMENTS` and return its process; its output goes to the file that `log` returns."""
         command = [sys.executable, "-m", "rtloop", *map(str, arguments)]
         with open(self.folder / "log", "a") as log:
             stderr = log if self.stderr is None else self.stderr
@@ -96,14 +96,14 @@ class Bench(Evidence):
         return process
 
     def start_board(self) -> None:
-        """Start the board and wait until it takes samples."""
+        """Start the board and wait until it converts samples."""
         self.board = self.rtloop("hil", "serve", self.config)
         path = self.folder / "board"
-        there = lambda: path.exists() and path.stat().st_size >= board.file_bytes()
-        wait_for(there, "a board", poll_s=START_POLL_S)
-        before = int(self.memory.words[board.SEQUENCE])  # of a board that was killed
-        running = lambda: self.memory.facts["magic"][0] == board.MAGIC and self.memory.words[board.SEQUENCE] != before
-        wait_for(running, "a board that runs", poll_s=START_POLL_S)
+        has_memory = lambda: path.exists() and path.stat().st_size >= board.file_bytes()
+        wait_for(has_memory, "a board", poll_s=START_POLL_S)
+        old = int(self.memory.words[board.SEQUENCE])  # a killed board has left its own
+        is_running = lambda: self.memory.facts["magic"][0] == board.MAGIC and self.memory.words[board.SEQUENCE] != old
+        wait_for(is_running, "a board that runs", poll_s=START_POLL_S)
 
     def start_service(self) -> None:
         """Start the service and wait until its loop runs."""
@@ -112,7 +112,7 @@ class Bench(Evidence):
         self.follow()
 
     def follow(self) -> SharedBlock:
-        """The shared block of the present loop, which stays readable after the loop's end."""
+        """Map the shared block of the present loop and return it; it stays readable after the loop's end."""
         path = self.folder / "run" / f"{self.config.stem}.block"
         wait_for(lambda: path.stat().st_size, "a shared block")
         fd = os.open(path, os.O_RDWR | os.O_CLOEXEC)
@@ -120,28 +120,29 @@ class Bench(Evidence):
         return self.blocks[-1]
 
     def _follows_the_present_loop(self) -> bool:
+        """Return whether the newest block of `blocks` is that of the present loop."""
         path = self.folder / "run" / f"{self.config.stem}.block"
         return path.exists() and os.path.samestat(os.fstat(self.blocks[-1].fd), path.stat())
 
     def pid(self, role: str) -> int:
-        """Process of the service, of its present loop ("rt") or of its present recorder."""
+        """Return the process id of the service, of its present loop (role "rt") or of its present recorder."""
         assert self.service is not None
         if role == "service":
             return self.service.pid
         return self.blocks[-1].load(Word.LOOP_PID if role == "rt" else Word.RECORDER_PID)
 
     def safe_pids(self) -> list[int]:
-        """The service and the present loop."""
+        """Return the process ids of the service and of the present loop."""
         loops = [pid for block in self.blocks[-1:] if (pid := block.load(Word.LOOP_PID))]
         return [*([self.service.pid] if self.service else []), *loops]
 
     @property
     def bounds(self) -> Bounds:
-        """What the configuration, as it is now, allows the output."""
-        return Bounds.of(self.config.read_text(), self.resolution_v)
+        """Largest steps and changes of the output that the present text of the configuration allows."""
+        return Bounds.from_text(self.config.read_text(), self.resolution_v)
 
     def _end_child(self, pid: int) -> None:
-        """End a loop or recorder of ours that still lives; its number may belong to somebody else by now."""
+        """Kill a loop or recorder of this bench; a process of others that has got its number is not touched."""
         with suppress(OSError):
             if (
                 str(ROOT) in Path(f"/proc/{pid}/environ").read_text()
@@ -149,38 +150,38 @@ class Bench(Evidence):
             ):
                 os.kill(pid, signal.SIGKILL)
 
-    # what the service says
+    # status, states, log
 
     def status(self) -> dict[str, Any]:
-        """Of the service; empty while it does not answer."""
+        """Return the service's status; empty while the service does not answer."""
         try:
             return self.client.get("/status")
         except RtloopError:
             return {}
 
     def await_state(self, state: str, *causes: str, timeout_s: float = TIMEOUT_S) -> dict[str, Any]:
-        """Wait for a state, and for trips of these causes among others."""
+        """Wait until the service is in `state` with trips of at least these causes; return its status."""
         report: dict[str, Any] = {}
 
-        def there() -> bool:
+        def is_reached() -> bool:
             nonlocal report
             report = self.status()
             return report.get("state") == state and set(causes) <= set(report.get("trip", ()))
 
         try:
-            wait_for(there, f"{state} {' '.join(causes)}", timeout_s)
+            wait_for(is_reached, f"{state} {' '.join(causes)}", timeout_s)
         except AssertionError as error:
-            there_is = {key: report.get(key) for key in ("state", "trip", "faults")}
-            raise AssertionError(f"{error}; there is {there_is}; {self.log()[-600:]}") from None
+            present = {key: report.get(key) for key in ("state", "trip", "faults")}
+            raise AssertionError(f"{error}; the state is {present}; {self.log()[-600:]}") from None
         return report
 
     def await_restart(self, count: int = 1) -> None:
-        """Wait for a new loop in place of one that ended."""
+        """Wait until the service has replaced `count` loops, and follow the newest one."""
         wait_for(lambda: self.status().get("restarts", 0) >= count and self.status().get("ticks"), "a restart")
         self.follow()
 
     def await_drive(self) -> None:
-        """Wait until the loop is closed and drives."""
+        """Wait until the loop runs with more than 1 V at the output, and for 1,000 further ticks."""
         self.await_state("running")
         wait_for(lambda: abs(self.seen().last_v) > 1.0, "a drive")
         ticks = self.ticks
@@ -192,7 +193,7 @@ class Bench(Evidence):
         wait_for(executed, "a thousand ticks")
 
     def recover(self) -> None:
-        """Reset what is tripped, start, and see that it drives again."""
+        """Reset a trip, start the loop, and wait until it drives."""
         before = wait_for(self.status, "an answer")
         if before["state"] == "tripped":
             self.client.post("/reset")
@@ -204,15 +205,15 @@ class Bench(Evidence):
 
     @property
     def ticks(self) -> int:
-        """Executed by the newest loop that is followed."""
+        """Number of ticks that the loop of the newest block has executed."""
         return int(self.blocks[-1]["ticks_head"][0])
 
     def log(self) -> str:
-        """What all processes said."""
+        """Return the output of all processes of the bench."""
         return (self.folder / "log").read_text()
 
     def stop(self) -> int:
-        """SIGTERM to the service; its exit code."""
+        """Send SIGTERM to the service and return its exit code."""
         assert self.service is not None
         if self.service.poll() is None:
             self.service.send_signal(signal.SIGTERM)

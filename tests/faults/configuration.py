@@ -1,6 +1,6 @@
 """Configurations of the fault suite: the paper's law, slower, with slew limits that bound every step of the outputs.
 
-The loop runs with the slew limit of the ramps, so that whatever moves an output is held against `trip_slew_v_per_s`.
+The loop runs with the slew limit of the ramps, so that `trip_slew_v_per_s` bounds every movement of an output.
 """
 
 from __future__ import annotations
@@ -13,13 +13,13 @@ from typing import NamedTuple
 ROOT = Path(__file__).resolve().parents[2]
 PAPER = (ROOT / "deploy" / "paper.toml").read_text(encoding="utf-8")
 LAW = PAPER[PAPER.index("[axis.feedforward]") : PAPER.index("# [axis.prefilter]")]
-"""Feed-forward, controller and model."""
+"""Tables of feedforward, controller and model of the paper's configuration."""
 CONTROLLER = LAW[LAW.index("[axis.controller]") : LAW.index("# Eq (5)")]
 BOARD_RATE_HZ = 4000.0
 SLEW_V_PER_S = 500.0
 WINDOW_S = 1e-3
 HELD_UP_STEPS = 2
-"""A write may be held up until the next is due, and comes with it: so many more steps within a window."""
+"""A delayed write may come together with the next one: a window of WINDOW_S may hold so many more steps."""
 
 BOARD = """
 [loop]
@@ -62,7 +62,7 @@ form = "zpk"
 gain = 200.0
 poles = [[-200.0, 0.0]]
 """
-# the board is a process beside others: a host that stalls it alone for less than 0.4 s is no fault of these rows
+# The board is a process beside others: a host that stalls it alone for less than 0.4 s must not trip the loop.
 LIMITS = f"""
 [axis.limits]
 slew_v_per_s = {SLEW_V_PER_S}
@@ -86,19 +86,19 @@ min_free_mib = 0.0
 
 
 PATIENCE_S = 20.0
-"""How long a host may hold up a process of a patient bench before the others take it for dead."""
+"""Time-out after which the other processes of a patient bench count a stalled process as dead."""
 
 
 class Bounds(NamedTuple):
-    """What a configuration allows its output: a step from one write to the next, and a change within WINDOW_S."""
+    """Limits of a configuration on its output, in V: step from one write to the next, change within WINDOW_S."""
 
     rate_hz: float
     step_v: float
     window_v: float
 
     @staticmethod
-    def of(text: str, resolution_v: float) -> Bounds:
-        """Bounds from a configuration's text; a voltage may be off by half of `resolution_v`."""
+    def from_text(text: str, resolution_v: float) -> Bounds:
+        """Return the bounds of a configuration's text; a voltage may be off by half of `resolution_v`."""
         configuration = tomllib.loads(text)
         (axis,), rate_hz = configuration["axis"], float(configuration["loop"]["rate_hz"])
         limits = axis["limits"]
@@ -109,17 +109,17 @@ class Bounds(NamedTuple):
 
 
 def on_a_board(folder: Path, *changes: tuple[str, str]) -> str:
-    """The paper's law on a rig that is a process of its own; the drive stays between 2 V and 8 V."""
-    return _changed(BOARD + '[[axis]]\nname = "x"\n' + LAW + LIMITS, folder, changes)
+    """Return the text of a configuration: the paper's law on a rig in a separate process; the drive is 2 V … 8 V."""
+    return _apply_changes(BOARD + '[[axis]]\nname = "x"\n' + LAW + LIMITS, folder, changes)
 
 
 def on_a_card(folder: Path, *changes: tuple[str, str]) -> str:
-    """A first-order plant behind a third party's driver in plain Python."""
-    return _changed(CARD + '[[axis]]\nname = "x"\n' + CARD_LAW + LIMITS, folder, changes)
+    """Return the text of a configuration: a first-order plant behind a third party's driver in plain Python."""
+    return _apply_changes(CARD + '[[axis]]\nname = "x"\n' + CARD_LAW + LIMITS, folder, changes)
 
 
 def patient(text: str) -> str:
-    """A configuration whose service and loop wait PATIENCE_S for each other, where it states no other limit."""
+    """Return `text` with time-outs of PATIENCE_S between service and loop, unless it states its own."""
     for table, key, value in (
         ("loop", "heartbeat_timeout_s", PATIENCE_S),
         ("service", "stall_ms", 1000.0 * PATIENCE_S),
@@ -131,7 +131,8 @@ def patient(text: str) -> str:
     return text
 
 
-def _changed(text: str, folder: Path, changes: tuple[tuple[str, str], ...]) -> str:
+def _apply_changes(text: str, folder: Path, changes: tuple[tuple[str, str], ...]) -> str:
+    """Return `text` with the folder filled in, and each `old` text, which occurs once, replaced by `new`."""
     text = text.replace("{folder}", str(folder))
     for old, new in changes:
         assert text.count(old) == 1, old

@@ -1,4 +1,4 @@
-"""One row of the table: a fault on real processes, what must happen, and what was measured."""
+"""One row of the fault table: a fault injected into real processes, the required behaviour, and the verdict."""
 
 from __future__ import annotations
 
@@ -21,40 +21,43 @@ class NotPossible(Exception):
 
 
 @dataclass
-class Measured:
-    """What a fault is judged by."""
+class Outcome:
+    """Result of an injected fault: time to the safe output in ms, and what the verdict has to accept."""
 
     safe_ms: float | None = None
     lost_allowed: bool = False
     exit_code: int = 0
     note: str = ""
-    extra: list[str] = field(default_factory=list)
 
 
 @dataclass(frozen=True)
 class Fault:
-    """`inject` raises AssertionError where what must happen does not."""
+    """A fault of the table. `must` is the required behaviour as a text.
+
+    `inject` brings the fault about and returns its outcome. It raises AssertionError if the service does not behave as
+    required. `changes` edit the configuration, `environment` adds variables, `around` is entered before the bench.
+    """
 
     name: str
     must: str
-    inject: Callable[[Bench], Measured]
+    inject: Callable[[Bench], Outcome]
     changes: tuple[tuple[str, str], ...] = ()
     card: bool = False
     environment: Callable[[Path], dict[str, str]] = lambda _: {}
     around: Callable[[Path], AbstractContextManager[None]] | None = None
     drives: bool = True
-    """Whether the loop drives before the fault comes."""
+    """Whether the fault is injected only when the loop drives its output."""
 
 
 @dataclass
 class Row:
-    """A row of the table, with the verdict: no problems."""
+    """A row of the table: the outcome, the account of the ticks, the drive in V. The row passes without `problems`."""
 
     fault: Fault
-    measured: Measured = field(default_factory=Measured)
+    outcome: Outcome = field(default_factory=Outcome)
     account: Account = field(default_factory=lambda: Account(0, 0, 0, []))
     stalled_ms: float = 0.0
-    """What the host took on the way to the safe output."""
+    """Time in ms that the host stalled between the fault and the safe output."""
     largest_v: float = 0.0
     step_v: float = 0.0
     window_v: float = 0.0
@@ -64,12 +67,12 @@ class Row:
 
 
 def measure(fault: Fault) -> Row:
-    """Bring a fault about on a bench of its own and judge what came of it."""
+    """Inject a fault into a new bench and return its row of the table, with all problems."""
     row = Row(fault)
     with tempfile.TemporaryDirectory(prefix="rtloop-fault-") as name, _surroundings(fault, Path(name)):
         try:
-            given = {"card": fault.card, "environment": fault.environment(Path(name)), "strict": True}
-            with Bench(Path(name), *fault.changes, **given) as bench:
+            options = {"card": fault.card, "environment": fault.environment(Path(name)), "strict": True}
+            with Bench(Path(name), *fault.changes, **options) as bench:
                 row.bounds = bench.bounds
                 if fault.drives:
                     bench.await_drive()
@@ -77,13 +80,14 @@ def measure(fault: Fault) -> Row:
         except NotPossible as reason:
             row.skipped = str(reason)
         except (AssertionError, RtloopError, subprocess.TimeoutExpired) as error:
-            where = traceback.extract_tb(error.__traceback__)[-1]
-            row.problems.append(str(error) or f"{where.name}: {where.line}")
+            frame = traceback.extract_tb(error.__traceback__)[-1]
+            row.problems.append(str(error) or f"{frame.name}: {frame.line}")
     return row
 
 
 @contextmanager
 def _surroundings(fault: Fault, folder: Path) -> Iterator[None]:
+    """Enter the context manager `fault.around`, where the fault has one."""
     if fault.around is None:
         yield
     else:
@@ -92,22 +96,22 @@ def _surroundings(fault: Fault, folder: Path) -> Iterator[None]:
 
 
 def _judge(row: Row, bench: Bench) -> None:
-    row.measured = measured = row.fault.inject(bench)
+    """Inject the fault of a row, stop the service, and fill in the row's figures and problems."""
+    row.outcome = outcome = row.fault.inject(bench)
     row.stalled_ms = bench.stalled_ms
-    row.problems += measured.extra
     code = bench.stop()
-    if code != measured.exit_code:
-        row.problems.append(f"exit code {code}, not {measured.exit_code}; {bench.log()[-600:]}")
-    bench.witness()
-    row.largest_v = max(seen.largest_v for seen in bench.witnessed)
-    row.step_v = max(seen.largest_step_v for seen in bench.witnessed)
-    row.window_v = max(seen.largest_window_v for seen in bench.witnessed)
-    row.problems += [problem for seen in bench.witnessed for problem in seen.problems(row.bounds)]
+    if code != outcome.exit_code:
+        row.problems.append(f"exit code {code}, not {outcome.exit_code}; {bench.log()[-600:]}")
+    bench.store_record()
+    row.largest_v = max(record.largest_v for record in bench.records)
+    row.step_v = max(record.largest_step_v for record in bench.records)
+    row.window_v = max(record.largest_window_v for record in bench.records)
+    row.problems += [problem for record in bench.records for problem in record.problems(row.bounds)]
     if bench.seen().last_v != 0.0:
         row.problems.append(f"the output is at {bench.seen().last_v:.3f} V in the end")
     row.account = account(bench.folder / "recordings", bench.blocks)
     row.problems += row.account.problems
-    if row.account.lost and not measured.lost_allowed:
+    if row.account.lost and not outcome.lost_allowed:
         row.problems.append(f"{row.account.lost} ticks lost")
     if "Traceback" in bench.log():
         row.problems.append(f"a traceback: {bench.log()[-1500:]}")

@@ -1,4 +1,4 @@
-"""A fault of a law that somebody wrote: in the tick that meets it nothing comes back to the loop."""
+"""Fault of a user's law: its step does not return from the tick of a certain setpoint."""
 
 from __future__ import annotations
 
@@ -9,40 +9,40 @@ from pathlib import Path
 from rtloop.errors import RtloopError
 from tests.faults.bench import Bench
 from tests.faults.configuration import CONTROLLER
-from tests.faults.fault import Fault, Measured
+from tests.faults.fault import Fault, Outcome
 from tests.faults.processes import STOPPED_SAFE_MS
 from tests.laws.failing import ENDLESS, ENDLESS_UM
 
 NAME = "endless.py"
-WITH_IT = ((CONTROLLER, f'[axis.controller]\nfile = "{NAME}"\n'),)
+WITH_ENDLESS_LAW = ((CONTROLLER, f'[axis.controller]\nfile = "{NAME}"\n'),)
 
 
 @contextmanager
-def beside_the_configuration(folder: Path) -> Iterator[None]:
-    """The law's file."""
+def endless_law_file(folder: Path) -> Iterator[None]:
+    """Write the law's file into `folder`, where the configuration will be."""
     (folder / NAME).write_text(ENDLESS)
     yield
 
 
-def never_ends(bench: Bench) -> Measured:
-    """A setpoint from which on its output runs for ever; another loop begins without that setpoint."""
+def never_ends(bench: Bench) -> Outcome:
+    """Set the setpoint at which the law never returns; the next loop starts without this setpoint."""
     loop = bench.pid("rt")
 
-    def ask() -> None:
-        with suppress(RtloopError):  # nobody may come to answer: the loop has taken it and stands still
+    def post_setpoint() -> None:
+        with suppress(RtloopError):  # the request may stay unanswered: the loop that received it stands still
             bench.client.post("/setpoint", {"axis": "x", "value": ENDLESS_UM + 1.0})
 
-    bench.strike(ask)
+    bench.strike(post_setpoint)
     took_ms = bench.await_safe(STOPPED_SAFE_MS, by_request=True)
     bench.await_restart()
     assert bench.await_state("tripped")["faults"]
     assert bench.pid("rt") != loop
     assert "stood still and was killed" in bench.log()
     bench.recover()
-    return Measured(took_ms)
+    return Outcome(took_ms)
 
 
 FAULTS = (
-    Fault("law never ends", "loop killed, parked, another loop", never_ends, changes=WITH_IT,
-          around=beside_the_configuration),
+    Fault("law never ends", "loop killed, parked, another loop", never_ends, changes=WITH_ENDLESS_LAW,
+          around=endless_law_file),
 )  # fmt: skip

@@ -1,8 +1,8 @@
-"""Can the table of faults fail? This module plants one mistake at a time and runs the rows that it concerns.
+"""Proof that the fault table can fail: one planted mistake at a time, with the rows that it concerns.
 
-Every mistake must make at least one of its rows fail, with a problem that names the mistake's effect; without one, none
-of these rows may fail. Exit code 0 if that is so. The mistakes are put in as the modules are loaded (`planting/`): the
-tree stays as it is, and nothing is compiled anew.
+Every mistake must make at least one of its rows fail, with a problem that names the mistake's effect. Without a mistake
+no row may fail. Exit code 0 if both hold. The mistakes are planted while the modules are loaded (`planting/`): no file
+of the tree changes, and nothing is compiled again.
 """
 
 from __future__ import annotations
@@ -19,14 +19,14 @@ PLANTING = Path(__file__).with_name("planting")
 PARKED, STUCK = "loop SIGKILL, no restart", "loop SIGSTOP"
 STOPPED, CARD = "SIGTERM under drive", "driver blocks for good"
 DEATHS = "parking SIGKILL, again and again"
-"""Two hundred parkings. One alone may end with a step below 0.2 V that is no larger than the others, or have so little
-of a busy processor that it is no faster than a ramp although it does not wait."""
+"""Two hundred parkings. A single one may hide a mistake: its last step below 0.2 V may be no larger than the others,
+and on a busy processor it may be as slow as a ramp although it does not wait."""
 STEEP, LATE = r"a step of|within 1 ms", r"safe after"
 RAMP, SUPERVISOR = "rtloop.engine.ramp", "rtloop.supervision.supervisor"
 
 
 class Mutant(NamedTuple):
-    """A mistake: `old` text of `module` replaced by `new`; `effect` is a pattern of the problems that it causes."""
+    """A mistake: the text `old` of `module` replaced by `new`. `effect` is a pattern of the problems that it causes."""
 
     name: str
     module: str
@@ -61,7 +61,7 @@ MUTANTS = (
 
 
 def failures(rows: tuple[str, ...], mutant: Mutant | None) -> dict[str, list[str]]:
-    """Rows that fail, and their problems, with a mistake planted or, for None, without one."""
+    """Return the problems of each row that fails, with a mistake planted or, for None, without one."""
     environment = dict(os.environ)
     if mutant is not None:
         environment |= {"PYTHONPATH": os.pathsep.join([str(PLANTING), environment.get("PYTHONPATH", "")]),
@@ -70,26 +70,26 @@ def failures(rows: tuple[str, ...], mutant: Mutant | None) -> dict[str, list[str
     command = [sys.executable, "-m", "tests.faults", "--json", *rows]
     done = subprocess.run(command, env=environment, stdout=subprocess.PIPE, text=True, check=False)
     measured = json.loads(done.stdout)
-    unlike = sorted(set(rows) ^ {row["fault"] for row in measured})
-    assert not unlike, f"rows {unlike} were asked for or measured, not both"
+    mismatched = sorted(set(rows) ^ {row["fault"] for row in measured})
+    assert not mismatched, f"rows {mismatched} were either requested or measured, not both"
     return {row["fault"]: row["problems"] for row in measured if row["problems"]}
 
 
 def main() -> int:
-    """Print which rows each mistake makes fail: all mistakes, or those whose name contains one of the words given."""
+    """Print the rows that each mistake makes fail; words on the command line select mistakes by their names."""
     words = sys.argv[1:]
     mutants = [mutant for mutant in MUTANTS if not words or any(word in mutant.name for word in words)]
-    every = tuple(dict.fromkeys(row for mutant in mutants for row in mutant.rows))
-    found = failures(every, None)
-    print(f"without a mistake: {'; '.join(f'{row}: {problems}' for row, problems in found.items()) or 'all hold'}")
-    held = not found
+    all_rows = tuple(dict.fromkeys(row for mutant in mutants for row in mutant.rows))
+    failed = failures(all_rows, None)
+    print(f"without a mistake: {'; '.join(f'{row}: {problems}' for row, problems in failed.items()) or 'all hold'}")
+    passed = not failed
     for mutant in mutants:
         noticed = {row: [problem for problem in problems if re.search(mutant.effect, problem)]
                    for row, problems in failures(mutant.rows, mutant).items()}  # fmt: skip
-        said = [f"{row}: {problems[0]}" for row, problems in noticed.items() if problems]
-        print(f"{mutant.name} → {'; '.join(said) or 'NOT NOTICED'}", flush=True)
-        held = held and bool(said)
-    return int(not held)
+        effects = [f"{row}: {problems[0]}" for row, problems in noticed.items() if problems]
+        print(f"{mutant.name} → {'; '.join(effects) or 'NOT NOTICED'}", flush=True)
+        passed = passed and bool(effects)
+    return int(not passed)
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Faults that would move an output: parking again and again, a log that nobody reads, changes under way."""
+"""Faults that could move an output: repeated or killed parking, a log without a reader, tuning of a driving loop."""
 
 from __future__ import annotations
 
@@ -22,21 +22,21 @@ from rtloop.hil.board import LSB_V
 from rtloop.supervision.parking import park
 from tests.faults.bench import Bench
 from tests.faults.evidence import TIMEOUT_S, wait_for
-from tests.faults.fault import Fault, Measured, NotPossible
+from tests.faults.fault import Fault, NotPossible, Outcome
 from tests.faults.processes import KILLED_SAFE_MS
 from tests.faults.requests import is_refused
 from tests.full_pipe import fill
 
 DEATHS, SEED = 200, 14
-FUNCTION = ctypes.CFUNCTYPE(ctypes.c_int32, ctypes.c_void_p, ctypes.c_void_p)
+WRITE_FUNCTION = ctypes.CFUNCTYPE(ctypes.c_int32, ctypes.c_void_p, ctypes.c_void_p)
 WITHOUT_RESTART = (("[recording]", "[service]\nrestarts = 0\n[recording]"),)
 PATIENT = (("[recording]", "[service]\nstall_ms = 60000.0\n[recording]"),)
 FORGED_V, STRANGER = 9.9, 65534
 TAPS = (128, 3, 64, 1, 17, 5)
 
 
-def parked_again(bench: Bench) -> Measured:
-    """The service and its loop die at once; three times whoever comes parks, by a file that is being edited."""
+def parked_three_times(bench: Bench) -> Outcome:
+    """Kill service and loop together, then park three times while the configuration file holds half of its text."""
     service, loop, text = bench.pid("service"), bench.pid("rt"), bench.config.read_text()
     bench.config.write_text(text[: len(text) // 2] + "[[axis")
     bench.strike(lambda: os.kill(service, signal.SIGKILL), lambda: os.kill(loop, signal.SIGKILL))
@@ -51,11 +51,11 @@ def parked_again(bench: Bench) -> Measured:
     bench.config.write_text(text)
     bench.start_service()
     bench.await_drive()
-    return Measured(took_ms)
+    return Outcome(took_ms)
 
 
-def forged_block(bench: Bench) -> Measured:
-    """The service and its loop die, and somebody else's block lies where theirs did: it is not believed."""
+def forged_block(bench: Bench) -> Outcome:
+    """Kill service and loop, and give the shared block to another user: `park` must refuse it."""
     if os.geteuid() != 0:
         raise NotPossible("only root can give a file to another user")
     service, loop = bench.pid("service"), bench.pid("rt")
@@ -74,11 +74,11 @@ def forged_block(bench: Bench) -> Measured:
     took_ms = bench.await_safe()  # no bound: an interpreter must start
     bench.start_service()
     bench.await_drive()
-    return Measured(took_ms, note=f"refused while it was there, at {before_v:.2f} V")
+    return Outcome(took_ms, note=f"park refused the block, at {before_v:.2f} V")
 
 
-def parked_by_the_service_and_after_it(bench: Bench) -> Measured:
-    """No other loop is allowed: the service parks and ends, and the unit parks after it."""
+def parked_without_restart(bench: Bench) -> Outcome:
+    """Kill the loop of a service without restarts: the service parks and ends, and a later `park` moves nothing."""
     bench.strike(lambda: os.kill(bench.pid("rt"), signal.SIGKILL))
     took_ms = bench.await_safe(KILLED_SAFE_MS)
     assert bench.service is not None
@@ -86,11 +86,11 @@ def parked_by_the_service_and_after_it(bench: Bench) -> Measured:
     moved_ns = bench.seen().moved_ns
     assert bench.rtloop("park", bench.config).wait(TIMEOUT_S) == 0
     assert bench.seen().moved_ns == moved_ns, "the output moved again"
-    return Measured(took_ms, exit_code=1)
+    return Outcome(took_ms, exit_code=1)
 
 
-def ended_while_it_parks(bench: Bench) -> Measured:
-    """SIGTERM just after the loop's death."""
+def service_ended_while_parking(bench: Bench) -> Outcome:
+    """Kill the loop, and send SIGTERM to the service while it parks."""
     bench.strike(
         lambda: os.kill(bench.pid("rt"), signal.SIGKILL), lambda: os.kill(bench.pid("service"), signal.SIGTERM)
     )
@@ -98,31 +98,31 @@ def ended_while_it_parks(bench: Bench) -> Measured:
     assert bench.service is not None
     bench.service.wait(TIMEOUT_S)
     assert bench.rtloop("park", bench.config).wait(TIMEOUT_S) == 0
-    return Measured(took_ms, exit_code=1)
+    return Outcome(took_ms, exit_code=1)
 
 
-def full_pipe(bench: Bench) -> Measured:
-    """Whoever reads the log has stopped; then the loop is killed."""
+def full_pipe(bench: Bench) -> Outcome:
+    """Fill the pipe of the log, whose reader has stopped, then kill the loop: the service must still park in time."""
     bench.stop()
     reading, writing = os.pipe()
     bench.stderr = writing
     bench.start_service()
     bench.await_drive()
-    filled = fill(writing)
+    filled_bytes = fill(writing)
     bench.strike(lambda: os.kill(bench.pid("rt"), signal.SIGKILL))
     took_ms = bench.await_safe(KILLED_SAFE_MS)
     bench.await_restart()
     assert bench.await_state("tripped")["faults"]
     bench.recover()
-    assert len(os.read(reading, filled)) > 0
+    assert len(os.read(reading, filled_bytes)) > 0
     os.close(reading)
     os.close(writing)
     bench.stderr = None
-    return Measured(took_ms, note=f"{filled} bytes in the pipe")
+    return Outcome(took_ms, note=f"{filled_bytes} bytes in the pipe")
 
 
-def other_filters(bench: Bench) -> Measured:
-    """Pre-filters of other lengths, one after the other, while the loop drives."""
+def filter_lengths_change(bench: Bench) -> Outcome:
+    """Tune the pre-filter to each length of TAPS while the loop drives."""
     bench.strike()
     for taps in TAPS:
         ticks = bench.ticks
@@ -130,11 +130,11 @@ def other_filters(bench: Bench) -> Measured:
         wait_for(lambda ticks=ticks: bench.ticks > ticks + 500, "some more ticks")
     report = bench.status()
     assert (report["state"], report["restarts"]) == ("running", 0), report
-    return Measured(note=f"{len(TAPS)} lengths")
+    return Outcome(note=f"{len(TAPS)} lengths")
 
 
-def refused_setpoint(bench: Bench) -> Measured:
-    """A setpoint for a loop that stands still: what was refused is not applied when it goes on."""
+def setpoint_refused(bench: Bench) -> Outcome:
+    """Post a setpoint to a stopped loop: the refused setpoint is not applied once the loop runs again."""
     loop, before_um = bench.pid("rt"), bench.status()["axes"]["x"]["reference_um"]
     bench.strike(lambda: os.kill(loop, signal.SIGSTOP))
     assert is_refused(bench, "/setpoint", {"axis": "x", "value": -before_um})
@@ -143,40 +143,40 @@ def refused_setpoint(bench: Bench) -> Measured:
     wait_for(lambda: bench.ticks > ticks + 1000, "some more ticks")
     reference_um = bench.status()["axes"]["x"]["reference_um"]
     assert reference_um * before_um > 0, f"reference {before_um} µm, now {reference_um} µm"
-    return Measured()
+    return Outcome()
 
 
-def parking_that_dies(bench: Bench) -> Measured:
-    """So many times: a process drives the output and dies, another is killed while it parks, a third parks."""
+def parking_killed(bench: Bench) -> Outcome:
+    """Repeat DEATHS times: a process drives the output and dies, one is killed while it parks, a third one parks."""
     service, loop = bench.pid("service"), bench.pid("rt")
     plan = prepare(load(bench.config)).plan
-    slew_v_per_s, noted_v, chance = plan.trip_slew_v_per_s, bench.blocks[-1]["last_drive_v"], random.Random(SEED)
+    slew_v_per_s, last_drive_v, chance = plan.trip_slew_v_per_s, bench.blocks[-1]["last_drive_v"], random.Random(SEED)
     bench.strike(lambda: os.kill(service, signal.SIGKILL), lambda: os.kill(loop, signal.SIGKILL))
     assert bench.service is not None
     bench.service.wait()
     wait_for(lambda: bench.blocks[-1].driver_pid() is None, "the loop's end")
-    park(plan.driver(), slew_v_per_s, noted_v)
+    park(plan.driver(), slew_v_per_s, last_drive_v)
     halfway = 0
     for _ in range(DEATHS):
         drive_v = chance.uniform(-9.0, 9.0)
         os.waitpid(fork(lambda drive_v=drive_v: drive_and_die(plan.driver(), drive_v, slew_v_per_s)), 0)
         wait_for(lambda drive_v=drive_v: abs(bench.seen().last_v - drive_v) < LSB_V, "a drive")
-        pid = fork(lambda: park(plan.driver(), slew_v_per_s, noted_v))
+        pid = fork(lambda: park(plan.driver(), slew_v_per_s, last_drive_v))
         time.sleep(chance.uniform(0.0, 2.0 * abs(drive_v) / slew_v_per_s))
         os.kill(pid, signal.SIGKILL)
         os.waitpid(pid, 0)
-        halfway += 0.0 < abs(park(plan.driver(), slew_v_per_s, noted_v)[0]) < abs(drive_v) - LSB_V
+        halfway += 0.0 < abs(park(plan.driver(), slew_v_per_s, last_drive_v)[0]) < abs(drive_v) - LSB_V
         wait_for(lambda: bench.seen().last_v == 0.0, "a safe output")
     assert halfway > DEATHS // 10, f"{halfway} of {DEATHS} died halfway"
     bench.start_service()
     bench.await_drive()
-    return Measured(note=f"{DEATHS} deaths, seed {SEED}, {halfway} of them halfway down")
+    return Outcome(note=f"{DEATHS} deaths, seed {SEED}, {halfway} of them halfway down")
 
 
 def drive_and_die(driver: Driver, drive_v: float, slew_v_per_s: float) -> None:
-    """Ramp the output up as steeply as is allowed, and leave it there."""
+    """Ramp the output to `drive_v` at the slew limit, and end the process there."""
     pointers = driver.open()
-    write = FUNCTION(pointers.write)
+    write = WRITE_FUNCTION(pointers.write)
     for row in ramp(np.zeros(1), np.array([drive_v]), slew_v_per_s / driver.rate_hz):
         write(pointers.context, row.ctypes.data)
         time.sleep(1.0 / driver.rate_hz)
@@ -184,7 +184,7 @@ def drive_and_die(driver: Driver, drive_v: float, slew_v_per_s: float) -> None:
 
 
 def fork(work: Callable[[], object]) -> int:
-    """Process number of a child that does `work` and ends."""
+    """Fork a child that does `work` and ends; return its process id."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DeprecationWarning)
         pid = os.fork()
@@ -199,13 +199,13 @@ def fork(work: Callable[[], object]) -> int:
 
 
 FAULTS = (
-    Fault("parked three times", "the first ramps, the others move nothing", parked_again),
-    Fault("block of another user", "not believed, no output moves; parked without it", forged_block),
+    Fault("parked three times", "the first parking ramps, the others move nothing", parked_three_times),
+    Fault("block of another user", "refused, no output moves; parked without the block", forged_block),
     Fault("loop SIGKILL, no restart", "service parks and ends; parking again moves nothing",
-          parked_by_the_service_and_after_it, changes=WITHOUT_RESTART),
-    Fault("loop SIGKILL, then SIGTERM", "parked; parking again moves nothing", ended_while_it_parks),
-    Fault("log that nobody reads", "parked in time; lines lost, not seconds", full_pipe),
-    Fault("pre-filters of other lengths", "the loop goes on", other_filters),
-    Fault("setpoint while it stands still", "refused and not applied later", refused_setpoint, changes=PATIENT),
-    Fault("parking SIGKILL, again and again", "gone on with where it was", parking_that_dies),
+          parked_without_restart, changes=WITHOUT_RESTART),
+    Fault("loop SIGKILL, then SIGTERM", "parked; parking again moves nothing", service_ended_while_parking),
+    Fault("log that nobody reads", "parked in time; only lines of the log are lost", full_pipe),
+    Fault("pre-filters of other lengths", "the loop goes on", filter_lengths_change),
+    Fault("setpoint while it stands still", "refused, and not applied later", setpoint_refused, changes=PATIENT),
+    Fault("parking SIGKILL, again and again", "each parking continues from the present output", parking_killed),
 )  # fmt: skip

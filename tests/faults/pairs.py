@@ -1,9 +1,9 @@
-"""Two faults at once, at random. The board judges every write, and where the output is in the end.
+"""Two random disturbances at once. The board's record shows every write and the last output.
 
-Each sequence begins with a service that drives. Two faults come within 50 ms of each other, what can be undone is
-undone half a second later, whoever is left is told to end, and `rtloop park` is called as the unit would, twice. No
-write may be further from the one before than one step of the ramp, the output must be safe in time, and must not move
-once it is.
+Each sequence begins with a service that drives. Two disturbances come within 50 ms of each other and are reverted half
+a second later, where possible. Then the service gets SIGTERM, and `rtloop park` is called twice, as the systemd unit
+does. No write may differ from the one before by more than a step of the ramp; the output must be safe in time, and must
+not move afterwards.
 """
 
 from __future__ import annotations
@@ -26,21 +26,21 @@ from rtloop.hil import board
 from tests.faults.bench import Bench
 from tests.faults.evidence import TIMEOUT_S, wait_for
 
-WITHIN_S, UNDONE_S = 0.05, 0.5
+WITHIN_S, REVERTED_S = 0.05, 0.5
 SAFE_MS = 8000.0
-"""At the worst: a heartbeat, a start of `park`, and its patience with a loop that stands still."""
+"""Bound from the second disturbance's end to 0 V: heartbeat time-out, start of `park`, its wait for a stopped loop."""
 
 
-class Stroke(NamedTuple):
-    """A fault, and what takes it back."""
+class Disturbance(NamedTuple):
+    """A fault or a request, and its reversal where there is one."""
 
     name: str
-    strike: Callable[[Bench], object]
-    undo: Callable[[Bench], object] = lambda bench: None
+    apply: Callable[[Bench], object]
+    revert: Callable[[Bench], object] = lambda bench: None
 
 
-def to(role: str, number: signal.Signals) -> Callable[[Bench], None]:
-    """A signal to one of the bench's processes, if it still lives."""
+def send_signal(role: str, number: signal.Signals) -> Callable[[Bench], None]:
+    """Return a function that sends a signal to the bench's process `role`, if it still lives."""
 
     def send(bench: Bench) -> None:
         with suppress(ProcessLookupError):
@@ -50,55 +50,58 @@ def to(role: str, number: signal.Signals) -> Callable[[Bench], None]:
     return send
 
 
-def ask(path: str, body: dict) -> Callable[[Bench], None]:
-    """A request that may be refused, or not answered at all; nobody waits for it."""
+def post(path: str, body: dict) -> Callable[[Bench], None]:
+    """Return a function that posts a request in a thread; the request may be refused or stay unanswered."""
 
-    def post(bench: Bench) -> None:
+    def send(bench: Bench) -> None:
         with suppress(RtloopError):
             bench.client.post(path, body)
 
-    return lambda bench: threading.Thread(target=post, args=(bench,), daemon=True).start()
+    return lambda bench: threading.Thread(target=send, args=(bench,), daemon=True).start()
 
 
-def taps(count: int) -> Callable[[Bench], None]:
-    """Another pre-filter."""
-    return ask("/tune", {"axis": "x", "section": "prefilter", "values": {"taps": [1 / count] * count}})
+def change_filter(count: int) -> Callable[[Bench], None]:
+    """Return a function that posts a pre-filter of `count` taps."""
+    return post("/tune", {"axis": "x", "section": "prefilter", "values": {"taps": [1 / count] * count}})
 
 
 def board_fault(fault: int) -> Callable[[Bench], None]:
-    """A fault of the board."""
+    """Return a function that sets a fault of the board."""
     return lambda bench: bench.ask_for(fault)
 
 
-STROKES = (
-    *(Stroke(f"{role} SIGKILL", to(role, signal.SIGKILL)) for role in ("rt", "service", "recorder")),
-    *(Stroke(f"{role} SIGSTOP", to(role, signal.SIGSTOP), to(role, signal.SIGCONT))
+DISTURBANCES = (
+    *(Disturbance(f"{role} SIGKILL", send_signal(role, signal.SIGKILL)) for role in ("rt", "service", "recorder")),
+    *(Disturbance(f"{role} SIGSTOP", send_signal(role, signal.SIGSTOP), send_signal(role, signal.SIGCONT))
       for role in ("rt", "service", "recorder")),
-    Stroke("SIGTERM", to("service", signal.SIGTERM)),
-    Stroke("SIGHUP", to("service", signal.SIGHUP)),
-    Stroke("park", lambda bench: bench.rtloop("park", bench.config)),
-    Stroke("input frozen", board_fault(board.FROZEN_INPUT), board_fault(board.NO_FAULT)),
-    Stroke("output stuck", board_fault(board.STUCK_OUTPUT), board_fault(board.NO_FAULT)),
-    Stroke("128 taps", taps(128)),
-    Stroke("3 taps", taps(3)),
-    Stroke("mode raw", ask("/mode", {"mode": "raw"})),
-    Stroke("setpoint", ask("/setpoint", {"axis": "x", "value": -20.0})),
-    Stroke("trip", ask("/tune", {"axis": "x", "section": "interlocks", "values": {"position_um": 5.0}})),
-    Stroke("stop", ask("/stop", {})),
-    Stroke("reset", ask("/reset", {})),
+    Disturbance("SIGTERM", send_signal("service", signal.SIGTERM)),
+    Disturbance("SIGHUP", send_signal("service", signal.SIGHUP)),
+    Disturbance("park", lambda bench: bench.rtloop("park", bench.config)),
+    Disturbance("input frozen", board_fault(board.FROZEN_INPUT), board_fault(board.NO_FAULT)),
+    Disturbance("output stuck", board_fault(board.STUCK_OUTPUT), board_fault(board.NO_FAULT)),
+    Disturbance("128 taps", change_filter(128)),
+    Disturbance("3 taps", change_filter(3)),
+    Disturbance("mode raw", post("/mode", {"mode": "raw"})),
+    Disturbance("setpoint", post("/setpoint", {"axis": "x", "value": -20.0})),
+    Disturbance("trip", post("/tune", {"axis": "x", "section": "interlocks", "values": {"position_um": 5.0}})),
+    Disturbance("stop", post("/stop", {})),
+    Disturbance("reset", post("/reset", {})),
 )  # fmt: skip
 
 
 def sequence(bench: Bench, chance: random.Random) -> tuple[str, float]:
-    """Two strokes and their end; what they were, and ms until the output was safe. Raises AssertionError."""
-    first, second = chance.sample(STROKES, 2)
+    """Apply two random disturbances and end the service.
+
+    Return the names of the disturbances and the ms until the output was safe. Raises AssertionError for a broken bound.
+    """
+    first, second = chance.sample(DISTURBANCES, 2)
     delay_s = chance.uniform(0.0, WITHIN_S)
-    bench.strike(lambda: first.strike(bench))
+    bench.strike(lambda: first.apply(bench))
     time.sleep(delay_s)
-    second.strike(bench)
-    time.sleep(UNDONE_S)
-    for stroke in (first, second):
-        stroke.undo(bench)
+    second.apply(bench)
+    time.sleep(REVERTED_S)
+    for disturbance in (first, second):
+        disturbance.revert(bench)
     bench.strike()
     assert bench.service is not None
     if bench.service.poll() is None:
@@ -108,37 +111,37 @@ def sequence(bench: Bench, chance: random.Random) -> tuple[str, float]:
     took_ms = bench.await_safe(SAFE_MS) if bench.seen().moved_ns > bench.struck_ns else 0.0
     moved_ns = bench.seen().moved_ns
     assert bench.rtloop("park", bench.config).wait(TIMEOUT_S) == 0
-    assert bench.seen().moved_ns == moved_ns, "it moved again"
+    assert bench.seen().moved_ns == moved_ns, "the output moved again"
     assert bench.seen().last_v == 0.0, f"the output is at {bench.seen().last_v} V"
     return f"{first.name}, after {1000 * delay_s:.0f} ms {second.name}", took_ms
 
 
 def main() -> int:
-    """Exit code 0 if every sequence holds."""
+    """Run the sequences and print a line for each; return exit code 0 if none failed."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--sequences", type=int, default=100)
     parser.add_argument("--seed", type=int, default=1)
-    given = parser.parse_args()
-    chance, failed = random.Random(given.seed), 0
+    arguments = parser.parse_args()
+    chance, failed = random.Random(arguments.seed), 0
     with tempfile.TemporaryDirectory(prefix="rtloop-pairs-") as name, Bench(Path(name), strict=True) as bench:
         largest_v = 0.0
-        for number in range(given.sequences):
+        for number in range(arguments.sequences):
             if number:
                 bench.start_service()
             bench.await_drive()
             try:
-                said, took_ms = sequence(bench, chance)
+                description, took_ms = sequence(bench, chance)
                 problems = bench.seen().problems(bench.bounds)
                 assert not problems, "; ".join(problems)
                 verdict = f"safe after {took_ms:.0f} ms"
             except AssertionError as error:
-                said, verdict, failed = "?", f"FAILS: {error}", failed + 1
+                description, verdict, failed = "?", f"FAILS: {error}", failed + 1
                 for name in ("largest_step_v", "largest_window_v"):
                     bench.memory.evidence[name] = 0.0
             largest_v = max(largest_v, bench.seen().largest_window_v)
-            print(f"{number + 1:4} {said}: {verdict}", flush=True)
+            print(f"{number + 1:4} {description}: {verdict}", flush=True)
         steps = f"at most {largest_v:.3f} V within 1 ms of {bench.bounds.window_v:.3f}"
-        print(f"seed {given.seed}: {given.sequences} sequences, {failed} failed; {steps}")
+        print(f"seed {arguments.seed}: {arguments.sequences} sequences, {failed} failed; {steps}")
     return int(failed > 0)
 
 

@@ -1,7 +1,7 @@
 """A third party's driver in plain Python, and its card: a small file that outlives every process.
 
-The card holds what was written last, keeps what its output did, and brings about the fault that a test asks for.
-It is copied into a package of its own and found there by its entry point.
+The card holds the last voltage written, a record of its output, and the fault that a test has set. This module is
+copied into a separate package, where its entry point declares it.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ MEMORY = np.dtype(
      ("highest_v", np.float64), ("largest_step_v", np.float64), ("largest_window_v", np.float64),
      ("moved_ns", np.int64), ("levels", np.int64), ("level_v", np.float64, LEVELS), ("level_ns", np.int64, LEVELS)]
 )  # fmt: skip
-"""`level_v` and `level_ns`: voltages that the output had last, number i at i modulo LEVELS, and since when."""
+"""`level_v` and `level_ns` are the last voltages of the output and their times; number i stands at i modulo LEVELS."""
 UM_PER_V, LAG = 4.3, 0.1
 
 
@@ -48,7 +48,7 @@ class PlainCard(PythonDriver):
         memory, fault = self.memory, int(self.memory["fault"])
         memory["position_um"] += LAG * (UM_PER_V * memory["last_v"] - memory["position_um"])
         if fault in (NAN, RAISE_IN_READ, BLOCK_50_MS):
-            memory["fault"] = NONE  # these happen once
+            memory["fault"] = NONE  # these faults happen once
         if fault == RAISE_IN_READ:
             raise OSError("the card does not answer")
         if fault == BLOCK_50_MS:
@@ -66,13 +66,13 @@ class PlainCard(PythonDriver):
         if volts[0] == memory["last_v"]:
             return
         memory["moved_ns"] = time.monotonic_ns()
-        self._judge(volts[0], int(memory["moved_ns"]))
+        self._record_level(volts[0], int(memory["moved_ns"]))
         memory["lowest_v"] = min(memory["lowest_v"], volts[0])
         memory["highest_v"] = max(memory["highest_v"], volts[0])
         memory["last_v"] = volts[0]
 
-    def _judge(self, volts: float, now_ns: int) -> None:
-        """Compare with the voltages of the last millisecond; one is left when the next begins."""
+    def _record_level(self, volts: float, now_ns: int) -> None:
+        """Update the largest step, and the largest change from a level of the last millisecond, with a new level."""
         memory, newest = self.memory, int(self.memory["levels"])
         memory["largest_step_v"] = max(memory["largest_step_v"], abs(volts - memory["last_v"]))
         for i in range(newest, max(newest - LEVELS, -1), -1):
@@ -87,7 +87,7 @@ class PlainCard(PythonDriver):
 
 
 def install(folder) -> None:
-    """Put this driver into `folder` as a package that declares it."""
+    """Write this driver and its entry point into `folder` as an installed package, and an empty card."""
     from pathlib import Path
 
     (folder / "plain_card.py").write_text(Path(__file__).read_text())

@@ -1,4 +1,4 @@
-"""A small C library put in front of libc, for the processes of one bench alone."""
+"""Build of a small C library that is put in front of libc for the processes of one bench."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from pathlib import Path
 from tests.faults.fault import NotPossible
 
 
-def preloaded(folder: Path, name: str) -> dict[str, str]:
-    """The environment that puts NAME.c of this folder in front of libc. Raises NotPossible without a compiler."""
+def preload(folder: Path, name: str) -> dict[str, str]:
+    """Compile NAME.c and return the environment that preloads it. Raises NotPossible without a C compiler."""
     compiler = shutil.which("cc")
     if compiler is None:
         raise NotPossible(f"no C compiler for {name}.c")

@@ -1,6 +1,6 @@
-"""Recovery by policy: each cause of a trip under each policy, and what comes between a trip and the return.
+"""Recovery by policy: each cause of a trip under each policy, and requests and faults between a trip and the return.
 
-A row that recovers reads its steps from the recordings; a row that must not sees the output stand still.
+A row that recovers compares the steps in the recordings; a row that must not recover watches the output.
 """
 
 from __future__ import annotations
@@ -17,38 +17,38 @@ from rtloop.hil import board
 from tests.faults import plain_card
 from tests.faults.bench import Bench
 from tests.faults.evidence import wait_for
-from tests.faults.fault import Fault, Measured
+from tests.faults.fault import Fault, Outcome
 from tests.faults.hardware import SHIFTED
-from tests.faults.laws import WITH_IT, beside_the_configuration
+from tests.faults.laws import WITH_ENDLESS_LAW, endless_law_file
 from tests.laws.failing import ENDLESS_UM
 
 QUICK = "wait_s = 0.2\nconfirmations = 3\nconfirmation_s = 0.1\n"
-EVERY = 'causes = ["stale", "driver", "late", "heartbeat"]\n'
+ALL_CAUSES = 'causes = ["stale", "driver", "late", "heartbeat"]\n'
 CONFIRMED_S = 0.2 + 3 * 0.1
 STANDS_STILL_S = 3.0
-"""A row that must not recover is watched for so long: five times the time that a recovery takes."""
+"""Time in s for which a row that must not recover is watched: more than five times that of a recovery."""
 SHORT_AGE = ("sample_age_us = 400000.0", "sample_age_us = 100000.0")
 LATE = ("sample_age_us = 400000.0", "sample_age_us = 400000.0\nlate_us = 10000.0\nlate_ticks = 1")
 LATE_S = 0.025
 SLOW_RETURN = ("[axis.limits]\n", "[axis.limits]\nbump_s = 0.1\n")
-"""A return takes ten times as long as a bump: a second, so that a busy host can act in the middle of it."""
+"""A return takes ten times `bump_s`: one second, in which a request arrives in time even on a busy host."""
 
 
 def policy(text: str = "", before: str = "") -> tuple[str, str]:
-    """A change of the configuration: [service.recover] with these keys, and keys of [service] before it."""
+    """Return a change of the configuration: tables [service.recover] with lines `text`, [service] with `before`."""
     return "[recording]", f"[service]\n{before}[service.recover]\n{QUICK}{text}[recording]"
 
 
 def recovery_steps(bench: Bench) -> list[str]:
-    """Steps of the recoveries that the recordings hold, in order, once the service has ended."""
-    names = sorted((bench.folder / "recordings").glob("*.mcap"), key=lambda path: path.stat().st_mtime_ns)
-    events = [event for path in names for event in rtloop.load(path).events]
+    """Return the steps of all recoveries in the recordings, in order; the service must have ended."""
+    paths = sorted((bench.folder / "recordings").glob("*.mcap"), key=lambda path: path.stat().st_mtime_ns)
+    events = [event for path in paths for event in rtloop.load(path).events]
     return [event["what"]["step"] for event in events if event["kind"] == "recovery"]
 
 
 def await_recovered(bench: Bench, count: int = 1) -> None:
-    """Wait for this many returns, with the loop closed and driving, and with no trip or fault."""
-    wait_for(lambda: bench.log().count(": recovered") >= count, f"return {count}; {bench.status().get('recovery')}")
+    """Wait for `count` completed recoveries, and for a closed loop that drives, without trip or fault."""
+    wait_for(lambda: bench.log().count(": recovered") >= count, f"recovery {count}; {bench.status().get('recovery')}")
     if not bench._follows_the_present_loop():
         bench.follow()
     report = bench.await_state("running")
@@ -57,7 +57,7 @@ def await_recovered(bench: Bench, count: int = 1) -> None:
 
 
 def stays_safe(bench: Bench, seconds: float = STANDS_STILL_S) -> None:
-    """The output is at 0 V, does not move for a while, and the service stays tripped."""
+    """Wait for 0 V, then require that output and service stay at 0 V and tripped for `seconds`."""
     wait_for(lambda: bench.seen().last_v == 0.0, "a safe output")
     moved_ns, returns = bench.seen().moved_ns, bench.log().count(": recovered")
     time.sleep(seconds)
@@ -69,7 +69,7 @@ def stays_safe(bench: Bench, seconds: float = STANDS_STILL_S) -> None:
 
 
 def await_return(bench: Bench) -> None:
-    """Wait until the output is on its way back."""
+    """Wait until a recovery drives the output back."""
     driving = lambda: abs(bench.seen().last_v) > 0.5 and bench.status()["recovery"]["state"] == "returning"
     wait_for(driving, "a return", poll_s=0.002)
 
@@ -78,6 +78,7 @@ Strike = Callable[[Bench], None]
 
 
 def board_sleeps(bench: Bench) -> None:
+    """Stop the board until the loop trips by a stale input, then let the board run again."""
     assert bench.board is not None
     process = bench.board
     bench.strike(lambda: process.send_signal(signal.SIGSTOP))
@@ -86,10 +87,12 @@ def board_sleeps(bench: Bench) -> None:
 
 
 def card_fails(fault: int) -> Strike:
+    """Return a function that sets a fault of the card."""
     return lambda bench: bench.strike(lambda: bench.ask_for(fault))
 
 
 def loop_sleeps(bench: Bench) -> None:
+    """Stop the loop for LATE_S, which trips it as late."""
     loop = bench.pid("rt")
 
     def sleep() -> None:
@@ -102,6 +105,7 @@ def loop_sleeps(bench: Bench) -> None:
 
 
 def service_sleeps(bench: Bench) -> None:
+    """Stop the service until the loop has parked, then let the service run again."""
     service = bench.pid("service")
     bench.strike(lambda: os.kill(service, signal.SIGSTOP))
     wait_for(lambda: bench.seen().last_v == 0.0, "a safe output")
@@ -109,7 +113,7 @@ def service_sleeps(bench: Bench) -> None:
 
 
 def narrow(key: str, value: float, cause: str) -> Strike:
-    """An interlock narrower than what the loop does now."""
+    """Return a function that sets an interlock's limit below the present signal, and waits for the trip."""
 
     def strike(bench: Bench) -> None:
         body = {"axis": "x", "section": "interlocks", "values": {key: value}}
@@ -120,6 +124,8 @@ def narrow(key: str, value: float, cause: str) -> Strike:
 
 
 def board_fault(fault: int) -> Strike:
+    """Return a function that sets a fault of the board until the loop trips."""
+
     def strike(bench: Bench) -> None:
         bench.strike(lambda: bench.ask_for(fault))
         bench.await_state("tripped")
@@ -129,53 +135,61 @@ def board_fault(fault: int) -> Strike:
 
 
 def oscillates(bench: Bench) -> None:
+    """Wait for the trip of a loop that oscillates from its start."""
     bench.await_state("tripped", "oscillation")
 
 
 def loop_dies(bench: Bench) -> None:
+    """Kill the loop and wait for its replacement."""
     bench.strike(lambda: os.kill(bench.pid("rt"), signal.SIGKILL))
     bench.await_restart()
 
 
 def law_hangs(bench: Bench) -> None:
+    """Set the setpoint at which the law never returns, and wait for another loop."""
     with suppress(RtloopError):
         bench.strike(lambda: bench.client.post("/setpoint", {"axis": "x", "value": ENDLESS_UM + 1.0}))
     bench.await_restart()
 
 
 def enable_opens(bench: Bench) -> None:
+    """Open the enable input until the loop trips."""
     bench.strike(lambda: bench.ask_for(plain_card.ENABLE_OPEN))
     bench.await_state("tripped", "enable")
     bench.ask_for(plain_card.NONE)
 
 
-def recovers(strike: Strike, *steps: str, new_loop: bool = False):
-    def inject(bench: Bench) -> Measured:
+def expect_recovery(strike: Strike, *steps: str, new_loop: bool = False):
+    """Return a fault after which the service must recover by `steps`; with `new_loop`, in a new loop."""
+
+    def inject(bench: Bench) -> Outcome:
         strike(bench)
         if new_loop:
             bench.await_restart()
         await_recovered(bench)
         bench.stop()
-        seen = [step for step in recovery_steps(bench) if step != "unsound"]
-        assert seen == list(steps or ("begun", "confirmed", "returning", "recovered")), seen
-        return Measured()
+        events = [step for step in recovery_steps(bench) if step != "unsound"]
+        assert events == list(steps or ("begun", "confirmed", "returning", "recovered")), events
+        return Outcome()
 
     return inject
 
 
-def stays(strike: Strike, new_loop: bool = False):
-    def inject(bench: Bench) -> Measured:
+def expect_latched(strike: Strike, new_loop: bool = False):
+    """Return a fault after which the trip must stay latched; with `new_loop`, in a new loop."""
+
+    def inject(bench: Bench) -> Outcome:
         strike(bench)
         if new_loop:
             bench.await_restart()
         stays_safe(bench)
-        return Measured()
+        return Outcome()
 
     return inject
 
 
-def latches_after_two(bench: Bench) -> Measured:
-    """Two trips are recovered from; the third within the hour stays latched, and a reset makes it go on."""
+def latches_after_two(bench: Bench) -> Outcome:
+    """Trip three times within an hour: the service recovers twice, then stays latched until a reset."""
     for count in (1, 2):
         board_sleeps(bench)
         await_recovered(bench, count)
@@ -189,13 +203,13 @@ def latches_after_two(bench: Bench) -> Measured:
     assert report["left"] == 0, report
     assert "max_per_hour" in report["reason"], report
     bench.recover()
-    return Measured(note=report["reason"])
+    return Outcome(note=report["reason"])
 
 
 def client_takes_over(command: str, in_state: str):
-    """A stop or a reset in the middle of a recovery: the output does not move again."""
+    """Return a fault that posts a stop or a reset while the recovery is `in_state`: the recovery must end."""
 
-    def inject(bench: Bench) -> Measured:
+    def inject(bench: Bench) -> Outcome:
         assert bench.board is not None
         process = bench.board
         bench.strike(lambda: process.send_signal(signal.SIGSTOP))
@@ -214,13 +228,13 @@ def client_takes_over(command: str, in_state: str):
         assert bench.seen().moved_ns == moved_ns, f"the output moved; {bench.log()[-800:]}"
         assert ": recovered" not in bench.log()
         assert ": ended" in bench.log()
-        return Measured()
+        return Outcome()
 
     return inject
 
 
-def trips_in_the_middle(bench: Bench) -> Measured:
-    """The board sleeps again while the output comes back: that is another recovery."""
+def trips_in_the_middle(bench: Bench) -> Outcome:
+    """Stop the board again while the output returns: the service counts a second recovery."""
     assert bench.board is not None
     board_sleeps(bench)
     await_return(bench)
@@ -229,20 +243,20 @@ def trips_in_the_middle(bench: Bench) -> Measured:
     assert bench.status()["recovery"]["left"] == 1, bench.status()["recovery"]
     bench.stop()
     assert recovery_steps(bench).count("begun") == 2
-    return Measured()
+    return Outcome()
 
 
-def service_ends(bench: Bench) -> Measured:
-    """SIGTERM while the readings are confirmed: the output does not move, the exit code is 0."""
+def service_ends(bench: Bench) -> Outcome:
+    """Send SIGTERM while the service confirms the readings: the output does not move, the exit code is 0."""
     board_sleeps(bench)
     moved_ns = wait_for(lambda: bench.seen().last_v == 0.0 and bench.seen().moved_ns, "a safe output")
     assert bench.stop() == 0
     assert bench.seen().moved_ns == moved_ns, "the output moved"
-    return Measured()
+    return Outcome()
 
 
-def another_configuration(bench: Bench) -> Measured:
-    """The file is replaced and reloaded in the middle: the law is another, and the trip stays latched."""
+def another_configuration(bench: Bench) -> Outcome:
+    """Reload a changed configuration during a recovery: the trip stays latched."""
     assert bench.board is not None
     process = bench.board
     bench.strike(lambda: process.send_signal(signal.SIGSTOP))
@@ -252,11 +266,11 @@ def another_configuration(bench: Bench) -> Measured:
     process.send_signal(signal.SIGCONT)
     stays_safe(bench)
     assert "changed" in bench.status()["recovery"]["reason"], bench.status()["recovery"]
-    return Measured()
+    return Outcome()
 
 
-def card_flaps(bench: Bench) -> Measured:
-    """The card's read fails again and again: three recoveries are begun, then the trip stays latched; never a drive."""
+def card_flaps(bench: Bench) -> Outcome:
+    """Make the card's read fail in each new loop: after three recoveries the trip stays latched."""
     bench.ask_for(plain_card.RAISE_IN_READ)
     for count in range(1, 5):
         wait_for(
@@ -270,14 +284,14 @@ def card_flaps(bench: Bench) -> Measured:
         bench.follow()
     stays_safe(bench)
     assert bench.status()["recovery"]["left"] == 0, bench.status()["recovery"]
-    return Measured(note=f"{bench.status()['restarts']} loops, the service goes on")
+    return Outcome(note=f"{bench.status()['restarts']} loops, the service runs on")
 
 
 READ, WRITE = card_fails(plain_card.RAISE_IN_READ), card_fails(plain_card.RAISE_IN_WRITE)
 SINE = ("[recording]", "[service.depolarise]\namplitude_v = 0.8\nfrequency_hz = 10.0\ncycles = 5\n[recording]")
 DEPOLARISED = ("begun", "confirmed", "depolarised", "returning", "recovered")
-WITHOUT = ("[recording]", "[service]\n[recording]")
-NEVER = (
+WITHOUT_POLICY = ("[recording]", "[service]\n[recording]")
+NEVER_RECOVERED = (
     ("position", narrow("position_um", 10.0, "position"), ()),
     ("sensor_range", narrow("sensor_max_v", 1.0, "sensor_range"), ()),
     ("frozen", board_fault(board.FROZEN_INPUT), (("frozen_ticks = 2000", "frozen_ticks = 100"),)),
@@ -286,39 +300,39 @@ NEVER = (
 )
 
 
-def _outside(name: str, strike: Strike, allowed: str, forbidden: str, *changes: tuple[str, str], **more) -> list[Fault]:  # type: ignore[no-untyped-def]
-    """Rows of one outside cause: allowed, not allowed by the policy, and without a policy."""
+def _rows(name: str, strike: Strike, allowed: str, forbidden: str, *changes: tuple[str, str], **more) -> list[Fault]:  # type: ignore[no-untyped-def]
+    """Return the rows of one cause outside the law: allowed by the policy, not allowed by it, and without a policy."""
     new_loop = more.pop("new_loop", False)
     return [
-        Fault(f"recover: {name}, allowed", "confirmed, returns by ramp", recovers(strike, new_loop=new_loop),
+        Fault(f"recover: {name}, allowed", "confirmed, returns by ramp", expect_recovery(strike, new_loop=new_loop),
               changes=(policy(allowed), *changes), **more),
-        Fault(f"recover: {name}, not in causes", "stays tripped", stays(strike, new_loop),
+        Fault(f"recover: {name}, not in causes", "stays tripped", expect_latched(strike, new_loop),
               changes=(policy(forbidden), *changes), **more),
-        Fault(f"recover: {name}, no policy", "stays tripped", stays(strike, new_loop), changes=(WITHOUT, *changes),
-              **more),
+        Fault(f"recover: {name}, no policy", "stays tripped", expect_latched(strike, new_loop),
+              changes=(WITHOUT_POLICY, *changes), **more),
     ]  # fmt: skip
 
 
 FAULTS = (
-    *_outside("stale", board_sleeps, "", 'causes = ["driver", "late", "heartbeat"]\n', SHORT_AGE),
-    *_outside("late", loop_sleeps, "", 'causes = ["stale", "driver", "heartbeat"]\n', LATE),
-    *_outside("heartbeat", service_sleeps, EVERY, "", new_loop=True),
-    *_outside("driver read", READ, "", 'causes = ["stale", "late", "heartbeat"]\n', card=True, new_loop=True),
-    *_outside("driver write", WRITE, "", 'causes = ["stale", "late", "heartbeat"]\n', card=True, new_loop=True),
+    *_rows("stale", board_sleeps, "", 'causes = ["driver", "late", "heartbeat"]\n', SHORT_AGE),
+    *_rows("late", loop_sleeps, "", 'causes = ["stale", "driver", "heartbeat"]\n', LATE),
+    *_rows("heartbeat", service_sleeps, ALL_CAUSES, "", new_loop=True),
+    *_rows("driver read", READ, "", 'causes = ["stale", "late", "heartbeat"]\n', card=True, new_loop=True),
+    *_rows("driver write", WRITE, "", 'causes = ["stale", "late", "heartbeat"]\n', card=True, new_loop=True),
     *(
-        Fault(f"recover: {name}, every cause allowed", "stays tripped", stays(strike),
-              changes=(policy(EVERY), *changes))
-        for name, strike, changes in NEVER
+        Fault(f"recover: {name}, every cause allowed", "stays tripped", expect_latched(strike),
+              changes=(policy(ALL_CAUSES), *changes))
+        for name, strike, changes in NEVER_RECOVERED
     ),
-    Fault("recover: oscillation, every cause allowed", "stays tripped", stays(oscillates),
-          changes=(policy(EVERY), *SHIFTED), drives=False),
-    Fault("recover: non_finite, every cause allowed", "stays tripped", stays(card_fails(plain_card.NAN)),
-          changes=(policy(EVERY),), card=True),
-    Fault("recover: enable, every cause allowed", "stays tripped", stays(enable_opens), changes=(policy(EVERY),),
-          card=True),
-    Fault("recover: law never ends, every cause allowed", "stays tripped", stays(law_hangs),
-          changes=(policy(EVERY), *WITH_IT), around=beside_the_configuration),
-    Fault("recover: stale, depolarises", "a sine, then returns by ramp", recovers(board_sleeps, *DEPOLARISED),
+    Fault("recover: oscillation, every cause allowed", "stays tripped", expect_latched(oscillates),
+          changes=(policy(ALL_CAUSES), *SHIFTED), drives=False),
+    Fault("recover: non_finite, every cause allowed", "stays tripped", expect_latched(card_fails(plain_card.NAN)),
+          changes=(policy(ALL_CAUSES),), card=True),
+    Fault("recover: enable, every cause allowed", "stays tripped", expect_latched(enable_opens),
+          changes=(policy(ALL_CAUSES),), card=True),
+    Fault("recover: law never ends, every cause allowed", "stays tripped", expect_latched(law_hangs),
+          changes=(policy(ALL_CAUSES), *WITH_ENDLESS_LAW), around=endless_law_file),
+    Fault("recover: stale, depolarises", "a sine, then returns by ramp", expect_recovery(board_sleeps, *DEPOLARISED),
           changes=(SHORT_AGE, ("[recording]", f"[service.recover]\n{QUICK}depolarise = true\n" + SINE[1]))),
     Fault("recover: third trip of two an hour", "latched until reset", latches_after_two,
           changes=(policy("max_per_hour = 2\n"), SHORT_AGE)),

@@ -1,4 +1,4 @@
-/* A disk that stands still for ten seconds, once: at the first fsync of a recording by any process that preloads this. */
+/* Preloaded library: the first fsync of a recording by any process that preloads it takes ten seconds longer. */
 #define _GNU_SOURCE
 #include <dlfcn.h>
 #include <fcntl.h>
@@ -7,7 +7,8 @@
 #include <string.h>
 #include <unistd.h>
 
-static int of_a_recording(int fd)
+/* Whether the descriptor is that of an unfinished recording. */
+static int is_recording(int fd)
 {
     char link[64], path[4096];
     snprintf(link, sizeof link, "/proc/self/fd/%d", fd);
@@ -23,7 +24,7 @@ int fsync(int fd)
 {
     int (*real)(int) = dlsym(RTLD_NEXT, "fsync");
     const char *marker = getenv("STALLED_DISK");
-    if (marker && of_a_recording(fd)) {
+    if (marker && is_recording(fd)) {
         int first = open(marker, O_CREAT | O_EXCL | O_WRONLY | O_CLOEXEC, 0600);
         if (first >= 0) {
             close(first);

@@ -1,4 +1,4 @@
-/* A wall clock that is an hour wrong in every other tenth of a second, for the processes that preload this. */
+/* Preloaded library: in every other tenth of a second the wall clock is an hour fast or slow. */
 #define _GNU_SOURCE
 #include <dlfcn.h>
 #include <sys/time.h>

@@ -1,4 +1,7 @@
-"""The evidence of the fault table: what a card in plain Python saw, what the host took, what a configuration allows."""
+"""Figures of the fault table: the plain card's largest step and window, overlapping stalls of the host, allowed steps.
+
+The card's figures are compared with a search over all pairs of writes; the others with numbers worked out by hand.
+"""
 
 from __future__ import annotations
 
@@ -36,6 +39,6 @@ def test_spans_that_overlap_count_once_and_only_between_two_times():
 
 
 def test_a_configuration_allows_steps_of_its_ramp_and_one_write_held_up():
-    bounds = Bounds.of(on_a_board(Path("/nowhere")), 0.001)
+    bounds = Bounds.from_text(on_a_board(Path("/nowhere")), 0.001)
     assert (bounds.rate_hz, bounds.step_v) == (4000.0, 0.125 + 0.001)
     assert bounds.window_v == pytest.approx((4 + 2) * 0.125 + 0.001)

@@ -1,4 +1,4 @@
-"""The mistakes that `make soak NAME=fault-mutants` plants are still mistakes of the code as it is."""
+"""Each mistake that `make soak NAME=fault-mutants` plants still replaces a text of the present code."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from tests.faults.mutants import MUTANTS, Mutant
 
 @pytest.mark.parametrize("mutant", MUTANTS, ids=lambda mutant: mutant.name)
 def test_the_text_to_be_replaced_is_there_once(mutant: Mutant) -> None:
-    found = importlib.util.find_spec(mutant.module)
-    assert found is not None
-    assert found.origin is not None
-    assert Path(found.origin).read_text().count(mutant.old) == 1
+    spec = importlib.util.find_spec(mutant.module)
+    assert spec is not None
+    assert spec.origin is not None
+    assert Path(spec.origin).read_text().count(mutant.old) == 1

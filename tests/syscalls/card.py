@@ -1,6 +1,6 @@
-"""A card that is a file: each write of an output is a system call, and the file holds all of them in order.
+"""A card in a file: each write of an output is a system call that appends a voltage to the file.
 
-It cannot be read back, and leaves its output alone when it is opened.
+Its outputs cannot be read back. Opening the card does not change its output.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ class FileCard(PythonDriver):
             raise DriverError(f"{self.options.file}: {error.strerror}") from None
 
     def outputs_v(self) -> None:
-        """Unknown."""
+        """Return None: the outputs cannot be read back."""
 
     def read(self) -> tuple[float]:
         return (0.0,)
@@ -56,5 +56,5 @@ class FileCard(PythonDriver):
 
 
 def written_v(path: Path) -> list[float]:
-    """All that was written to the card's output, in order."""
+    """Return all voltages written to the card's output, in order."""
     return [value for (value,) in struct.iter_unpack("<d", path.read_bytes())]

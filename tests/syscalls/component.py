@@ -1,4 +1,4 @@
-"""A component under test: its work, done in a process of its own, and a judge who comes after it."""
+"""A component under test: its work in a separate traced process, and the check by the next process."""
 
 from __future__ import annotations
 
@@ -12,55 +12,55 @@ from tests.syscalls.kinds import RETRIED
 from tests.syscalls.traced import Call, EndedTooEarly, Injection, Outcome, Traced
 
 ATTEMPTS = 3
-"""Where the work ends before it is traced."""
+"""Number of attempts at a work that ends before its trace begins."""
 
 
 class Case:
-    """One try in `folder`, which is empty. Subclasses put there what the work needs, before anything is traced."""
+    """One try in the empty `folder`. Subclasses prepare the files of the work there, before the trace."""
 
     may_crash = False
-    """Whether an error that nobody catches counts as a death, after which somebody else goes on."""
+    """Whether an uncaught error counts as a death of the process, from which the next process must recover."""
 
     is_all_traced = True
-    """Whether all of the work is traced; otherwise `traced_work` says where its trace begins."""
+    """Whether all of the work is traced; otherwise `traced_work` calls `begin_here` where the trace begins."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
 
     def warm_up(self) -> None:
-        """Do the work in the parent, so that it imports then what is imported when it is first done."""
+        """Do the work in the parent, so that the child finds all modules imported."""
         self.work()
 
     def prepare_child(self) -> None:
-        """Make the child ready for the work, before it is traced."""
+        """Prepare the child for the work, before the trace."""
 
     def work(self) -> None:
-        """Do the work, in the traced process."""
+        """Do the work of the component."""
         raise NotImplementedError
 
     def traced_work(self, logs: Path) -> None:
-        """Do the work in the traced process, whose trace is in `logs`."""
+        """Do the work in the traced process, whose trace and marks are in `logs`."""
         self.work()
 
     def judge(self, outcome: Outcome) -> list[str]:
-        """Let the next hand do the same work, and return what is wrong then; in the parent."""
+        """Do the same work again in the parent, as the next process would, and return the problems."""
         raise NotImplementedError
 
     def traced(self, injection: Injection | None, logs: Path) -> Traced:
-        """The process that does the work, traced, before it begins."""
+        """Return the traced process that will do the work; `begin` starts it."""
         prepare = self.prepare_child if self.is_all_traced else None
         return Traced(lambda: self.traced_work(logs), logs, injection, prepare)
 
     def trace(self, injection: Injection | None, logs: Path) -> Outcome:
-        """Do the work in a traced process, from fork to end."""
+        """Do the work in a traced process and return its outcome."""
         traced = self.traced(injection, logs)
         traced.begin()
         return traced.wait()
 
 
 class Result(NamedTuple):
-    """What came of one injection; None in the place of an injection is the work as it is. `crashed`: by an error that
-    nobody caught, where that counts as a death."""
+    """Result of a try; `injection` None: of the undisturbed work. `reached`: the injection took place. `crashed`: an
+    uncaught error ended the work."""
 
     component: str
     injection: Injection | None
@@ -71,25 +71,25 @@ class Result(NamedTuple):
 
 
 class Component(NamedTuple):
-    """`case` makes a try in an empty folder; `share` is its part of a sample; `is_thinned`: see `kinds.thinned`.
-    `most` is how many of its calls are tried, evenly spread; None: all."""
+    """A component. `case` makes a try in an empty folder; `share` is its part of a sample; `is_thinned`: see
+    `kinds.thinned`. `max_calls` is the number of its calls that are tried, evenly spread; None: all."""
 
     name: str
     case: Callable[[Path], Case]
     share: int
     is_thinned: bool = False
-    most: int | None = None
+    max_calls: int | None = None
 
     def warm_up(self, folder: Path) -> None:
-        """As `Case.warm_up`, in a folder of its own."""
-        self.case(_empty(folder / "warm")).warm_up()
+        """Call `Case.warm_up` in a new folder below `folder`."""
+        self.case(_emptied(folder / "warm")).warm_up()
 
     def measure(self, folder: Path, injection: Injection | None = None) -> Result:
-        """Do the work with an injection, or without one, and judge what it leaves."""
+        """Do the work, with or without an injection, check the files and outputs afterwards, return the result."""
         logs = folder / "logs"
         logs.mkdir(exist_ok=True)
         for _ in range(ATTEMPTS):
-            case = self.case(_empty(folder / "case"))
+            case = self.case(_emptied(folder / "case"))
             with suppress(EndedTooEarly):
                 outcome = case.trace(injection, logs)
                 break
@@ -104,7 +104,8 @@ class Component(NamedTuple):
         return Result(self.name, injection, outcome.calls, outcome.reached, bool(outcome.crash), problems)
 
 
-def _empty(folder: Path) -> Path:
+def _emptied(folder: Path) -> Path:
+    """Create `folder` empty, and return it."""
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir()
     return folder

@@ -1,4 +1,4 @@
-"""The components, by name, and what they share."""
+"""All components by name, and the surroundings that they share."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from tests.syscalls.recordings import small_chunks
 from tests.syscalls.service import ImportingAService, StartingAService, StoppingAService
 
 IMPORTS = 20
-"""Calls of a service's imports that are tried: each takes some seconds, and they are thousands of one kind."""
+"""Number of calls in a service's imports that are tried: each try takes seconds, and thousands of calls are alike."""
 COMPONENTS = {
     component.name: component
     for component in (
@@ -30,7 +30,7 @@ COMPONENTS = {
         Component("parking", ParkingABoard, share=12),
         Component("parking-noted", ParkingTheNoted, share=6),
         Component("parking-card", ParkingACard, share=12),
-        Component("service-imports", ImportingAService, share=0, most=IMPORTS),
+        Component("service-imports", ImportingAService, share=0, max_calls=IMPORTS),
         Component("service-start", StartingAService, share=1, is_thinned=True),
         Component("service-stop", StoppingAService, share=1, is_thinned=True),
     )
@@ -39,7 +39,7 @@ COMPONENTS = {
 
 @contextmanager
 def surroundings() -> Iterator[None]:
-    """Small chunks, a card that is a file, and an environment that is put back."""
+    """Set small chunks and register the card in a file; restore environment variables and signal mask at the end."""
     mask = signal.pthread_sigmask(signal.SIG_BLOCK, ())
     with small_chunks(), patch.dict(BUILT_IN, {card.KIND: "tests.syscalls.card:FileCard"}), patch.dict(os.environ):
         try:

@@ -1,4 +1,4 @@
-"""Components that make, mend and remove files: recover, cut and quota."""
+"""Components that write, repair and remove files: recover, cut and quota."""
 
 from __future__ import annotations
 
@@ -22,42 +22,41 @@ from rtloop.supervision.quota import Quota
 from rtloop.supervision.recorder_keeper import RecorderKeeper
 from tests.recording.hand_made_loop import AXES, START_UNIX_NS, final_message, make_header, make_rows
 from tests.syscalls.component import Case
-from tests.syscalls.recordings import SNAPSHOT_TICKS, TICKS, problems_of, ticks_on_disk, write
+from tests.syscalls.recordings import SNAPSHOT_TICKS, TICKS, run_file_problems, ticks_on_disk, write
 from tests.syscalls.traced import Outcome
 
 NAME = "run.mcap"
 
 
 @cache
-def _base(finished: bool) -> Path:
-    """A finished recording, or the unfinished file of a killed recorder."""
+def _original(finished: bool) -> Path:
+    """Return the path of a finished recording, or of the unfinished file of a killed recorder."""
     path = Path(mkdtemp(prefix="rtloop-syscalls-")) / NAME
     write(path, finished=finished)
     return path if finished else path.with_name(f"{NAME}.part")
 
 
 class Recovering(Case):
-    """The supervisor's repair of what a recorder left: recovered, then the unfinished file removed."""
+    """The supervisor's repair of a killed recorder's file: it is recovered, then the unfinished file is removed."""
 
     def __init__(self, folder: Path) -> None:
         super().__init__(folder)
-        self.part = Path(shutil.copy(_base(False), folder))
-        self.flushed = ticks_on_disk([_base(False)])
+        self.part = Path(shutil.copy(_original(False), folder))
+        self.flushed = ticks_on_disk([_original(False)])
 
     def work(self) -> None:
-        keeper = cast(RecorderKeeper, SimpleNamespace(notes=[]))
-        RecorderKeeper._repair(keeper, self.part)
+        self._repair(self.part)
 
     def judge(self, outcome: Outcome) -> list[str]:
-        problems = [] if outcome.killed or self._is_recovered() or self.part.exists() else ["nothing is left"]
-        problems += problems_of(self._finished(), set(), whole=self.flushed)
+        problems = [] if outcome.killed or self._is_recovered() or self.part.exists() else ["both files are gone"]
+        problems += run_file_problems(self._finished(), set(), complete_ticks=self.flushed)
         for part in find_leftovers(self.folder):
-            self._once_more(part)
-        problems += problems_of(self._finished(), self.flushed, whole=self.flushed)
-        strange = {path.name for path in self.folder.iterdir()} - {NAME, f"{NAME}.part"}
-        return [*problems, *(f"{name} is left" for name in strange)]
+            self._repair(part)
+        problems += run_file_problems(self._finished(), self.flushed, complete_ticks=self.flushed)
+        unexpected = {path.name for path in self.folder.iterdir()} - {NAME, f"{NAME}.part"}
+        return [*problems, *(f"{name} is unexpected" for name in unexpected)]
 
-    def _once_more(self, part: Path) -> None:
+    def _repair(self, part: Path) -> None:
         RecorderKeeper._repair(cast(RecorderKeeper, SimpleNamespace(notes=[])), part)
 
     def _finished(self) -> list[Path]:
@@ -68,39 +67,39 @@ class Recovering(Case):
 
 
 class Cutting(Case):
-    """A stretch of a recording becomes a recording of its own."""
+    """The cut: a range of ticks of a recording is copied to a new recording."""
 
     FIRST, END = 2 * SNAPSHOT_TICKS, TICKS
 
     def __init__(self, folder: Path) -> None:
         super().__init__(folder)
-        self.recording = Path(shutil.copy(_base(True), folder))
+        self.recording = Path(shutil.copy(_original(True), folder))
         self.output = cut_path(self.recording, self.FIRST)
 
     def work(self) -> None:
         cut(self.recording, self.FIRST, self.END)
 
     def judge(self, outcome: Outcome) -> list[str]:
-        stretch, problems = set(range(self.FIRST, self.END)), []
-        if self.recording.read_bytes() != _base(True).read_bytes():
+        ticks, problems = set(range(self.FIRST, self.END)), []
+        if self.recording.read_bytes() != _original(True).read_bytes():
             problems.append("the recording was changed")
-        if self.output.exists():  # a killed cut may have come to its end
-            problems += problems_of([self.output], stretch, whole=stretch)
+        if self.output.exists():  # a killed cut may have been finished
+            problems += run_file_problems([self.output], ticks, complete_ticks=ticks)
             self.output.unlink()
         elif outcome.finished:
-            problems.append("the cut says that it is done, and is not there")
+            problems.append("the cut ends without an error, and its file is missing")
         self.work()
-        problems += problems_of([self.output], stretch, whole=stretch)
-        strange = {path.name for path in self.folder.iterdir()} - {self.recording.name, self.output.name}
-        return [*problems, *(f"{name} is left" for name in strange)]
+        problems += run_file_problems([self.output], ticks, complete_ticks=ticks)
+        unexpected = {path.name for path in self.folder.iterdir()} - {self.recording.name, self.output.name}
+        return [*problems, *(f"{name} is unexpected" for name in unexpected)]
 
 
 PART_TICKS = 5_000
 
 
 @cache
-def _stored() -> Path:
-    """Three runs of several files; the second tripped at the first tick of its second file."""
+def _original_runs() -> Path:
+    """Return a folder with three runs of several files; the second run tripped at the first tick of its second file."""
     folder = Path(mkdtemp(prefix="rtloop-syscalls-"))
     for run, count in ((1, 2), (2, 3), (3, 2)):
         for number in range(1, count + 1):
@@ -109,6 +108,7 @@ def _stored() -> Path:
 
 
 def _write_part(path: Path, run: int, number: int) -> None:
+    """Write file `number` of a run, with 200 of its ticks."""
     first = (number - 1) * PART_TICKS
     around = {"before_s": 0.1, "after_s": 0.2, "every_s": 1.0, "on": ["trip"]}
     facts: dict[str, Any] = {"sequence": number, "first_tick": first, "format": 2, "around": around}
@@ -123,7 +123,7 @@ def _write_part(path: Path, run: int, number: int) -> None:
 
 
 class KeepingQuota(Case):
-    """The oldest recordings are removed, none around a trip and not the newest; a quota of one file."""
+    """A quota of one file: the oldest recordings are removed, except those around a trip and the newest."""
 
     REMOVABLE = frozenset(
         ("test-20260101T000001-0001.mcap", "test-20260101T000001-0002.mcap", "test-20260102T000002-0003.mcap",
@@ -132,24 +132,26 @@ class KeepingQuota(Case):
 
     def __init__(self, folder: Path) -> None:
         super().__init__(folder)
-        for path in _stored().iterdir():
+        for path in _original_runs().iterdir():
             shutil.copy(path, folder)
         self.quota = Quota(folder, "test", 1, 0)
 
     def work(self) -> None:
-        for _ in range(2):  # the second look is what the next second does
+        for _ in range(2):  # the second call is that of the next second
             self.quota.enforce(budget_s=60.0)
 
     def judge(self, outcome: Outcome) -> list[str]:
         problems = self._wrongly_removed()
         Quota(self.folder, "test", 1, 0).enforce(budget_s=60.0)
         problems += self._wrongly_removed()
-        left = {path.name for path in self.folder.iterdir()} & self.REMOVABLE
-        return [*problems, *(f"{name} is not removed by the next hand" for name in left)]
+        not_removed = {path.name for path in self.folder.iterdir()} & self.REMOVABLE
+        return [*problems, *(f"{name} is not removed by the next process" for name in not_removed)]
 
     def _wrongly_removed(self) -> list[str]:
-        gone = {path.name for path in _stored().iterdir()} - {path.name for path in self.folder.iterdir()}
+        """Return the problems of files that had to stay: removed or changed ones."""
+        originals = _original_runs()
+        removed = {file.name for file in originals.iterdir()} - {file.name for file in self.folder.iterdir()}
         changed = [
-            path.name for path in self.folder.iterdir() if path.read_bytes() != (_stored() / path.name).read_bytes()
+            file.name for file in self.folder.iterdir() if file.read_bytes() != (originals / file.name).read_bytes()
         ]
-        return [f"{name} was removed or changed" for name in (*(gone - self.REMOVABLE), *changed)]
+        return [f"{name} was removed or changed" for name in (*(removed - self.REMOVABLE), *changed)]

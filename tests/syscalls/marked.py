@@ -1,4 +1,4 @@
-"""The side of the process that is traced: it waits until it is, marks its work in the trace, says how it ended."""
+"""Traced side of a try: the process waits until it is traced, marks its work in the trace, and stores its error."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ from rtloop.drivers.errors import DriverError
 from rtloop.errors import RtloopError
 
 BEGIN, END = "/rtloop-begin", "/rtloop-end"
-"""Looked for by the child, in vain: they mark the work in the trace."""
+"""Paths that do not exist; the child calls `access` on them to mark begin and end of its work in the trace."""
 GO = signal.SIGUSR1
 PREPARED = "prepared"
-"""The file that holds the number of the thread that is to be traced."""
+"""Name of the file that holds the id of the thread to trace."""
 CLEAR, REFUSED, CRASHED = 0, 1, 2
-"""Exit codes."""
+"""Exit codes of the traced process."""
 
 
 def begin_here(folder: Path) -> None:
-    """Have this thread traced, wait for GO and mark the beginning; in the child."""
+    """In the child: have this thread traced, wait for GO, and mark the begin of the tried calls."""
     new = folder / f"{PREPARED}.new"
     new.write_text(str(threading.get_native_id()))
     new.rename(folder / PREPARED)
@@ -31,12 +31,12 @@ def begin_here(folder: Path) -> None:
 
 
 def end_here() -> None:
-    """Mark the end of what is tried; in the child."""
+    """In the child: mark the end of the tried calls."""
     os.access(END, 0)
 
 
 def work_and_exit(prepare: Callable[[], object] | None, work: Callable[[], object], error: Path) -> None:
-    """Wait for GO, do the work between the marks, say how it ended; never returns."""
+    """Wait for GO, do the work between the marks, write an error to `error`, and exit; never returns."""
     code = CLEAR
     try:
         if prepare is not None:

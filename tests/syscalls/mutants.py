@@ -1,4 +1,4 @@
-"""Planted mistakes that a call has to find: each is made in the traced process alone, and the next hand is sound."""
+"""Planted mistakes that the tries have to find: each is planted in the traced process, not in the next process."""
 
 from __future__ import annotations
 
@@ -29,59 +29,59 @@ def rename_before_the_end() -> None:
     """The recorder gives a file its name before the index is written."""
     finish = Writer.finish
 
-    def named_first(writer: Writer, final: Any, **options: Any) -> None:
+    def rename_and_finish(writer: Writer, final: Any, **options: Any) -> None:
         os.rename(writer.part, writer.path)
         finish(writer, final, **options)
 
-    Writer.finish, ChunkFile.publish = named_first, ChunkFile.close  # type: ignore[method-assign]
+    Writer.finish, ChunkFile.publish = rename_and_finish, ChunkFile.close  # type: ignore[method-assign]
 
 
 def remove_before_it_is_whole() -> None:
-    """A repair removes the unfinished file before the recovered one has its end."""
+    """A repair removes the unfinished file before the recovered file is complete."""
     finish = Writer.finish
 
-    def removed_first(writer: Writer, final: Any, **options: Any) -> None:
+    def remove_and_finish(writer: Writer, final: Any, **options: Any) -> None:
         writer.path.with_name(f"{writer.path.name}.part").unlink()
         finish(writer, final, **options)
 
-    Writer.finish = removed_first  # type: ignore[method-assign]
+    Writer.finish = remove_and_finish  # type: ignore[method-assign]
 
 
 def write_the_note_in_place() -> None:
-    """The note of the hardware is written over the old one."""
+    """The hardware note is written over the old note."""
 
-    def in_place(path: Path, hardware: Hardware) -> None:
+    def write_in_place(path: Path, hardware: Hardware) -> None:
         path.write_bytes(_ADAPTER.dump_json(hardware))
 
-    parking.write_note = in_place  # type: ignore[assignment]
+    parking.write_note = write_in_place  # type: ignore[assignment]
 
 
 def ignore_refused_writes() -> None:
-    """Parking goes on with the next value where a write was refused."""
+    """Parking continues with the next value after a refused write."""
 
-    def careless(driver: Driver, pointers: Pointers, from_v: Any, slew_v_per_s: float, on_step: Any = None) -> None:
+    def ramp_on(driver: Driver, pointers: Pointers, from_v: Any, slew_v_per_s: float, on_step: Any = None) -> None:
         write = ramp._WRITE(pointers.write)
         for row in ramp.ramp(from_v, ramp.safe_outputs_v(driver), slew_v_per_s / driver.rate_hz):
             write(pointers.context, np.ascontiguousarray(row).ctypes.data)
             on_step(row)
 
-    parking_module.ramp_to_safe = careless
+    parking_module.ramp_to_safe = ramp_on
 
 
 def tidy_up_at_the_stop() -> None:
-    """A service that is told to end removes unfinished recordings, as its recorder will finish its own."""
+    """A service removes unfinished recordings when it is stopped, also those that the recorder has yet to finish."""
     stop = Supervisor.stop
 
-    def tidy(supervisor: Supervisor) -> None:
+    def remove_and_stop(supervisor: Supervisor) -> None:
         for part in Path(supervisor.prepared.configuration.recording.folder).glob("*.part"):
             part.unlink()
         stop(supervisor)
 
-    Supervisor.stop = tidy  # type: ignore[method-assign]
+    Supervisor.stop = remove_and_stop  # type: ignore[method-assign]
 
 
 class Mutant(NamedTuple):
-    """A mistake in a component, the kinds and calls that may find it; any of them has to."""
+    """A mistake in a component, and the kinds and calls of injections of which at least one must find the mistake."""
 
     plant: Callable[[], None]
     component: str
@@ -89,13 +89,13 @@ class Mutant(NamedTuple):
     calls: tuple[str, ...]
 
     def tries(self, folder: Path) -> list[Try]:
-        """What is tried of the component with its mistake."""
+        """Return the tries of the component with the mistake, at these calls and of these kinds."""
         sound = COMPONENTS[self.component]
-        tries, _ = plan([sound._replace(case=_with(sound, self.plant))], folder)
-        return [one for one in tries if one[1].kind in self.kinds and one[1].call.name in self.calls]
+        tries, _ = plan([sound._replace(case=_mutated_case(sound, self.plant))], folder)
+        return [trial for trial in tries if trial[1].kind in self.kinds and trial[1].call.name in self.calls]
 
-    def found_after(self, folder: Path) -> int | None:
-        """The number of tries after which a judge finds the mistake; None if no try does."""
+    def count_tries(self, folder: Path) -> int | None:
+        """Return the number of tries until one finds the mistake; None if no try does."""
         for number, (component, injection) in enumerate(self.tries(folder), start=1):
             if component.measure(folder, injection).problems:
                 return number
@@ -111,28 +111,28 @@ MUTANTS = (
 )
 
 
-def _with(sound: Component, plant: Callable[[], None]) -> Any:
-    """The component's case with a mistake, planted in the child."""
+def _mutated_case(sound: Component, plant: Callable[[], None]) -> Any:
+    """Return the component's case with the mistake, which is planted in the child."""
 
-    class Planted(sound.case):  # type: ignore[misc, name-defined]
+    class MutatedCase(sound.case):  # type: ignore[misc, name-defined]
         def prepare_child(self) -> None:
             super().prepare_child()
             plant()
 
         def traced_work(self, logs: Path) -> None:
-            if not self.is_all_traced:  # then nobody prepares the child
+            if not self.is_all_traced:  # prepare_child is not called then
                 plant()
             super().traced_work(logs)
 
-    return Planted
+    return MutatedCase
 
 
 def run() -> int:
-    """Plant each mistake; 1 where one is not found."""
+    """Plant each mistake and print the tries that found it; return 1 if a mistake is not found."""
     missed = 0
     for mutant in MUTANTS:
         with TemporaryDirectory(prefix="rtloop-syscalls-") as name, surroundings():
-            number = mutant.found_after(Path(name))
+            number = mutant.count_tries(Path(name))
         print(f"{mutant.plant.__name__} ({mutant.component}): {f'found by try {number}' if number else 'NOT FOUND'}")
         missed += number is None
     if missed:

@@ -1,6 +1,6 @@
-"""`rtloop park` after a service that died with its output up, and the note of the hardware that it goes by.
+"""Components: `rtloop park` after a service that died with its output up, and the hardware note that it reads.
 
-The witness is the card's own memory, which outlives all processes and holds every write.
+The evidence is the card's memory, which outlives all processes and holds every write.
 """
 
 from __future__ import annotations
@@ -33,15 +33,15 @@ from tests.syscalls.traced import Outcome
 NAME, DRIVE_CODE = "lab", 8192
 DRIVE_V = DRIVE_CODE * LSB_V
 STEP_V = SLEW_V_PER_S / BOARD_RATE_HZ
-ANOTHER = (
+CARD_CHANGES = (
     ('kind = "shm"', f'kind = "{card.KIND}"'), ("board_rate_hz = 8000\n", ""), ('"adc0"', '"in"'), ('"dac0"', '"out"'),
     ("[driver.plant.sensor]\num_per_v = 10.0\nnoise_um = 0.010\nresolution_um = 0.010\n", ""),
 )  # fmt: skip
 
 
 @lru_cache
-def _text(folder: Path, *changes: tuple[str, str]) -> tuple[str, Hardware, Sizes]:
-    """A configuration, its hardware, and the sizes of its shared block."""
+def _configuration(folder: Path, *changes: tuple[str, str]) -> tuple[str, Hardware, Sizes]:
+    """Return the text of a configuration, its hardware, and the sizes of its shared block."""
     config = folder / f"{NAME}.toml"
     config.write_text(text := on_a_board(folder, *changes))
     plan = prepare(load(config)).plan
@@ -53,14 +53,14 @@ def _text(folder: Path, *changes: tuple[str, str]) -> tuple[str, Hardware, Sizes
 
 
 class ParkingABoard(Case):
-    """The board of `rtloop hil serve`, whose memory says where its outputs are."""
+    """Parking of the board of `rtloop hil serve`, whose memory shows the present outputs."""
 
     changes: tuple[tuple[str, str], ...] = ()
 
     def __init__(self, folder: Path) -> None:
         super().__init__(folder)
         os.environ["RUNTIME_DIRECTORY"] = str(folder)
-        text, self.hardware, sizes = _text(folder, *self.changes)
+        text, self.hardware, sizes = _configuration(folder, *self.changes)
         self.config, self.card = folder / f"{NAME}.toml", folder / "board"
         self.config.write_text(text)
         fd = os.open(block_path(NAME), os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
@@ -70,7 +70,7 @@ class ParkingABoard(Case):
         self.switch_on()
 
     def switch_on(self) -> None:
-        """Make the card as the service left it, its output up."""
+        """Create the card with its output at DRIVE_V, as the dead service left it."""
         fd = os.open(self.card, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
         os.ftruncate(fd, board.file_bytes())
         self.memory = BoardMemory(fd)
@@ -82,7 +82,7 @@ class ParkingABoard(Case):
         facts["magic"] = board.MAGIC
 
     def written_v(self) -> list[float]:
-        """All that was written to the output, the newest last."""
+        """Return all voltages written to the output, the newest last."""
         count = int(self.memory.words[board.WRITTEN])
         return (self.memory.fifo.codes[:count, 0] * LSB_V).tolist()
 
@@ -92,15 +92,15 @@ class ParkingABoard(Case):
     def judge(self, outcome: Outcome) -> list[str]:
         problems = []
         if outcome.finished and self._output_v() != 0.0:
-            problems.append(f"parking says that it is done; the output is at {self._output_v():.3f} V")
+            problems.append(f"parking ends without an error; the output is at {self._output_v():.3f} V")
         try:
             self.work()
         except (RtloopError, DriverError) as error:
-            problems.append(f"the next hand cannot park: {error}")
+            problems.append(f"the next process cannot park: {error}")
         if self._output_v() != 0.0:
-            problems.append(f"after the next hand the output is at {self._output_v():.3f} V")
-        written = np.array([DRIVE_V, *self.written_v()])
-        if (step_v := float(np.max(np.abs(np.diff(written))))) > STEP_V + LSB_V:
+            problems.append(f"after the next process the output is at {self._output_v():.3f} V")
+        levels_v = np.array([DRIVE_V, *self.written_v()])
+        if (step_v := float(np.max(np.abs(np.diff(levels_v))))) > STEP_V + LSB_V:
             problems.append(f"a step of {step_v:.3f} V, allowed {STEP_V:.3f} V")
         os.close(self.block.fd)
         return problems
@@ -110,23 +110,23 @@ class ParkingABoard(Case):
 
 
 class ParkingTheNoted(ParkingABoard):
-    """The configuration names another board by now: the one that is up is known by the note alone."""
+    """Parking with a configuration that names another board: only the note names the board whose output is up."""
 
     def __init__(self, folder: Path) -> None:
         super().__init__(folder)
-        other = folder / "other"
-        shutil.copy(self.card, other)
-        fd = os.open(other, os.O_RDWR | os.O_CLOEXEC)
+        other_board = folder / "other"
+        shutil.copy(self.card, other_board)
+        fd = os.open(other_board, os.O_RDWR | os.O_CLOEXEC)
         write_first(BoardMemory(fd), [0])
         os.close(fd)
-        other.chmod(0o600)
-        self.config.write_text(self.config.read_text().replace(f'"{self.card}"', f'"{other}"'))
+        other_board.chmod(0o600)
+        self.config.write_text(self.config.read_text().replace(f'"{self.card}"', f'"{other_board}"'))
 
 
 class ParkingACard(ParkingABoard):
-    """A card whose writes are system calls, and which cannot say where its output is."""
+    """Parking of a card whose writes are system calls, and whose outputs cannot be read back."""
 
-    changes = ANOTHER
+    changes = CARD_CHANGES
 
     def switch_on(self) -> None:
         self.card.write_bytes(struct.pack("<d", DRIVE_V))
@@ -136,7 +136,7 @@ class ParkingACard(ParkingABoard):
 
 
 class Noting(Case):
-    """A service that starts on another board than the last one's: the note is the old one or the new one."""
+    """The note of a service that starts on another board: at each moment it is the old note or the new one, whole."""
 
     def __init__(self, folder: Path) -> None:
         super().__init__(folder)
@@ -153,15 +153,15 @@ class Noting(Case):
 
     def judge(self, outcome: Outcome) -> list[str]:
         try:
-            problems, there = [], read_note(self.path)
+            problems, note = [], read_note(self.path)
         except UnusableNote as error:
-            problems, there = [str(error)], None
-        if there not in (self.old, self.new):
+            problems, note = [str(error)], None
+        if note not in (self.old, self.new):
             problems.append("the note is neither the old one nor the new one")
-        if outcome.finished and there != self.new:
-            problems.append("the note is said to be written, and is not there")
+        if outcome.finished and note != self.new:
+            problems.append("the write ends without an error, and the new note is missing")
         self.work()
         if read_note(self.path) != self.new:
-            problems.append("the next hand's note is not there")
-        strange = {path.name for path in self.folder.iterdir()} - {self.path.name}
-        return [*problems, *(f"{name} is left" for name in strange)]
+            problems.append("the next process's note is missing")
+        unexpected = {path.name for path in self.folder.iterdir()} - {self.path.name}
+        return [*problems, *(f"{name} is unexpected" for name in unexpected)]

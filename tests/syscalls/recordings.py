@@ -1,6 +1,6 @@
-"""A short recording of a real law, and what a folder of recordings is judged by.
+"""A short recording of a real law, and checks of recordings in a folder.
 
-Ticks on the disk are counted with the MCAP project's own reader: nothing of rtloop says what was flushed.
+Ticks on the disk are counted with the MCAP project's reader, not with rtloop's.
 """
 
 from __future__ import annotations
@@ -29,24 +29,24 @@ from tests.recording.real_loop import RealLoop, scheduled
 
 TICKS, SNAPSHOT_TICKS, CHUNK_BYTES = 640, 160, 1 << 14
 MAGIC = b"\x89MCAP0\r\n"
-"""Ends a file that is whole."""
+"""Last bytes of a complete file."""
 _TICK_FIELD = b"\x09"
-"""Protobuf: field 1, eight bytes. It is the first of a tick's message, and holds its number."""
+"""Protobuf tag of field 1 with eight bytes: the first field of a tick's message, which holds the tick's number."""
 
 
 @contextmanager
 def small_chunks() -> Iterator[None]:
-    """Several chunks, and several files of a rotated run, in 64 ms of ticks."""
-    before, format.MAX_CHUNK_BYTES = format.MAX_CHUNK_BYTES, CHUNK_BYTES
+    """Set chunks so small that 64 ms of ticks fill several chunks, and several files of a rotated run."""
+    original_bytes, format.MAX_CHUNK_BYTES = format.MAX_CHUNK_BYTES, CHUNK_BYTES
     try:
         yield
     finally:
-        format.MAX_CHUNK_BYTES = before
+        format.MAX_CHUNK_BYTES = original_bytes
 
 
 @cache
-def executed() -> RealLoop:
-    """A loop that has run; what it published is copied for each recorder."""
+def executed_loop() -> RealLoop:
+    """Return a loop that has run TICKS ticks; each recorder gets a copy of its shared block."""
     loop = RealLoop(scheduled().replace("at_tick = 3000", "at_tick = 200").replace("at_tick = 5000", "at_tick = 400"))
     loop.take_snapshots_every(SNAPSHOT_TICKS)
     loop.run(TICKS)
@@ -55,13 +55,13 @@ def executed() -> RealLoop:
 
 @cache
 def expected_rows() -> np.ndarray[Any, Any]:
-    """The records (ticks, columns) that were executed."""
-    return executed().block.ring("ticks").slots[:TICKS].copy()
+    """Return the executed records (ticks, columns)."""
+    return executed_loop().block.ring("ticks").slots[:TICKS].copy()
 
 
-def published() -> SharedBlock:
-    """A new shared block with all that the loop published, and no recorder's words."""
-    source = executed()
+def new_block() -> SharedBlock:
+    """Return a new shared block with all records that the loop published, before any recorder has read them."""
+    source = executed_loop()
     block = SharedBlock.create(source.prepared.plan.sizes)
     for name in ("ticks", "snapshots", "events"):
         count = int(source.block[f"{name}_head"][0])
@@ -73,25 +73,25 @@ def published() -> SharedBlock:
 
 
 def header(**changes: Any) -> dict[str, Any]:
-    """As of a paced run: a recorder then tries again after a failure."""
-    return {**executed().header, "paced": True, **changes}
+    """Return the header of a paced run, with changes: in a paced run a recorder tries again after a failure."""
+    return {**executed_loop().header, "paced": True, **changes}
 
 
 def write(path: Path, *, finished: bool = True, **options: Any) -> None:
-    """Record the loop into `path`, or leave its `.part` as a recorder that was killed does."""
-    session = Session(published(), path, header(), Options(**{"min_free_bytes": 0, "message_index": True, **options}))
+    """Record the loop into `path`, or leave the unfinished `.part` of a killed recorder."""
+    session = Session(new_block(), path, header(), Options(**{"min_free_bytes": 0, "message_index": True, **options}))
     while session.drain():
         session.write_due()
     if finished:
         assert session.finish("finished")["complete"]
         return
-    session._write_all()  # what a killed recorder has flushed
+    session._write_all()  # the ticks that a killed recorder has flushed
     assert session._files.writer
     session._files.writer.close()
 
 
 def ticks_on_disk(paths: Iterable[Path]) -> set[int]:
-    """Ticks that the MCAP project's reader finds, up to where a file is cut off."""
+    """Return the ticks that the MCAP project's reader finds before the end, or the cut, of each file."""
     ticks: set[int] = set()
     for path in paths:
         with path.open("rb") as file:
@@ -109,39 +109,38 @@ def ticks_on_disk(paths: Iterable[Path]) -> set[int]:
 
 
 class Verdicts(NamedTuple):
-    """What rtloop says of the files of a run: their ticks, `complete` of info, and problems that do not depend on
-    what was tried."""
+    """Verdicts of rtloop on the files of a run: their ticks, `complete` of info, and problems that no try excuses."""
 
     ticks: frozenset[int]
     complete: bool
     problems: tuple[str, ...]
 
 
-def ticks_of(paths: list[Path]) -> frozenset[int]:
-    """Ticks that rtloop finds in finished files of one run."""
+def ticks_in_files(paths: list[Path]) -> frozenset[int]:
+    """Return the ticks that rtloop reads from finished files of one run."""
     return _verdicts(tuple((path.name, path.read_bytes()) for path in paths)).ticks if paths else frozenset()
 
 
-def problems_of(paths: list[Path], must: set[int], whole: Iterable[int] = range(TICKS)) -> list[str]:
-    """What is wrong with finished files of one run: ticks of `must` that are in none, other bytes, a false verdict.
+def run_file_problems(paths: list[Path], required: set[int], complete_ticks: Iterable[int] = range(TICKS)) -> list[str]:
+    """Return the problems of finished files of one run: missing `required` ticks, other bytes, a false verdict.
 
-    `whole` are the ticks of which the files may say that they are complete.
+    Files that info calls complete must hold all of `complete_ticks`.
     """
     if not paths:
-        return [f"{len(must)} flushed ticks are in no file"] if must else []
-    problems = [f"{path.name}: has its name and no end" for path in paths if not path.read_bytes().endswith(MAGIC)]
-    said = _verdicts(tuple((path.name, path.read_bytes()) for path in paths))
-    problems += said.problems
-    if absent := must - said.ticks:
-        problems.append(f"{len(absent)} flushed ticks are in no file")
-    if said.complete and (absent := set(whole) - said.ticks):
-        problems.append(f"info says complete, and {len(absent)} ticks lack")
+        return [f"{len(required)} flushed ticks are in no file"] if required else []
+    problems = [f"{path.name}: renamed without its end" for path in paths if not path.read_bytes().endswith(MAGIC)]
+    verdicts = _verdicts(tuple((path.name, path.read_bytes()) for path in paths))
+    problems += verdicts.problems
+    if missing := required - verdicts.ticks:
+        problems.append(f"{len(missing)} flushed ticks are in no file")
+    if verdicts.complete and (missing := set(complete_ticks) - verdicts.ticks):
+        problems.append(f"info says complete, and {len(missing)} ticks are missing")
     return problems
 
 
 @lru_cache(maxsize=256)
 def _verdicts(files: tuple[tuple[str, bytes], ...]) -> Verdicts:
-    """The same bytes are judged once."""
+    """Read, summarise and replay files, given as names and bytes; the same bytes are checked only once."""
     with TemporaryDirectory() as name:
         paths = [Path(name) / file for file, _ in files]
         for path, (_, data) in zip(paths, files, strict=True):

@@ -1,10 +1,10 @@
-"""A service on a board that outlives it, from its start until it is ready, and from the stop signal to its end.
+"""Components: a service on a board that outlives it, from its start until it is ready, and from SIGTERM to its end.
 
-The service is forked from what has imported everything, and its children are too: the calls that are tried are those
-of its work. Its first thread is traced, which starts and ends all else. Of what it does again and again, waiting for
-others or looking for the versions of packages, a few calls are tried (`kinds.thinned`), and a few of its imports.
+Service and children are forked from a process with all modules imported: only calls of their work are tried. The trace
+is that of the service's first thread, which starts and ends all others. Of repeated calls, which wait for others or
+look for the versions of packages, a few are tried (`kinds.thinned`), and a few of the imports.
 
-The next hands are `rtloop park`, then another service.
+The next processes are `rtloop park`, then another service.
 """
 
 from __future__ import annotations
@@ -33,19 +33,19 @@ from tests.faults.evidence import wait_for
 from tests.syscalls.component import Case
 from tests.syscalls.marked import begin_here, end_here
 from tests.syscalls.recordings import ticks_on_disk
-from tests.syscalls.serving import board, problems_of_runs, serve, terminate
+from tests.syscalls.serving import board, run_problems, serve, terminate
 from tests.syscalls.traced import Injection, Outcome
 
 NAME, UP_V, POLL_S, TIMEOUT_S = "lab", 1.0, 0.002, 40.0
 WARM_TIMEOUT_S = 300.0
-"""What is not in the cache is compiled first."""
+"""Long enough to compile all functions into an empty cache."""
 HEARTBEAT_S = 0.5
 LAST = 1_200
-"""Characters of a log."""
+"""Number of characters at the end of a log that are printed."""
 
 
 class StartingAService(Case):
-    """From the beginning of `serve` until systemd is told that it is ready; then it is told to end."""
+    """A service from the begin of `serve` until it reports READY to systemd; then it gets SIGTERM."""
 
     is_all_traced = False
     may_crash = True
@@ -61,7 +61,7 @@ class StartingAService(Case):
         self.unseen_step_v = board().seen().largest_step_v
 
     def warm_up(self) -> None:
-        """Import, load and compile here what a service and its children do, and serve once."""
+        """Serve once in a child, then import all of its modules here, so that later children find them imported."""
         prepare(load(self.config))
         rehearse()
         names = self.folder / "imported"
@@ -79,53 +79,55 @@ class StartingAService(Case):
     def judge(self, outcome: Outcome) -> list[str]:
         problems = [] if outcome.crash else self._tracebacks(self.log)
         flushed = {path.name.removesuffix(".part"): ticks_on_disk([path]) for path in self.recordings.glob("*.mcap*")}
-        written = self._written()
+        written_ticks = self._flushed_ticks()
         if outcome.finished and not all(summarise(run).complete for run in runs_in(self.recordings)):
             problems.append("the service ends with 0, and a recording is not complete")
         try:
             parking.park_configuration(self.config)
         except (RtloopError, DriverError) as error:
-            problems.append(f"the next hand cannot park: {error}")
-        problems += self._problems_of_the_board("parking")
-        problems += self._problems_of_the_next_start()
+            problems.append(f"the next process cannot park: {error}")
+        problems += self._board_problems("parking")
+        problems += self._next_start_problems()
         for name, ticks in flushed.items():
             if absent := ticks - (ticks_on_disk([path]) if (path := self.recordings / name).exists() else set()):
                 problems.append(f"{name}: {len(absent)} flushed ticks are in no file")
-        if written > (there := len(ticks_on_disk([self.recordings / max(flushed)])) if flushed else 0):
-            problems.append(f"{written} ticks are said to be written, {there} are there")
-        problems += problems_of_runs(self.recordings)
-        return [*problems, *(self._log_of(self.log) if problems else [])]
+        if written_ticks > (on_disk := len(ticks_on_disk([self.recordings / max(flushed)])) if flushed else 0):
+            problems.append(f"{written_ticks} ticks are counted as written, {on_disk} are on the disk")
+        problems += run_problems(self.recordings)
+        return [*problems, *(self._log_tail(self.log) if problems else [])]
 
-    def _written(self) -> int:
-        """Ticks of the last run that are in files, as its recorder says in the shared block."""
+    def _flushed_ticks(self) -> int:
+        """Return the number of ticks in files of the last run, as its recorder counts them in the shared block."""
         path = self.folder / "run" / f"{NAME}.block"
         if not path.exists() or not path.stat().st_size:
             return 0
-        with suppress(ValueError), path.open("r+b") as file:  # there is no directory in it yet
+        with suppress(ValueError), path.open("r+b") as file:  # the block has no directory yet
             block = SharedBlock(file.fileno())
             return block.load(Word.FLUSHED_TICKS) - block.load(Word.LOST_TICKS)
         return 0
 
-    def _problems_of_the_next_start(self) -> list[str]:
+    def _next_start_problems(self) -> list[str]:
+        """Start another service in a child, end it once it is ready, and return its problems."""
         pid = os.fork()
         if pid == 0:
             self._serve_once(lambda: None)
         code = self._await(pid)
-        problems = self._tracebacks(self.next_log) + self._problems_of_the_board("the next service")
+        problems = self._tracebacks(self.next_log) + self._board_problems("the next service")
         if code != 0:
             problems.append(f"the next service: {code}")
-        return problems + (self._log_of(self.next_log) if problems else [])
+        return problems + (self._log_tail(self.next_log) if problems else [])
 
-    def _problems_of_the_board(self, hand: str) -> list[str]:
+    def _board_problems(self, process: str) -> list[str]:
+        """Return the problems of the board's output after `process`: an output that is not 0 V, a step too large."""
         bench = board()
-        seen = bench.seen()
-        problems = [] if seen.last_v == 0.0 else [f"after {hand} the output is at {seen.last_v:.3f} V"]
-        if seen.largest_step_v > max(bench.bounds.step_v, self.unseen_step_v):
-            problems.append(f"a step of {seen.largest_step_v:.3f} V, allowed {bench.bounds.step_v:.3f} V")
+        record = bench.seen()
+        problems = [] if record.last_v == 0.0 else [f"after {process} the output is at {record.last_v:.3f} V"]
+        if record.largest_step_v > max(bench.bounds.step_v, self.unseen_step_v):
+            problems.append(f"a step of {record.largest_step_v:.3f} V, allowed {bench.bounds.step_v:.3f} V")
         return problems
 
     def _serve_once(self, at_ready: Callable[[], object]) -> None:
-        """As another service does that is told to end once it is ready; never returns."""
+        """Be a service that ends once it is ready, in this child process; never returns."""
         code = 1
         try:
             serve(self.config, self.next_log, at_ready=lambda: (at_ready(), terminate()))
@@ -136,6 +138,7 @@ class StartingAService(Case):
             os._exit(code)
 
     def _await(self, pid: int, timeout_s: float = TIMEOUT_S) -> int | str:
+        """Return the exit code of a child, or a text for a child that had to be killed at the time-out."""
         deadline_s = time.monotonic() + timeout_s
         while time.monotonic() < deadline_s:
             done, status = os.waitpid(pid, os.WNOHANG)
@@ -150,12 +153,12 @@ class StartingAService(Case):
         text = log.read_text() if log.exists() else ""
         return ["a traceback"] if "Traceback" in text else []
 
-    def _log_of(self, log: Path) -> list[str]:
+    def _log_tail(self, log: Path) -> list[str]:
         return [f"{log.name}: {log.read_text()[-LAST:]}"] if log.exists() else []
 
 
 class StoppingAService(StartingAService):
-    """From SIGTERM, with the output up and ticks in the file, until the service has ended."""
+    """A service from SIGTERM, with the output up and ticks in the file, until it has ended."""
 
     def traced_work(self, logs: Path) -> None:
         threading.Thread(target=self._terminate_once_up, daemon=True).start()
@@ -163,14 +166,14 @@ class StoppingAService(StartingAService):
 
     def _terminate_once_up(self) -> None:
         wait_for(lambda: board().seen().last_v > UP_V, "an output that is up", TIMEOUT_S)
-        wait_for(lambda: self._written() > 0, "ticks in the file", TIMEOUT_S)
+        wait_for(lambda: self._flushed_ticks() > 0, "ticks in the file", TIMEOUT_S)
         terminate()
 
 
 class ImportingAService(StartingAService):
-    """A service as a user starts it, from the beginning of its interpreter until it reads its configuration.
+    """A service in a new interpreter, from the start of the interpreter until it reads its configuration.
 
-    Its children are interpreters of their own. It is told to end once systemd is told that it is ready.
+    Its children are new interpreters too. It gets SIGTERM once it has reported READY to systemd.
     """
 
     def traced_work(self, logs: Path) -> None:
@@ -193,6 +196,6 @@ class ImportingAService(StartingAService):
         first = next(
             (at for at, call in enumerate(calls) if f"{self.folder.name}/{self.config.name}" in call.line), None
         )
-        # an interpreter that cannot import says so by a traceback, before there is anything of rtloop
+        # An interpreter that cannot import prints a traceback before any code of rtloop runs: that counts as a crash.
         crash = outcome.crash or (self.log.read_text() if self._tracebacks(self.log) else "")
         return outcome._replace(calls=calls[:first], crash=crash)

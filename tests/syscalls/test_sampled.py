@@ -1,4 +1,7 @@
-"""A sample of what `make soak NAME=syscalls` tries: killed and failing at a system call, judged by the next hand."""
+"""A component that is killed, or gets an error, at a system call leaves nothing that the next process cannot repair.
+
+This is a sample of the tries of `make soak NAME=syscalls`; planted mistakes show that a try can fail.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +19,7 @@ from tests.syscalls.traced import unavailable
 
 SAMPLE = 60
 MISSED = 10
-"""One try in so many may miss its call: in which order threads run depends on time."""
+"""One try in MISSED may miss its call: the order of threads depends on time."""
 SAMPLED = [component for component in COMPONENTS.values() if component.share]
 QUICK_MUTANTS = [mutant for mutant in MUTANTS if not mutant.component.startswith("service")]
 SHARES = sum(component.share for component in SAMPLED)
@@ -25,6 +28,7 @@ pytestmark = pytest.mark.skipif(bool(unavailable()), reason=unavailable())
 
 @pytest.fixture(autouse=True)
 def _surroundings() -> Iterator[None]:
+    """Give each test small chunks, the card in a file, and its own environment variables."""
     with surroundings():
         yield
 
@@ -33,7 +37,7 @@ def _surroundings() -> Iterator[None]:
 def test_no_call_that_fails_or_is_the_last_leaves_harm(component: Component, tmp_path: Path):
     tries, problems = plan([component], tmp_path)
     chosen, missed = sample(tries, round(SAMPLE * component.share / SHARES)), []
-    print(f"seed {SEED}, {len(chosen)} of {len(tries)} tries:", *(f"{one}" for _, one in chosen), sep="\n")
+    print(f"seed {SEED}, {len(chosen)} of {len(tries)} tries:", *(f"{injection}" for _, injection in chosen), sep="\n")
     for _, injection in chosen:
         result = component.measure(tmp_path, injection)
         problems += [f"{injection}, {injection.call.line[:100]}: {problem}" for problem in result.problems]
@@ -45,4 +49,4 @@ def test_no_call_that_fails_or_is_the_last_leaves_harm(component: Component, tmp
 
 @pytest.mark.parametrize("mutant", QUICK_MUTANTS, ids=lambda mutant: mutant.plant.__name__)
 def test_a_planted_mistake_is_found(mutant: Mutant, tmp_path: Path):
-    assert mutant.found_after(tmp_path)
+    assert mutant.count_tries(tmp_path)

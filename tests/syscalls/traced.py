@@ -1,7 +1,7 @@
-"""A forked process that does some work under strace, which fails one of its system calls or is the last to see it.
+"""A forked process that works under strace, which makes one of its system calls fail or kills the process there.
 
-The parent has imported everything before: the child makes only the calls of the work. strace is attached before the
-work begins, so that the ordinal of a call counts from there, by the name of the call.
+The parent has imported all modules before: the child makes only the calls of the work. strace is attached before the
+work begins; the ordinals of calls are counted from there, separately for each name.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ KILLED_BEFORE, KILLED_AFTER = "killed before", "killed after"
 _LINE = re.compile(r"(\w+)\(")
 _FOREVER_US, _POLL_S, _TIMEOUT_S = 600_000_000, 0.001, 60.0
 _LAST_BYTES = 400
-"""Of a trace: at least its last line."""
+"""Bytes at the end of a trace that hold at least its last line."""
 
 
 class EndedTooEarly(Exception):
-    """The work ended before its trace began: a host that stands still for seconds trips a loop."""
+    """The work ended before its trace began, as when a stalled host trips a loop."""
 
 
 class Call(NamedTuple):
@@ -45,14 +45,14 @@ class Call(NamedTuple):
 
 
 class Injection(NamedTuple):
-    """What happens at a call: an error by its name (`EIO`), KILLED_BEFORE or KILLED_AFTER."""
+    """An injection at a call; `kind` is an error by its name (`EIO`), KILLED_BEFORE or KILLED_AFTER."""
 
     call: Call
     kind: str
 
     @property
     def options(self) -> list[str]:
-        """Arguments for strace."""
+        """Arguments of strace for this injection."""
         act = {KILLED_BEFORE: "signal=SIGKILL", KILLED_AFTER: f"delay_exit={_FOREVER_US}"}.get(self.kind)
         return [f"--inject={self.call.name}:{act or f'error={self.kind}'}:when={self.call.ordinal}"]
 
@@ -61,7 +61,7 @@ class Injection(NamedTuple):
 
 
 class Outcome(NamedTuple):
-    """How the work ended: `killed`, or with `refusal` (message of an error of rtloop) or `crash` (a traceback)."""
+    """End of the work: `killed`, or with `refusal` (message of an error of rtloop) or `crash` (a traceback)."""
 
     calls: list[Call]
     reached: bool
@@ -72,13 +72,13 @@ class Outcome(NamedTuple):
 
     @property
     def finished(self) -> bool:
-        """Whether the work came to its end without an error."""
+        """Whether the work ended without an error."""
         return not (self.killed or self.refusal or self.crash)
 
 
 @cache
 def unavailable() -> str:
-    """Why system calls cannot be traced here; empty where they can."""
+    """Return the reason why this host cannot trace system calls; empty if it can."""
     if shutil.which("strace") is None:
         return "strace is not installed (make tools)"
     done = subprocess.run(["strace", "-o", "/dev/null", "true"], capture_output=True, text=True, check=False)
@@ -86,10 +86,10 @@ def unavailable() -> str:
 
 
 class Traced:
-    """Forks, and attaches strace to the thread that says it is ready; `begin` lets the work go.
+    """A forked child with strace attached to one of its threads; `begin` starts the work.
 
-    `folder` receives the trace and the error. `prepare` is done in the child before strace is attached; None: the work
-    says by itself, by `begin_here`, which of its threads is traced from where on.
+    `folder` receives the trace and the error. `prepare` is called in the child before strace is attached; None: the
+    work calls `begin_here` in the thread to trace, where the trace shall begin.
     """
 
     def __init__(
@@ -134,52 +134,53 @@ class Traced:
         self._await_attachment()
 
     def begin(self) -> None:
-        """Let the work go."""
+        """Send GO, which starts the work."""
         os.kill(self.pid, GO)
 
     def exit_code(self) -> int | None:
-        """Exit code as in subprocess, or None while it runs; a call with KILLED_AFTER is killed from here."""
+        """Return the exit code as in subprocess, or None while the process runs; this method kills for KILLED_AFTER."""
         with self._lock:
             if self._status is None:
                 if self._injection and self._injection.kind == KILLED_AFTER and self._is_delayed():
                     os.kill(self.pid, signal.SIGKILL)
-                    self._strace.kill()  # it sleeps, and the child's end is first reported to it
+                    self._strace.kill()  # strace sleeps, and the kernel reports the child's end to strace first
                 pid, status = os.waitpid(self.pid, os.WNOHANG)
                 self._status = os.waitstatus_to_exitcode(status) if pid else None
             return self._status
 
     def wait(self, timeout_s: float = _TIMEOUT_S) -> Outcome:
-        """Wait for the end; a process that does not end in time is killed, and its outcome is a crash."""
-        deadline_s, late = time.monotonic() + timeout_s, ""
+        """Wait for the end and return the outcome; a process that hangs is killed and counts as a crash."""
+        deadline_s, hang = time.monotonic() + timeout_s, ""
         while self.exit_code() is None:
-            if time.monotonic() > deadline_s and not late:
-                late = f"it hung for {timeout_s:g} s"
+            if time.monotonic() > deadline_s and not hang:
+                hang = f"the process hung for {timeout_s:g} s"
                 os.kill(self.pid, signal.SIGKILL)
             time.sleep(_POLL_S)
         self._strace.communicate()
         code, error = self.exit_code(), self._error.read_text() if self._error.exists() else ""
-        killed = code == -signal.SIGKILL and not late
-        crash = late or (error if code not in (CLEAR, REFUSED) and not killed else "")
+        killed = code == -signal.SIGKILL and not hang
+        crash = hang or (error if code not in (CLEAR, REFUSED) and not killed else "")
         if not crash and not killed and code not in (CLEAR, REFUSED):
             crash = f"exit code {code}"
-        text = self._text()
+        text = self._trace()
         return Outcome(
-            _calls(text), self._is_reached(text, killed), killed, error if code == REFUSED else "", crash, bool(late)
+            _calls(text), self._is_reached(text, killed), killed, error if code == REFUSED else "", crash, bool(hang)
         )
 
     def kill(self) -> None:
-        """End the process if it still runs."""
+        """Kill the process if it still runs."""
         with self._lock:
             if self._status is None:
                 os.kill(self.pid, signal.SIGKILL)
 
     def _is_reached(self, text: str, killed: bool) -> bool:
-        """Whether the injection came about."""
+        """Return whether the injection took place."""
         if self._injection is None:
             return True
         return killed if self._injection.kind in (KILLED_BEFORE, KILLED_AFTER) else "(INJECTED)" in text
 
     def _await_attachment(self) -> None:
+        """Wait until the kernel names strace as the tracer of the thread."""
         deadline_s, mark = time.monotonic() + _TIMEOUT_S, f"TracerPid:\t{self._strace.pid}\n"
         while mark not in Path(f"/proc/{self.pid}/task/{self._thread}/status").read_text():
             if self._strace.poll() is not None or time.monotonic() > deadline_s:
@@ -188,28 +189,28 @@ class Traced:
             time.sleep(_POLL_S)
 
     def _is_delayed(self) -> bool:
-        """Whether strace holds the child behind the call."""
+        """Return whether strace holds the child after its call."""
         if not self._log.exists():
             return False
         with self._log.open("rb") as file:
             file.seek(max(self._log.stat().st_size - _LAST_BYTES, 0))
             return b"(DELAYED)" in file.read()
 
-    def _text(self) -> str:
+    def _trace(self) -> str:
         return self._log.read_text(errors="replace") if self._log.exists() else ""
 
 
 def _calls(text: str) -> list[Call]:
-    """The calls between the marks of a trace."""
-    seen, calls, inside = Counter[str](), [], False
+    """Return the calls between the marks BEGIN and END of a trace."""
+    counts, calls, inside = Counter[str](), [], False
     for line in text.splitlines():
         match = _LINE.match(line)
         if match is None:
             continue
-        seen[match[1]] += 1
+        counts[match[1]] += 1
         if END in line:
             break
         if inside:
-            calls.append(Call(match[1], seen[match[1]], line))
+            calls.append(Call(match[1], counts[match[1]], line))
         inside = inside or BEGIN in line
     return calls

@@ -1,6 +1,6 @@
 """Plants one mistake into every Python process that has this folder on its path: see `tests.faults.mutants`.
 
-The mistake is text that stands in the place of other text of one module, named by environment variables.
+The mistake replaces one text of one module; environment variables name the module and both texts.
 """
 
 from __future__ import annotations
@@ -13,7 +13,9 @@ from types import CodeType
 MODULE, OLD, NEW = (os.environ.get(f"RTLOOP_PLANTED_{part}", "") for part in ("MODULE", "OLD", "NEW"))
 
 
-class _Planted(SourceFileLoader):
+class _PlantingLoader(SourceFileLoader):
+    """Loader that replaces OLD by NEW in the source of a module."""
+
     def get_code(self, fullname: str) -> CodeType:
         text = self.get_source(fullname) or ""
         if text.count(OLD) != 1:
@@ -22,13 +24,15 @@ class _Planted(SourceFileLoader):
 
 
 class _Finder:
+    """Finder of MODULE alone, which is loaded by a _PlantingLoader."""
+
     @staticmethod
     def find_spec(name: str, path: object = None, target: object = None) -> ModuleSpec | None:
         if name != MODULE:
             return None
         spec = PathFinder.find_spec(name, path, target)  # type: ignore[arg-type]
         if spec is not None:
-            spec.loader = _Planted(name, str(spec.origin))
+            spec.loader = _PlantingLoader(name, str(spec.origin))
         return spec
 
 
