@@ -1,4 +1,4 @@
-"""A small driver in Python: two outputs looped back to two inputs, on hardware whose voltages a test can read."""
+"""A small driver in Python with two outputs looped back to two inputs, whose voltages a test can read."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class LoopBack(PythonDriver):
 
     def __init__(self) -> None:
         super().__init__(self.options_model(), WIRING, 1000.0)
-        self.volts = [0.7, 0.7]  # Left by an earlier user.
+        self.volts = [0.7, 0.7]  # Voltages left by an earlier user.
 
     @property
     def facts(self) -> Facts:
@@ -37,7 +37,7 @@ class LoopBack(PythonDriver):
         self.volts = [0.0, 2.0]
 
     def stop(self) -> None:
-        """Nothing to let go."""
+        """Do nothing: the driver holds no resource."""
 
     def read(self) -> Sequence[float]:
         return self.volts
@@ -50,7 +50,7 @@ class LoopBack(PythonDriver):
 
 
 class LoopBackContract(DriverContract):
-    """The suite on LoopBack, whose outputs can be seen."""
+    """The drivers' contract on LoopBack, or on a subclass `kind`; the outputs are read from the driver."""
 
     tolerance_v = 0.0
     kind: type[LoopBack] = LoopBack

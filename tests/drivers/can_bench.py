@@ -1,4 +1,4 @@
-"""Configurations for a node on a bus of this machine alone, and the node as a process of its own."""
+"""Configurations and options for a simulated node on a CAN bus that stays within this machine."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def free_port() -> int:
 
 
 def configuration(folder: Path, port: int, rate_hz: float = 500.0, hold_ticks: int = 500, more: str = "") -> Path:
-    """Write a configuration and return its path; `hold_ticks` bridges a stall of this machine."""
+    """Write a configuration, with `more` lines at the end, and return its path; `hold_ticks` bridges a stall."""
     path = folder / "lab.toml"
     driver = DRIVER.format(group=GROUP, port=port, hold_ticks=hold_ticks)
     path.write_text(
@@ -59,5 +59,5 @@ def configuration(folder: Path, port: int, rate_hz: float = 500.0, hold_ticks: i
 
 
 def options_on(port: int, **more: Any) -> CanOptions:
-    """Return options of a driver on a bus of this machine."""
+    """Return options of a driver on the bus of UDP port `port`."""
     return CanOptions(interface="udp_multicast", channel=GROUP, settings={"port": port, "hop_limit": 0}, **more)

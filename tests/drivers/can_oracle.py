@@ -1,4 +1,4 @@
-"""Frames of ISO 11898-1 bit by bit, with an 11-bit identifier: what goes over the wire, stuffed as it is sent."""
+"""CAN frames with an 11-bit identifier, built and stuffed bit by bit after ISO 11898-1: the oracle of frame lengths."""
 
 from __future__ import annotations
 
@@ -8,15 +8,16 @@ Bits = list[int]
 FD_LENGTHS = [0, 1, 2, 3, 4, 5, 6, 7, 8, 12, 16, 20, 24, 32, 48, 64]
 SPACE = [1] * 3
 END = [1, 0, 1, *[1] * 7, *SPACE]
-"""CRC delimiter, acknowledgement, its delimiter, end of frame, space between frames."""
+"""Bits after the CRC: CRC delimiter, acknowledgement and its delimiter, end of frame, space between frames."""
 
 
-def bits_of(value: int, count: int) -> Bits:
+def to_bits(value: int, count: int) -> Bits:
+    """Return the lowest `count` bits of a number, the highest first."""
     return [value >> i & 1 for i in reversed(range(count))]
 
 
-def stuffed(bits: Sequence[int]) -> Bits:
-    """After five equal bits, stuff bits among them, the opposite one."""
+def stuff(bits: Sequence[int]) -> Bits:
+    """Return the bits with a stuff bit, the opposite one, after each five equal bits; stuff bits count as bits."""
     sent: Bits = []
     run = 0
     for bit in bits:
@@ -29,6 +30,7 @@ def stuffed(bits: Sequence[int]) -> Bits:
 
 
 def crc15(bits: Sequence[int]) -> int:
+    """Return the check of a classic frame: polynomial 0x4599, initial value 0."""
     register = 0
     for bit in bits:
         feedback = bit ^ register >> 14
@@ -38,24 +40,24 @@ def crc15(bits: Sequence[int]) -> int:
     return register
 
 
-def classic(identifier: int, data: bytes) -> Bits:
-    """A whole classic data frame, and the space behind it."""
-    head = [0, *bits_of(identifier, 11), 0, 0, 0, *bits_of(len(data), 4)]
-    body = [*head, *(bit for byte in data for bit in bits_of(byte, 8))]
-    return [*stuffed([*body, *bits_of(crc15(body), 15)]), *END]
+def classic_frame(identifier: int, data: bytes) -> Bits:
+    """Return the bits of a classic data frame and of the space behind it."""
+    head = [0, *to_bits(identifier, 11), 0, 0, 0, *to_bits(len(data), 4)]
+    body = [*head, *(bit for byte in data for bit in to_bits(byte, 8))]
+    return [*stuff([*body, *to_bits(crc15(body), 15)]), *END]
 
 
-def fd(identifier: int, data: bytes, crc: int = 0) -> tuple[int, int]:
-    """Bits of a CAN FD frame with a switched rate: those up to the switch and behind it, and those between."""
-    head = [0, *bits_of(identifier, 11), 0, 0, 1, 0, 1]
-    body = [0, *bits_of(FD_LENGTHS.index(len(data)), 4), *(bit for byte in data for bit in bits_of(byte, 8))]
-    dynamic = stuffed([*head, *body])
-    until_switch = len(stuffed(head[:-1])) + 1
-    field = [*bits_of(0b0110, 4), *bits_of(crc, 17 if len(data) <= 16 else 21)]
+def fd_frame_lengths(identifier: int, data: bytes, crc: int = 0) -> tuple[int, int]:
+    """Return the numbers of bits of a CAN FD frame: those at the arbitration rate, those at the data rate."""
+    head = [0, *to_bits(identifier, 11), 0, 0, 1, 0, 1]
+    body = [0, *to_bits(FD_LENGTHS.index(len(data)), 4), *(bit for byte in data for bit in to_bits(byte, 8))]
+    dynamic = stuff([*head, *body])
+    until_switch = len(stuff(head[:-1])) + 1
+    field = [*to_bits(0b0110, 4), *to_bits(crc, 17 if len(data) <= 16 else 21)]
     fixed = [bit for i, data_bit in enumerate(field) for bit in ([1, data_bit] if i % 4 == 0 else [data_bit])]
     return until_switch + len(END), len(dynamic) - until_switch + len(fixed)
 
 
-def worst(count: int) -> Bits:
-    """The `count` bits that need most stuff bits: five equal ones, then four of the other kind, and so on."""
+def most_stuffed(count: int) -> Bits:
+    """Return the `count` bits that need most stuff bits: five equal bits, then groups of four opposite ones."""
     return [0] + [(i // 4) % 2 for i in range(count - 1)]

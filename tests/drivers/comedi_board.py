@@ -1,4 +1,4 @@
-"""The stand-in for libcomedi, compiled once a session, and a look at its hardware, which is a file."""
+"""The stand-in for libcomedi, compiled once a session, and access to its hardware, which is a file."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ OUTPUT_RANGES_V = ((-10.0, 10.0), (0.0, 5.0))
 
 @functools.cache
 def stub_library() -> Path:
-    """The shared library; the test is skipped where there is no C compiler."""
+    """Return the path of the compiled stand-in; skip the test where there is no C compiler."""
     compiler = shutil.which("cc")
     if compiler is None:
         pytest.skip("no C compiler")
@@ -39,7 +39,7 @@ def stub_library() -> Path:
 
 
 def new_board(path: Path, mute: bool = False, share: float = 0.85) -> Path:
-    """Hardware as somebody left it: outputs at 7 V, or at another share of their range; `mute`: not to be read back."""
+    """Write hardware with outputs at 7 V, or at another share of their range; a `mute` board's cannot be read."""
     hardware = np.zeros(1, HARDWARE)
     hardware["magic"], hardware["code"], hardware["mute"] = MAGIC, round(share * HIGHEST_CODE), mute
     path.write_bytes(hardware.tobytes())
@@ -47,12 +47,12 @@ def new_board(path: Path, mute: bool = False, share: float = 0.85) -> Path:
 
 
 def hardware(path: Path) -> np.ndarray:
-    """The hardware, to look at and to break."""
+    """Return the mapped record of the hardware, which a test can read and change."""
     return np.memmap(path, HARDWARE, "r+", shape=(1,))
 
 
 def output_v(path: Path, channel: int) -> float:
-    """Volts at an output now."""
+    """Return the present voltage of an output."""
     board = hardware(path)[0]
     lowest, highest = OUTPUT_RANGES_V[board["range"][channel]]
     return float(lowest + board["code"][channel] * (highest - lowest) / HIGHEST_CODE)

@@ -1,8 +1,8 @@
 /* A stand-in for libcomedi and a board: a file whose outputs are looped back to its inputs.
  *
- * The file is the hardware: it outlives every process, and a test looks at it. Subdevice 0 has eight inputs of 16 bit
+ * The file is the hardware: it outlives every process, and a test can read it. Subdevice 0 has eight inputs of 16 bit
  * with the ranges ±10, ±5 and 0 … 5 V, subdevice 1 four outputs of 16 bit with ±10 and 0 … 5 V, subdevice 2 is digital.
- * Input i sees output i; those beyond see 0 V. Outputs can be read back unless the board is mute.
+ * Input i reads output i; inputs without an output read 0 V. Outputs can be read back unless the board is mute.
  */
 #define _GNU_SOURCE
 #include <errno.h>

@@ -1,8 +1,8 @@
-"""A bus that loses, doubles, delays and reorders what it receives, as a list says; python-can knows it as "faulty".
+"""A CAN bus that loses, doubles, delays and reorders received frames by a list; python-can's name for it is "faulty".
 
-It stands on python-can's `virtual` interface. Answer k (from 0) to the loop is handed over `deliveries[k]` ticks
-late each: () loses it, (0,) is a good bus, (0, 2) doubles it, (1,) reorders it behind its successor. A tick ends when
-the receiver was told that there is nothing more. What the loop sends, the node at the other end gets at once.
+The bus is built on python-can's `virtual` interface. `deliveries[k]` has the delay in ticks of each copy of answer k
+(from 0) to the loop: () loses the answer, (0,) is a good bus, (0, 2) doubles the answer, (1,) delivers it after its
+successor. A tick ends when a receive call has returned no frame. The node gets frames of the loop at once.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ FIRST_SAMPLE, LAST_SAMPLE = 0x180, 0x184
 
 
 class FaultyBus(VirtualBus):
-    """`deliveries` and `node` are set by the test; until then it is a good bus."""
+    """The faulty bus. A test sets `deliveries` and `node`; without `deliveries` the bus has no faults."""
 
     deliveries: Sequence[Sequence[int]] | None = None
     node: Callable[[], None] = staticmethod(lambda: None)

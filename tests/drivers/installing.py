@@ -1,4 +1,4 @@
-"""The third party's package as pip would leave it: files and entry points, as its own pyproject.toml says."""
+"""Installation of a third party's package without pip: the modules and entry points of its pyproject.toml."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from pathlib import Path
 
 
 def install(target: Path) -> Path:
-    """Put the package into the folder `target`, which then belongs on the path; returns it."""
+    """Install the package into the folder `target`, and return the folder, which must be on the Python path."""
     source = Path(__file__).with_name("third_party")
     pyproject = tomllib.loads((source / "pyproject.toml").read_text())
     project, modules = pyproject["project"], pyproject["tool"]["setuptools"]["py-modules"]
@@ -31,7 +31,7 @@ def write_distribution(target: Path, name: str, version: str, entry_points: str)
 
 
 def built_modules(folder: Path) -> list[str]:
-    """Names of the files that setuptools puts into the installed package of a folder, sorted."""
+    """Return the sorted names of the files that setuptools builds from the project in a folder."""
     target = folder / "built"
     shutil.rmtree(target, ignore_errors=True)
     command = [sys.executable, "-W", "ignore", "-c", "import setuptools; setuptools.setup()"]

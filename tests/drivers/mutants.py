@@ -1,4 +1,4 @@
-"""Drivers that break one promise of the contract each, in every way that the conformance suite must detect."""
+"""Drivers that each break one promise of the contract: the conformance suite must fail on every one."""
 
 from __future__ import annotations
 
@@ -18,6 +18,8 @@ Values = ctypes.Array[ctypes.c_double]
 
 
 class TouchesHardwareForItsFacts(LoopBack):
+    """Reading `facts` moves the outputs."""
+
     @property
     def facts(self) -> Facts:
         self.volts = [0.0, 0.0]
@@ -25,6 +27,8 @@ class TouchesHardwareForItsFacts(LoopBack):
 
 
 class ChangesItsFacts(LoopBack):
+    """`facts` differ at each access."""
+
     looks = 0
 
     @property
@@ -34,6 +38,8 @@ class ChangesItsFacts(LoopBack):
 
 
 class RefusesTheEndOfItsRange(LoopBack):
+    """`write` fails for the highest voltage of the range."""
+
     def write(self, volts: Sequence[float]) -> None:
         if volts[0] >= 5.0:
             raise ValueError("too much")
@@ -41,6 +47,8 @@ class RefusesTheEndOfItsRange(LoopBack):
 
 
 class WritesOneOutputOnly(LoopBack):
+    """`write` ignores the second output."""
+
     def write(self, volts: Sequence[float]) -> None:
         self.volts[0] = volts[0]
 
@@ -50,8 +58,8 @@ class Native(LoopBack):
 
     def open(self) -> Pointers:
         pointers = super().open()
-        self._own = FUNCTION(self.native_read), FUNCTION(self.native_write)
-        read, write = (ctypes.cast(function, ctypes.c_void_p).value or 0 for function in self._own)
+        self._functions = FUNCTION(self.native_read), FUNCTION(self.native_write)
+        read, write = (ctypes.cast(function, ctypes.c_void_p).value or 0 for function in self._functions)
         return pointers._replace(read=read, write=write)
 
     def native_read(self, _: int, values: Values) -> int:
@@ -62,14 +70,17 @@ class Native(LoopBack):
     def native_write(self, _: int, values: Values) -> int:
         if any(map(math.isnan, values[0:2])):
             return -1
-        self.volts = [self.admitted(volts, c) for volts, c in zip(values[0:2], self.facts.outputs, strict=True)]
+        self.volts = [self.limited(volts, c) for volts, c in zip(values[0:2], self.facts.outputs, strict=True)]
         return 0
 
-    def admitted(self, volts: float, channel: Channel) -> float:
+    def limited(self, volts: float, channel: Channel) -> float:
+        """Return the voltage limited to the channel's range."""
         return min(max(volts, channel.minimum_v), channel.maximum_v)
 
 
 class StepsToSafeForNotANumber(Native):
+    """A write with NaN moves the outputs to their safe values."""
+
     def native_write(self, _: int, values: Values) -> int:
         if any(map(math.isnan, values[0:2])):
             self.volts = [channel.safe_v for channel in self.facts.outputs]
@@ -78,18 +89,24 @@ class StepsToSafeForNotANumber(Native):
 
 
 class ReadsBeyondTheEnd(Native):
+    """A read writes a value behind the end of its array."""
+
     def native_read(self, _: int, values: Values) -> int:
         values[4] = 1.0
         return super().native_read(_, values)
 
 
 class LeavesTheAgeOut(Native):
+    """A read does not set the sample's age."""
+
     def native_read(self, _: int, values: Values) -> int:
         values[0], values[1], values[3] = *self.volts, 21.5
         return 0
 
 
 class ChangesWhatItIsGiven(Native):
+    """A write changes the array of the caller."""
+
     def native_write(self, _: int, values: Values) -> int:
         status = super().native_write(_, values)
         values[0] = 0.0
@@ -97,7 +114,7 @@ class ChangesWhatItIsGiven(Native):
 
 
 class TakesTheHardwareWithoutOpening(LoopBack):
-    """`close` before `open` does no harm, and yet nothing can be opened afterwards."""
+    """`close` before `open` succeeds, but every later `open` fails."""
 
     spoilt = False
 
@@ -112,38 +129,40 @@ class TakesTheHardwareWithoutOpening(LoopBack):
 
 
 class DeafAfterClose(LoopBack):
-    """Its second life reads nothing."""
+    """`read` fails after the second `open`."""
 
-    lives = 0
+    openings = 0
 
     def start(self) -> None:
-        self.lives += 1
+        self.openings += 1
         super().start()
 
     def read(self) -> Sequence[float]:
-        if self.lives > 1:
+        if self.openings > 1:
             raise OSError("no answer")
         return super().read()
 
 
 class MuteAfterClose(DeafAfterClose):
-    """Its second life writes nothing, but parks."""
+    """`write` fails after the second `open`; `close` still parks."""
 
     def read(self) -> Sequence[float]:
         return LoopBack.read(self)
 
     def write(self, volts: Sequence[float]) -> None:
-        if self.lives > 1:
+        if self.openings > 1:
             raise OSError("no answer")
         super().write(volts)
 
     def close(self) -> None:
-        if self.lives > 1:
+        if self.openings > 1:
             self._callbacks, self.volts = (), [0.0, 2.0]
         super().close()
 
 
 class ClosesOnce(LoopBack):
+    """A second `close` fails."""
+
     closed = False
 
     def close(self) -> None:
@@ -154,6 +173,8 @@ class ClosesOnce(LoopBack):
 
 
 class OpensOnce(LoopBack):
+    """`open` fails after the first time."""
+
     used = False
 
     def start(self) -> None:
@@ -164,10 +185,13 @@ class OpensOnce(LoopBack):
 
 
 def _changed_facts(**changes: Any) -> dict[str, Any]:
+    """Return members of a class whose facts differ from LoopBack's."""
     return {"facts": property(lambda driver: replace(LoopBack.facts.fget(driver), **changes))}
 
 
 def _changed_attributes(**changes: Any) -> dict[str, Any]:
+    """Return members of a class whose instances have other attributes than LoopBack's."""
+
     def initialise(driver: LoopBack) -> None:
         LoopBack.__init__(driver)
         vars(driver).update(changes)
@@ -176,6 +200,7 @@ def _changed_attributes(**changes: Any) -> dict[str, Any]:
 
 
 def _changed_pointers(**changes: Any) -> dict[str, Any]:
+    """Return members of a class whose `open` returns other pointers."""
     return {"open": lambda driver: type(driver).__base__.open(driver)._replace(**changes)}
 
 
@@ -211,24 +236,25 @@ _MEMBERS: dict[str, dict[str, Any]] = {
     "DoesNotPark": {"close": _assign(_callbacks=())},
     "ParksWithoutBeingOpen": {"close": _assign(volts=[0.0, 2.0])},
 }
-"""Members of LoopBack that a mutant replaces."""
+"""Members of LoopBack that each mutant replaces, by the mutant's name."""
 
 
-def _assign_outputs(driver: Native, values: Values) -> int:
-    driver.volts = [driver.admitted(volts, c) for volts, c in zip(values[0:2], driver.facts.outputs, strict=True)]
+def _write_unchecked(driver: Native, values: Values) -> int:
+    """Write the outputs without the check for NaN."""
+    driver.volts = [driver.limited(volts, c) for volts, c in zip(values[0:2], driver.facts.outputs, strict=True)]
     return 0
 
 
 _NATIVE_MEMBERS: dict[str, dict[str, Any]] = {
     "AddressesThatAreNone": _changed_pointers(context=None),
-    "PassesEverythingOn": {"admitted": lambda driver, volts, channel: volts},
-    "WritesNotANumber": {"native_write": lambda driver, _, values: _assign_outputs(driver, values)},
+    "PassesEverythingOn": {"limited": lambda driver, volts, channel: volts},
+    "WritesNotANumber": {"native_write": lambda driver, _, values: _write_unchecked(driver, values)},
 }
-"""Members of Native that a mutant replaces."""
+"""Members of Native that each mutant replaces, by the mutant's name."""
 
 
 def _descendants(kind: type[LoopBack]) -> list[type[LoopBack]]:
-    """Subclasses that stand in this file; other tests have their own."""
+    """Return the subclasses of a class that this module defines, with their subclasses."""
     children = [child for child in kind.__subclasses__() if child.__module__ == __name__]
     return [mutant for child in children for mutant in (child, *_descendants(child))]
 

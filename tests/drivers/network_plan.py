@@ -1,4 +1,4 @@
-"""Plans of a bad network: what happens to each datagram, drawn from a seed or written down."""
+"""Plans of a bad network: the copies of each datagram, drawn from a seed or listed by a test."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 
 class Copy(NamedTuple):
-    """A copy of a datagram: slots until it arrives, and its damage, "" for none."""
+    """A copy of a datagram: delay in slots until it arrives, and its damage, "" for none."""
 
     delay: int = 0
     damage: str = ""
@@ -18,7 +18,7 @@ class Copy(NamedTuple):
 DAMAGES = ("bits", "burst", "cut", "empty", "longer", "huge")
 
 
-def damaged(data: bytes, damage: str, chance: random.Random) -> bytes:
+def damage_datagram(data: bytes, damage: str, chance: random.Random) -> bytes:
     """Return the datagram with the damage: one to three bits or a burst of 32 bits, its end cut off, or more bytes."""
     if damage == "bits":
         for place in chance.sample(range(8 * len(data)), chance.randint(1, 3)):
@@ -37,10 +37,10 @@ def damaged(data: bytes, damage: str, chance: random.Random) -> bytes:
 
 @dataclass
 class Plan:
-    """Shares of datagrams that are lost, delayed, doubled and damaged in each direction, drawn from a seed.
+    """A random plan: shares of datagrams that are lost, delayed, doubled and damaged in each direction.
 
-    `delays` are the largest delays in slots. With `strangers`, a slot can have forged datagrams too: of another sender,
-    of an earlier run, and lies of the node.
+    `delays` are the largest delays in slots. `strangers` is the share of slots with each kind of forged datagram: from
+    another sender, of an earlier run, and false answers from the node's address.
     """
 
     seed: int
@@ -53,7 +53,7 @@ class Plan:
     chance: random.Random = field(init=False)
 
     def __post_init__(self) -> None:
-        """Begin the sequence of random numbers."""
+        """Seed the random numbers."""
         self.chance = random.Random(self.seed)
 
     def fate(self, direction: str) -> tuple[Copy, ...]:
@@ -69,7 +69,7 @@ class Plan:
 
 
 class Script(Plan):
-    """A plan that is written down: copies of each datagram by its direction and number; a good network otherwise."""
+    """A listed plan: copies of datagrams by direction and number; all other datagrams arrive once and at once."""
 
     def __init__(self, copies: dict[tuple[str, int], tuple[Copy, ...]] | None = None) -> None:
         super().__init__(0)

@@ -1,4 +1,4 @@
-"""Calls of the exchange with a node, compiled or, with NUMBA_DISABLE_JIT=1, as Python functions."""
+"""Calls of a node's driver, compiled or, with NUMBA_DISABLE_JIT=1, as Python functions."""
 
 from __future__ import annotations
 

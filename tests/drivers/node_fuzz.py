@@ -1,4 +1,4 @@
-"""Random bytes for the compiled exchange, run as plain Python: an index outside an array raises here.
+"""Random bytes for the compiled exchange, run as plain Python, where an index outside an array raises an error.
 
     NUMBA_DISABLE_JIT=1 python -m tests.drivers.node_fuzz KIND SEED COUNT
 
@@ -27,14 +27,14 @@ SCALES = (Scale(-1000, 1000, 0, 1, 0.01, 0.0),) * INPUTS
 
 
 def sample(sequence: int, codes: list[int], session: int = SESSION, boot: int = BOOT, flags: int = 1) -> bytes:
-    """A SAMPLE, written from docs/node-protocol.md."""
+    """Return the bytes of a SAMPLE, written from docs/node-protocol.md."""
     data = struct.pack("<HBBIIIBBHII", 0x057B, 0x73, 1, sequence, session, boot, flags, len(codes), 0, 0, 0)
     data += struct.pack(f"<{len(codes)}i", *codes)
     return data + struct.pack("<I", zlib.crc32(data))
 
 
-def damaged(frame: bytes, draw: random.Random) -> bytes:
-    """A frame with a bit changed, cut, grown, or of random bytes."""
+def damage(frame: bytes, draw: random.Random) -> bytes:
+    """Return a damaged frame: a changed bit, cut, grown, random bytes, or one changed byte with a right CRC."""
     kind = draw.randrange(5)
     if kind == 0:
         place = draw.randrange(len(frame))
@@ -51,16 +51,16 @@ def damaged(frame: bytes, draw: random.Random) -> bytes:
 
 
 def fuzz(kind: str, seed: int, count: int) -> dict[str, float]:
-    """Let `count` frames, half of them damaged, come in before a read each; return the counters at the end.
+    """Send `count` frames, half of them damaged, each before a read; return the counters at the end.
 
-    Raises IndexError for an index outside an array, AssertionError for a sample that no whole frame had.
+    Raises IndexError for an index outside an array, AssertionError for codes that no valid frame had.
     """
     draw = random.Random(seed)
     if kind == "udp":
         loop, node, strangers = (socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in range(3))
-        for end in (loop, node, strangers):
-            end.bind(("127.0.0.1", 0))
-            end.setblocking(False)
+        for endpoint in (loop, node, strangers):
+            endpoint.bind(("127.0.0.1", 0))
+            endpoint.setblocking(False)
         loop.connect(node.getsockname())
         fd, strangers_fd = loop.fileno(), strangers.fileno()
         send = lambda data: node.sendto(data, loop.getsockname())
@@ -74,20 +74,20 @@ def fuzz(kind: str, seed: int, count: int) -> dict[str, float]:
         boot=BOOT, hold_us=1000, running=1,
     )  # fmt: skip
     values, volts = np.zeros(INPUTS + 1 + len(OBSERVED)), np.zeros(INPUTS)
-    possible: set[tuple[int, ...]] = {(0, 0, 0)}
+    allowed_codes: set[tuple[int, ...]] = {(0, 0, 0)}
     for _ in range(count):
         node_write(card.ctypes.data, volts.ctypes.data)
         sequence = int(card["sequence"][0]) - draw.choice((0, 0, 0, 1, 2, 3000)) & 0xFFFFFFFF
         codes = [draw.randint(-1100, 1100) for _ in range(INPUTS)]
         frame = sample(sequence, codes)
         if draw.random() < 0.5:
-            frame = damaged(frame, draw)
+            frame = damage(frame, draw)
         if frame[-4:] == struct.pack("<I", zlib.crc32(frame[:-4])) and max(map(abs, codes)) <= 1000:
-            possible.add(tuple(codes))
+            allowed_codes.add(tuple(codes))
         send(frame)
         node_read(card.ctypes.data, values.ctypes.data)
         card["failure"] = 0
-        assert tuple(arrays["codes"].tolist()) in possible, arrays["codes"]
+        assert tuple(arrays["codes"].tolist()) in allowed_codes, arrays["codes"]
     return {name: int(card[name][0]) for name in COUNTS}
 
 

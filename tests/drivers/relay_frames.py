@@ -1,4 +1,4 @@
-"""Frames and arrivals as a relay between driver and node sees them, read from docs/node-protocol.md alone."""
+"""Frames and arrivals as a relay between driver and node sees them, written from docs/node-protocol.md alone."""
 
 from __future__ import annotations
 
@@ -9,29 +9,29 @@ from typing import NamedTuple, Protocol
 from tests.node.frames import DRIVE
 
 LOOP, STRANGER = "loop", "stranger"
-"""Senders, as the node sees them."""
+"""Names of the two senders from which the node receives datagrams."""
 
 
 class Node(Protocol):
-    """A node without a line of its own."""
+    """Interface of a node without a line: the relay calls it with each datagram."""
 
     def receive(self, data: bytes, sender: str, now_us: int) -> bytes:
-        """Process a datagram; return the answer, empty without one."""
+        """Process a datagram at a time; return the answer, or no bytes."""
         ...
 
     @property
     def outputs(self) -> tuple[int, ...]:
-        """Codes at the outputs."""
+        """Present codes of the outputs."""
         ...
 
     @property
     def counts(self) -> tuple[int, int]:
-        """Invalid frames and parkings by the watchdog."""
+        """Number of invalid frames, and of parkings by the watchdog."""
         ...
 
 
 class DriveFrame(NamedTuple):
-    """Fields of a DRIVE."""
+    """Fields of a DRIVE that the relay reads."""
 
     sequence: int
     session: int
@@ -49,7 +49,7 @@ def parse_drive(data: bytes) -> DriveFrame | None:
 
 
 class Arrival(NamedTuple):
-    """A datagram that arrived at the loop: "sample" with its sequence and codes, "invalid", "foreign" or "stranger"."""
+    """A datagram that arrived at the loop; `kind` is "sample", "refusal", "invalid", "foreign" or "stranger"."""
 
     kind: str
     sequence: int = 0

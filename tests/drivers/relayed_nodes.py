@@ -1,4 +1,4 @@
-"""Nodes behind a relay: the simulated one, and the library in C on a board of arrays."""
+"""The two nodes behind a relay: the simulated node, and the C library on a simulated board."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ LONG_HOLD_US = 10_000_000
 
 
 class CountingNode(SimulatedNode):
-    """The simulated node with an input whose codes count the readings; its rig stands still."""
+    """The simulated node with an input whose code is the number of readings."""
 
     readings = 0
 
@@ -26,28 +26,28 @@ class CountingNode(SimulatedNode):
 
 
 class PythonNode:
-    """The simulated node with one input and one output."""
+    """The simulated node with one input and one output; its plant stands still."""
 
     def __init__(self, boot: int | None = None) -> None:
         self._node = CountingNode(UdpOptions(park_slew_v_per_s=1e5), ["x"], boot)
         self._node._rig.advance_to = lambda elapsed_s: None
 
     def receive(self, data: bytes, sender: str, now_us: int) -> bytes:
-        """Process a datagram; return the answer, empty without one."""
+        """Process a datagram at a time; return the answer, or no bytes."""
         return self._node.receive(data, sender, now_us) or b""
 
     @property
     def outputs(self) -> tuple[int, ...]:
-        """Codes at the outputs."""
+        """Present codes of the outputs."""
         return tuple(self._node.codes)
 
     def volts(self, code: int) -> float:
-        """Volts of a code of the output."""
+        """Return the voltage of an output code."""
         return self._node._outputs[0].volts(code)
 
     @property
     def counts(self) -> tuple[int, int]:
-        """Invalid frames and parkings by the watchdog."""
+        """Number of invalid frames, and of parkings by the watchdog."""
         return self._node.invalid, self._node.watchdog_parkings
 
 
@@ -61,7 +61,7 @@ class LibraryNode:
         assert self._bench.start([source], [sink], (0, 0), LONG_HOLD_US, boot)
 
     def receive(self, data: bytes, sender: str, now_us: int) -> bytes:
-        """Process a datagram; return the answer, empty without one."""
+        """Process a datagram at a time; return the answer, or no bytes."""
         self._samples += 1
         self._bench.set_inputs([self._samples % LARGEST_CODE])
         self._bench.now_us = now_us
@@ -70,14 +70,14 @@ class LibraryNode:
 
     @property
     def outputs(self) -> tuple[int, ...]:
-        """Codes at the outputs."""
+        """Present codes of the outputs."""
         return tuple(self._bench.codes)
 
     def volts(self, code: int) -> float:
-        """Volts of a code of the output."""
+        """Return the voltage of an output code."""
         return code * 10 / LARGEST_CODE
 
     @property
     def counts(self) -> tuple[int, int]:
-        """Invalid frames and parkings by the watchdog."""
+        """Number of invalid frames, and of parkings by the watchdog."""
         return self._bench.counters.invalid, self._bench.counters.watchdog_trips

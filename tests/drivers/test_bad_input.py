@@ -1,4 +1,4 @@
-"""Faults of a driver's configuration and hardware, by the command line: one message each, exit 69 or 78."""
+"""Each fault of a driver's configuration or hardware gives one message on the command line and exit 69 or 78."""
 
 from __future__ import annotations
 
@@ -34,27 +34,32 @@ kind = "{kind}"
 HARDWARE, CONFIGURATION = 69, 78
 
 
-def write_text(path: Path) -> None:
+def write_other_content(path: Path) -> None:
+    """Make the device a file that is no hardware."""
     path.write_text("no hardware")
 
 
 def open_comedi(path: Path) -> Driver:
+    """Return an open comedi driver, which occupies the board."""
     driver = comedi(path)
     driver.open()
     return driver
 
 
 def open_shm(path: Path) -> Driver:
+    """Return an open shm driver, which occupies the board."""
     driver = ShmDriver(ShmOptions(file=str(path)), {"x": Wiring("adc0", "dac0")}, 1000.0)
     driver.open()
     return driver
 
 
 def remove_channels(path: Path) -> None:
+    """Set the board's number of channels to 0."""
     board_memory(path).facts["channels"] = 0
 
 
-def switch_off(path: Path) -> None:
+def end_board(path: Path) -> None:
+    """Leave the board's memory as after the board's end."""
     board_memory(path).facts["magic"] = 0
 
 
@@ -74,12 +79,13 @@ class Case:
     message: str
     code: int = HARDWARE
     hardware: Callable[[Path], Driver | None] = lambda path: None
-    """Brings the hardware into its state; returns the driver that uses it, if any."""
+    """Function that prepares the hardware; it returns a driver that stays open, or None."""
     options: dict[str, str] = field(default_factory=dict)
     channels: tuple[str, str] = ("ai0", "ao0")
 
 
 def shm(message: str, code: int = HARDWARE, **more: object) -> Case:
+    """Return a case of kind shm with the board's first channels."""
     return Case("shm", message, code, **{"channels": ("adc0", "dac0"), **more})  # type: ignore[arg-type]
 
 
@@ -91,7 +97,7 @@ CASES = {
     "comedi: no device": Case("comedi", "{device}: No such file or directory; load the board's kernel module",
                               hardware=Path.unlink),
     "comedi: not a device": Case("comedi", "{device}: Inappropriate ioctl for device; not a comedi device",
-                                 hardware=write_text),
+                                 hardware=write_other_content),
     "comedi: in use": Case("comedi", "{device}: subdevice 0: another program uses this subdevice; stop that program",
                            hardware=open_comedi),
     "comedi: channel": Case("comedi", "{device}: ao9 is not a channel of this board; allowed: ao0 … ao3",
@@ -108,9 +114,9 @@ CASES = {
                         options={"devise": '"/dev/comedi1"'}),
     "shm: no board": shm("{device}: No such file or directory; start the board with `rtloop hil serve CONFIG`",
                          hardware=Path.unlink),
-    "shm: not a board": shm("{device}: this file is not the memory of a board", hardware=write_text),
+    "shm: not a board": shm("{device}: this file is not the memory of a board", hardware=write_other_content),
     "shm: board ended": shm("{device}: no board is running; start the board with `rtloop hil serve CONFIG`",
-                            hardware=switch_off),
+                            hardware=end_board),
     "shm: in use": shm("{device}: another controller drives this board; stop the other controller", hardware=open_shm),
     "shm: too few channels": shm("{device}: the board has 0 channels; allowed: at least 1", hardware=remove_channels),
     "shm: channel": shm("driver.channels.x: 'adc7' is not a channel of this driver; allowed: adc0", CONFIGURATION,
@@ -122,7 +128,7 @@ CASES = {
 
 @pytest.fixture
 def prepare(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[Case], tuple[Path, Path]]]:
-    """Write a case's configuration and hardware and return their paths."""
+    """Yield a function that writes a case's configuration and hardware and returns their paths."""
     monkeypatch.setenv("RUNTIME_DIRECTORY", str(tmp_path / "run"))
     config, device, users = tmp_path / "lab.toml", tmp_path / "device", list[Driver]()
 
@@ -145,12 +151,13 @@ def prepare(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callabl
 
 
 def check_and_park(config: Path) -> list[Result]:
+    """Return the results of `rtloop check` and `rtloop park`."""
     return [CliRunner().invoke(main, [command, str(config)]) for command in ("check", "park")]
 
 
 @pytest.mark.parametrize("case", CASES.values(), ids=CASES)
 def test_a_fault_gives_one_clear_message(prepare, case):
-    """`check` finds faults of the configuration; a command that opens the hardware finds its faults, too."""
+    """`check` finds faults of the configuration; `park`, which opens the hardware, also finds those of the hardware."""
     config, device = prepare(case)
     checked, opened = check_and_park(config)
     assert checked.exit_code == (0 if case.code == HARDWARE else CONFIGURATION)
@@ -171,7 +178,8 @@ def test_limits_of_the_law_are_judged_by_check_and_do_not_prevent_parking(prepar
     assert "ao0 has no range [-5.0, 5.0] V" in parked.stderr
 
 
-def run(config: Path, *prefix: str) -> CompletedProcess[str]:
+def run_loop(config: Path, *prefix: str) -> CompletedProcess[str]:
+    """Run a loop for one second in a separate process, behind a command `prefix`, and return the result."""
     command = (sys.executable, "-m", "rtloop", "run", config, "--duration", "1", "--out", config.parent)
     return completed(*prefix, *command)
 
@@ -179,17 +187,18 @@ def run(config: Path, *prefix: str) -> CompletedProcess[str]:
 @pytest.mark.parametrize("name", ["comedi: in use", "shm: in use"])
 def test_run_gives_the_same_message(prepare, name):
     config, device = prepare(CASES[name])
-    result = run(config)
+    result = run_loop(config)
     assert result.returncode == HARDWARE
     assert result.stderr.strip() == f"rtloop: {CASES[name].message.format(device=device)}"
 
 
 @pytest.mark.parametrize("case", [Case("comedi", ""), shm("")], ids=["comedi", "shm"])
 def test_missing_permission_is_named(prepare, case):
-    """Root, too, is refused without its privilege to read any file."""
+    """The test also holds for root, whose privilege to read any file is dropped."""
     config, device = prepare(case)
     device.chmod(0)
-    result = run(config, *(("setpriv", "--bounding-set=-dac_override,-dac_read_search") if os.getuid() == 0 else ()))
+    prefix = ("setpriv", "--bounding-set=-dac_override,-dac_read_search") if os.getuid() == 0 else ()
+    result = run_loop(config, *prefix)
     assert result.returncode == HARDWARE
     assert f"rtloop: {device}: Permission denied; " in result.stderr
     assert "Traceback" not in result.stderr

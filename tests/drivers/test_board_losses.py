@@ -1,4 +1,7 @@
-"""Samples that a board drops or repeats: as many as the seed says, and what of them reaches the controller."""
+"""Samples that a board drops or repeats: their number follows from the seed, and none reaches the controller.
+
+The oracle is a second xorshift64 generator with the same seed.
+"""
 
 from __future__ import annotations
 
@@ -20,14 +23,14 @@ SLICES = 3
 
 
 def run_board(path: Path, **options: float) -> tuple[int, BoardMemory]:
-    """A board that ran for a few slices: its samples and its memory."""
-    looks = iter([False] * SLICES)
-    samples = serve(path, BoardOptions.model_validate(options), ["x"], RATE_HZ, lambda: next(looks, True))
+    """Run a board for SLICES slices; return its number of samples and its memory."""
+    ends = iter([False] * SLICES)
+    samples = serve(path, BoardOptions.model_validate(options), ["x"], RATE_HZ, lambda: next(ends, True))
     return samples, board_memory(path)
 
 
-def chances(seed: int, count: int) -> np.ndarray:
-    """States of xorshift64 as numbers from 0 to 1."""
+def random_shares(seed: int, count: int) -> np.ndarray:
+    """Return the first `count` states of xorshift64 as numbers from 0 to 1."""
     first = int.from_bytes(hashlib.sha256(f"{seed}/losses".encode()).digest()[:8], "little")
     return np.array([(word >> 11) / 2**53 for word in islice(xorshift64(first), count)])
 
@@ -35,7 +38,7 @@ def chances(seed: int, count: int) -> np.ndarray:
 @pytest.mark.parametrize("seed", [0, 7])
 def test_losses_are_determined_by_the_seed(tmp_path, seed):
     samples, memory = run_board(tmp_path / "board", dropped_share=0.1, repeated_share=0.05, seed=seed)
-    drawn = chances(seed, samples)
+    drawn = random_shares(seed, samples)
     assert samples == SLICES * RATE_HZ * 0.02
     assert memory.words[DROPPED] == np.sum(drawn < 0.1) > 0
     assert memory.words[REPEATED] == np.sum((drawn >= 0.1) & (drawn < 0.1 + 0.05)) > 0
@@ -47,7 +50,7 @@ def test_losses_are_determined_by_the_seed(tmp_path, seed):
     [({}, True, True), ({"dropped_share": 1.0}, False, False), ({"repeated_share": 1.0}, False, True)],
 )
 def test_lost_values_and_times_do_not_reach_the_controller(tmp_path, options, value, time):
-    """The sensor's offset is what a value would show; a memory that nothing reached holds zeros."""
+    """The sensor has an offset: a delivered value is not 0, while untouched memory holds zeros."""
     plant = {"sensor": {"offset_um": 20.0, "um_per_v": 10.0}}
     samples, memory = run_board(tmp_path / "board", plant=plant, **options)  # type: ignore[arg-type]
     assert samples

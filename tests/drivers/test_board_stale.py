@@ -1,7 +1,7 @@
-"""A board at a rate of its own that is paused, killed and started again during a run.
+"""A board with its own rate that is paused, killed and started again during a run trips the loop in time.
 
-How late the trip came is counted in ticks of the recording: never more than the limit on the sample's age holds, and
-one, whatever else the machine did meanwhile.
+The delay of a trip is counted in ticks of the recording. It may exceed the ticks of the limit on the sample's age by
+at most two, whatever else the machine did meanwhile.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ CHANGES = (
 
 
 def drive_again(bench: Bench) -> None:
-    """Reset the trip and close the loop; twice again if a stall of the host trips it meanwhile."""
+    """Reset the trip and close the loop; retry twice, as a stall of the host may trip the loop again."""
     for _ in range(2):
         with suppress(AssertionError, RtloopError):
             return bench.recover()
@@ -60,27 +60,28 @@ def test_a_board_that_stops_trips_within_the_ticks_of_the_limit_and_a_reset_reco
         assert bench.stop() == 0
         assert account(tmp_path / "recordings", bench.blocks).problems == []
     recording = rtloop.load(sorted((tmp_path / "recordings").glob("*.mcap")))
-    late = [ticks_stale(recording, event) for event in recording.events if stale(event)]
+    late = [count_stale_ticks(recording, event) for event in recording.events if is_stale_trip(event)]
     assert len(late) >= 2
     with capsys.disabled():
         print(f"\nstale after {late} ticks; the limit holds {LIMIT_TICKS}")
-    assert max(late) <= LIMIT_TICKS + 2  # up to a period more than the limit, and both its ends
+    assert max(late) <= LIMIT_TICKS + 2  # one tick for the period after the limit, one because both ends count
 
 
-def stale(event) -> bool:
+def is_stale_trip(event) -> bool:
+    """Return whether an event is a trip by a stale sample."""
     return event["kind"] == "tripped" and "stale" in event["what"]["causes"]
 
 
-def ticks_stale(recording, event) -> int:
-    """Ticks that woke from the newest sample to the trip, which came in the first that was beyond the limit."""
-    before = recording["tick"] <= event["tick"]
-    age_us, read_us = recording["sample_age_us"][before], recording["read_us"][before]
+def count_stale_ticks(recording, event) -> int:
+    """Return the number of ticks from the newest sample to the trip, whose sample must be the first too old."""
+    until_trip = recording["tick"] <= event["tick"]
+    age_us, read_us = recording["sample_age_us"][until_trip], recording["read_us"][until_trip]
     assert age_us[-1] > LIMIT_US
     assert age_us[-2] <= LIMIT_US
-    wake_us = recording["deadline_ns"][before] * 1e-3 + recording["lateness_us"][before]
-    # a tick may be held up between waking and reading: then the sample seems older than it is, in that tick alone
-    taken_us = np.max((wake_us + read_us - age_us)[-LIMIT_TICKS // 2 :])
-    return int(np.sum(wake_us > taken_us))
+    wake_us = recording["deadline_ns"][until_trip] * 1e-3 + recording["lateness_us"][until_trip]
+    # A tick may be delayed between waking and reading: its sample seems older than it is, in that tick alone.
+    sampled_us = np.max((wake_us + read_us - age_us)[-LIMIT_TICKS // 2 :])
+    return int(np.sum(wake_us > sampled_us))
 
 
 @pytest.mark.parametrize("key", ["dropped_share", "repeated_share"])
@@ -96,15 +97,15 @@ def test_a_loop_on_a_board_of_50_khz_loses_nothing_and_replays(tmp_path, capsys)
     config.write_text(on_a_board(tmp_path, *changes))
     rtloop_command = (sys.executable, "-m", "rtloop")
     with (tmp_path / "log").open("w") as log:
-        served = subprocess.Popen([*rtloop_command, "hil", "serve", config], env=ENVIRONMENT, stderr=log)
+        board_process = subprocess.Popen([*rtloop_command, "hil", "serve", config], env=ENVIRONMENT, stderr=log)
         try:
             wait_for(lambda: "board at" in (tmp_path / "log").read_text(), "a board", 120.0)
-            wait_for(lambda: running(tmp_path / "board"), "samples", 120.0)
+            wait_for(lambda: has_samples(tmp_path / "board"), "samples", 120.0)
             result = completed(*rtloop_command, "run", config, "--duration", "1", "--json")
             memory = board_memory(tmp_path / "board")
         finally:
-            served.send_signal(signal.SIGTERM)
-            served.wait()
+            board_process.send_signal(signal.SIGTERM)
+            board_process.wait()
     assert result.returncode == 0, result.stderr
     summary = json.loads(result.stdout)
     assert memory.facts["rate_hz"] == 50_000
@@ -116,7 +117,8 @@ def test_a_loop_on_a_board_of_50_khz_loses_nothing_and_replays(tmp_path, capsys)
     assert replay(rtloop.load(summary["recording"])).identical
 
 
-def running(path: Path) -> bool:
+def has_samples(path: Path) -> bool:
+    """Return whether a board's memory exists and has had more than 1,000 samples."""
     return (
         path.exists()
         and path.stat().st_size >= board.file_bytes()

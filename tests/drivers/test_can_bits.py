@@ -1,4 +1,4 @@
-"""The length of frames against frames that are built and stuffed bit by bit."""
+"""Lengths and highest rates of CAN frames, compared with frames built bit by bit and with figures of the literature."""
 
 from __future__ import annotations
 
@@ -13,17 +13,18 @@ from rtloop.drivers.can.frames import DBC, choose_exchange, load_frames
 from rtloop.drivers.can.options import BusOptions
 from tests.drivers import can_oracle as oracle
 
-NASTY = st.sampled_from([0x00, 0xFF, 0x0F, 0xF0, 0x1E, 0xE1, 0x3C, 0xC3, 0x78, 0x87, 0x07, 0xF8])
+STUFFED_BYTES = st.sampled_from([0x00, 0xFF, 0x0F, 0xF0, 0x1E, 0xE1, 0x3C, 0xC3, 0x78, 0x87, 0x07, 0xF8])
 IDENTIFIERS = st.integers(0, 0x7FF) | st.sampled_from([0x000, 0x078, 0x087, 0x0F0, 0x1E1, 0x7FF])
 
 
-def data_of(length: int) -> st.SearchStrategy[bytes]:
-    return st.lists(NASTY | st.integers(0, 255), min_size=length, max_size=length).map(bytes)
+def data_bytes(length: int) -> st.SearchStrategy[bytes]:
+    """Return a strategy for `length` bytes, among which bytes that need many stuff bits are frequent."""
+    return st.lists(STUFFED_BYTES | st.integers(0, 255), min_size=length, max_size=length).map(bytes)
 
 
 @pytest.mark.parametrize("length", range(9))
 def test_the_worst_stream_reaches_the_classic_bound(length):
-    sent = oracle.stuffed(oracle.worst(34 + 8 * length))
+    sent = oracle.stuff(oracle.most_stuffed(34 + 8 * length))
     assert len(sent) + len(oracle.END) == classic_frame_bits(length)
 
 
@@ -33,15 +34,15 @@ def test_classic_lengths_of_the_literature():
 
 
 @settings(max_examples=300)
-@given(IDENTIFIERS, st.integers(0, 8).flatmap(data_of))
+@given(IDENTIFIERS, st.integers(0, 8).flatmap(data_bytes))
 def test_no_classic_frame_is_longer(identifier, data):
-    assert len(oracle.classic(identifier, data)) <= classic_frame_bits(len(data))
+    assert len(oracle.classic_frame(identifier, data)) <= classic_frame_bits(len(data))
 
 
 @settings(max_examples=300)
-@given(IDENTIFIERS, st.sampled_from(oracle.FD_LENGTHS).flatmap(data_of))
+@given(IDENTIFIERS, st.sampled_from(oracle.FD_LENGTHS).flatmap(data_bytes))
 def test_no_fd_frame_is_longer(identifier, data):
-    slow, fast = oracle.fd(identifier, data)
+    slow, fast = oracle.fd_frame_lengths(identifier, data)
     most_slow, most_fast = fd_frame_bits(len(data))
     assert slow <= most_slow
     assert slow + fast <= most_slow + most_fast
@@ -51,21 +52,24 @@ def test_no_fd_frame_is_longer(identifier, data):
 
 @pytest.mark.parametrize("length", FD_LENGTHS)
 def test_the_worst_stream_reaches_the_fd_bound_in_all(length):
-    stuff = len(oracle.stuffed(oracle.worst(22 + 8 * length))) - (22 + 8 * length)
-    slow, fast = oracle.fd(0x555, bytes(length))
-    unstuffed = slow + fast - (len(_dynamic(length)) - (22 + 8 * length))
+    stuff = len(oracle.stuff(oracle.most_stuffed(22 + 8 * length))) - (22 + 8 * length)
+    slow, fast = oracle.fd_frame_lengths(0x555, bytes(length))
+    unstuffed = slow + fast - (len(_stuffed_part(length)) - (22 + 8 * length))
     assert sum(fd_frame_bits(length)) == unstuffed + stuff
 
 
-def _dynamic(length: int) -> list[int]:
-    """The same frame's part that is stuffed as the bits require."""
-    code = oracle.bits_of(oracle.FD_LENGTHS.index(length), 4)
-    head = [0, *oracle.bits_of(0x555, 11), 0, 0, 1, 0, 1, 0, *code]
-    return oracle.stuffed([*head, *[0] * (8 * length)])
+def _stuffed_part(length: int) -> list[int]:
+    """Return identifier 0x555, control field and `length` zero bytes of a CAN FD frame, with their stuff bits."""
+    code = oracle.to_bits(oracle.FD_LENGTHS.index(length), 4)
+    head = [0, *oracle.to_bits(0x555, 11), 0, 0, 1, 0, 1, 0, *code]
+    return oracle.stuff([*head, *[0] * (8 * length)])
 
 
-def fd_s(length: int, data_bitrate: float) -> float:
-    """34 slow bits, then 5 + 8n, a CRC field of 27 or 32, and the stuff bits that are not among the slow ones."""
+def fd_frame_s(length: int, data_bitrate: float) -> float:
+    """Return the time in s of a CAN FD frame of `length` bytes at 1 Mbit/s and `data_bitrate` in the worst case.
+
+    34 slow bits, then fast ones: 5 + 8n, a CRC field of 27 or 32, and the stuff bits that are not slow.
+    """
     return 34e-6 + (5 + 8 * length + (27 if length <= 16 else 32) + (21 + 8 * length) // 4 - 4) / data_bitrate
 
 
@@ -75,9 +79,9 @@ def fd_s(length: int, data_bitrate: float) -> float:
         (BusOptions(), 1, 1e6 / (95 + 115)),
         (BusOptions(), 2, 1e6 / (115 + 135)),
         (BusOptions(bitrate=500_000), 1, 5e5 / (95 + 115)),
-        (BusOptions(fd=True, data_bitrate=5_000_000), 1, 1 / (fd_s(4, 5e6) + fd_s(6, 5e6))),
-        (BusOptions(fd=True, data_bitrate=5_000_000), 2, 1 / (fd_s(6, 5e6) + fd_s(8, 5e6))),
-        (BusOptions(fd=True, data_bitrate=8_000_000), 3, 1 / (2 * fd_s(20, 8e6))),
+        (BusOptions(fd=True, data_bitrate=5_000_000), 1, 1 / (fd_frame_s(4, 5e6) + fd_frame_s(6, 5e6))),
+        (BusOptions(fd=True, data_bitrate=5_000_000), 2, 1 / (fd_frame_s(6, 5e6) + fd_frame_s(8, 5e6))),
+        (BusOptions(fd=True, data_bitrate=8_000_000), 3, 1 / (2 * fd_frame_s(20, 8e6))),
     ],
 )
 def test_the_highest_rate(options, channels, rate_hz):

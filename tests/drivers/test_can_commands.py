@@ -1,4 +1,4 @@
-"""The commands on a CAN bus as a user gives them: node and loop as processes, and what is said where none can be."""
+"""Commands on a CAN bus: node and loop as processes, and the message and exit code of each fault."""
 
 from __future__ import annotations
 
@@ -34,10 +34,12 @@ def run_command(*arguments: str | Path) -> tuple[int, str, str]:
 
 @pytest.fixture
 def config(tmp_path: Path) -> Path:
+    """Return a configuration of a loop and a node on a free port."""
     return configuration(tmp_path, free_port())
 
 
 def replace_text(config: Path, old: str, new: str) -> None:
+    """Replace the first `old` in a configuration file."""
     config.write_text(config.read_text().replace(old, new, 1))
 
 
@@ -65,7 +67,7 @@ def test_a_run_over_the_bus_loses_nothing_and_replays(config, first):
     assert answer("replay", summary["recording"])["identical"] is True
 
 
-BAD = {
+FAULTS = {
     "the rate": (
         "rate_hz = 500.0",
         "rate_hz = 5000",
@@ -79,9 +81,9 @@ BAD = {
 }
 
 
-@pytest.mark.parametrize("fault", BAD)
+@pytest.mark.parametrize("fault", FAULTS)
 def test_a_bad_configuration_is_refused(config, fault):
-    old, new, message = BAD[fault]
+    old, new, message = FAULTS[fault]
     replace_text(config, old, new)
     with pytest.raises(ConfigError, match=message):
         prepare(load(config))
@@ -113,8 +115,8 @@ def test_a_dbc_with_other_signals_is_refused_by_name(config: Path, case: str):
 
 
 def test_a_rate_above_the_bus_is_refused_by_the_command(tmp_path):
-    ran = run("check", configuration(tmp_path, free_port(), rate_hz=4800.0))
-    assert (ran.exit_code, "4800 Hz; allowed with driver 'can': at most 4761.9 Hz" in ran.stderr) == (78, True)
+    result = run("check", configuration(tmp_path, free_port(), rate_hz=4800.0))
+    assert (result.exit_code, "4800 Hz; allowed with driver 'can': at most 4761.9 Hz" in result.stderr) == (78, True)
 
 
 @pytest.mark.parametrize(

@@ -28,7 +28,7 @@ from tests.drivers.can_bench import free_port, options_on
 from tests.drivers.processes import ENVIRONMENT
 from tests.faults.evidence import wait_for
 
-ONE = {"x": Wiring("adc0", "dac0")}
+ONE_AXIS = {"x": Wiring("adc0", "dac0")}
 RATE_HZ = 500.0
 WATCHDOG_MS = 300.0
 WITNESS = struct.Struct("<qdq")
@@ -42,37 +42,38 @@ from tests.drivers.test_can_contract import WATCHDOG_MS, WITNESS
 
 options = options_on(int(sys.argv[1]), watchdog_ms=WATCHDOG_MS)
 with open(sys.argv[2], "r+b") as file:
-    seen = mmap.mmap(file.fileno(), WITNESS.size)
+    witness = mmap.mmap(file.fileno(), WITNESS.size)
 with open_bus(options) as bus:
     node = RigNode(bus, options, ["x"])
     node.require_alone()
     while True:
         node.step()
-        WITNESS.pack_into(seen, 0, node.samples, node.drive_v[0], node.parked)
+        WITNESS.pack_into(witness, 0, node.samples, node.drive_v[0], node.parked)
 """
 
 
 class Node:
-    """A node's process, with the record of its work."""
+    """A simulated CAN node's process, with a record of its work in shared memory."""
 
     def __init__(self, folder: Path) -> None:
         self.port, path = free_port(), folder / "witness"
         path.write_bytes(bytes(WITNESS.size))
         with path.open("r+b") as file:
-            self._seen = mmap.mmap(file.fileno(), WITNESS.size)
+            self._witness = mmap.mmap(file.fileno(), WITNESS.size)
         command = [sys.executable, "-c", PROGRAM, str(self.port), str(path)]
         self.process = subprocess.Popen(command, env=ENVIRONMENT)
 
     def driver(self, **more: object) -> CanDriver:
-        return CanDriver(options_on(self.port, **{"hold_ticks": 100, "wait_s": 60.0} | more), ONE, RATE_HZ)
+        """Return a driver of this node, not yet open."""
+        return CanDriver(options_on(self.port, **{"hold_ticks": 100, "wait_s": 60.0} | more), ONE_AXIS, RATE_HZ)
 
     @property
-    def seen(self) -> tuple[int, float, int]:
-        """Samples, output in V, how often its watchdog parked it."""
-        return WITNESS.unpack_from(self._seen)
+    def record(self) -> tuple[int, float, int]:
+        """Number of samples, output in V, number of parkings by the watchdog."""
+        return WITNESS.unpack_from(self._witness)
 
-    def sleeps(self) -> bool:
-        """Whether the process waits for a message, not for a processor."""
+    def is_waiting(self) -> bool:
+        """Return whether the process waits for a message, not for a processor."""
         return Path(f"/proc/{self.process.pid}/stat").read_text().rpartition(")")[2].split()[0] == "S"
 
     def end(self) -> None:
@@ -82,6 +83,7 @@ class Node:
 
 @pytest.fixture(scope="module")
 def node(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Node]:
+    """Yield a node's process that runs for the whole module."""
     node = Node(tmp_path_factory.mktemp("node"))
     yield node
     node.end()
@@ -96,19 +98,19 @@ class TestNode(DriverContract):
         return self.node.driver()
 
     def outputs(self, driver: Driver) -> Sequence[float] | None:
-        """Wait until the node is at rest and has followed all frames, and return its output."""
+        """Return the output once the node waits for a message and its record no longer changes."""
         last = None
-        while last != (last := self.node.seen[:2]) or not self.node.sleeps():
+        while last != (last := self.node.record[:2]) or not self.node.is_waiting():
             time.sleep(0.05)
-        return [self.node.seen[1]]
+        return [self.node.record[1]]
 
 
 def test_a_silent_controller_gets_the_outputs_parked(node):
     with opened(node.driver()) as calls:
-        before = node.seen[2]
+        before = node.record[2]
         assert calls.write([4.0]) == 0
-        wait_for(lambda: node.seen[1] == pytest.approx(4.0, abs=2e-4), "the drive")
-        wait_for(lambda: node.seen[1] == 0.0 and node.seen[2] == before + 1, "a parked output")
+        wait_for(lambda: node.record[1] == pytest.approx(4.0, abs=2e-4), "the drive")
+        wait_for(lambda: node.record[1] == 0.0 and node.record[2] == before + 1, "a parked output")
 
 
 def test_a_stopped_node_shows_in_status_and_age(node):
@@ -148,8 +150,8 @@ def test_an_intruder_fails_the_driver(node):
         bus.send(can.Message(arbitration_id=0x100, data=bytes([9, 0, 0, 16]), is_extended_id=False))
     wait_for(lambda: calls.read()[0] == -1, "a failed read")
     assert "another controller drives this node" in str(driver.error)
-    wait_for(lambda: node.seen[1] == 0.0, "a parked output")
-    driver.open()  # where it is alone again
+    wait_for(lambda: node.record[1] == 0.0, "a parked output")
+    driver.open()  # the intruder is gone
     driver.close()
 
 
@@ -157,7 +159,7 @@ def test_a_bus_that_fails_at_its_closing_is_closed(node, monkeypatch: pytest.Mon
     driver, closings = node.driver(), list[int]()
     calls = DriverCalls(driver.open(), driver.facts)
     assert calls.write([3.0]) == 0
-    wait_for(lambda: node.seen[1] == pytest.approx(3.0, abs=2e-4), "the drive")
+    wait_for(lambda: node.record[1] == pytest.approx(3.0, abs=2e-4), "the drive")
     shut_down = UdpMulticastBus.shutdown
 
     def fail(bus: UdpMulticastBus) -> None:
@@ -167,9 +169,9 @@ def test_a_bus_that_fails_at_its_closing_is_closed(node, monkeypatch: pytest.Mon
 
     monkeypatch.setattr(UdpMulticastBus, "shutdown", fail)
     assert calls.write([0.0]) == 0
-    driver.close()  # The node has answered the last frame then.
+    driver.close()  # `close` waits for the answer to the last frame.
     assert closings == [1]
-    wait_for(lambda: node.seen[1] == 0.0, "a drive of 0 V")
+    wait_for(lambda: node.record[1] == 0.0, "a drive of 0 V")
     monkeypatch.undo()
     driver.open()
     driver.close()

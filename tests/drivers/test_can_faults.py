@@ -1,4 +1,7 @@
-"""Frames lost, doubled, reordered and delayed at random: counted exactly, held or tripped as configured."""
+"""Frames lost, doubled, reordered and delayed at random are counted exactly, and held or tripped as configured.
+
+The oracle, `expected_counts`, counts from the frames that the bus handed over.
+"""
 
 from __future__ import annotations
 
@@ -33,7 +36,7 @@ PLAN = LoopBench(RAW).plan
 
 
 class FaultyLoop:
-    """A whole loop, its node, and the bad bus between them, in virtual time."""
+    """A run of a loop and its node, with the faulty bus between them, in virtual time."""
 
     def __init__(self, deliveries: list[tuple[int, ...]], hold_ticks: int) -> None:
         options = CanOptions(interface="virtual", channel=f"faulty-{next(CHANNELS)}", hold_ticks=hold_ticks)
@@ -46,7 +49,7 @@ class FaultyLoop:
         bench = LoopBench(replace(PLAN, observed=OBSERVED), self.driver)
         bus = self.driver._bus
         assert isinstance(bus, FaultyBus)
-        bench.run(1)  # the first tick asks for its sample itself
+        bench.run(1)  # the first tick requests its own sample
         bus.deliveries = deliveries
         self.rows = bench.run(TICKS)
         self.columns = bench.plan.columns
@@ -56,17 +59,18 @@ class FaultyLoop:
         self.node_bus.shutdown()
 
     def column(self, name: str) -> np.ndarray:
+        """Return one column of the rows (ticks)."""
         return self.rows[:, self.columns.index(name)]
 
 
-def accounts(arrivals: list[list[int]]) -> list[dict[str, int]]:
-    """Return the counts of faults after each tick, by their definitions; tick k awaits answer k + 1."""
+def expected_counts(arrivals: list[list[int]]) -> list[dict[str, int]]:
+    """Return the counts of faults after each tick, by their definitions; in tick k, answer k + 1 is due."""
     received: list[int] = []
     held, counts = 0, []
     for tick, numbers in enumerate(arrivals):
         received += numbers
         firsts = [number for i, number in enumerate(received) if number not in received[:i]]
-        late = sum(any(other > number for other in firsts[:i]) for i, number in enumerate(firsts))
+        late = sum(any(earlier > number for earlier in firsts[:i]) for i, number in enumerate(firsts))
         newest = max(firsts, default=0)
         held += newest != tick + 1
         counts.append({"can_lost_samples": newest - len(firsts), "can_reordered_samples": late,
@@ -78,11 +82,11 @@ def accounts(arrivals: list[list[int]]) -> list[dict[str, int]]:
 @given(SCRIPTS, st.integers(0, 6))
 def test_faults_are_counted_exactly_and_held_or_tripped(deliveries, hold_ticks):
     loop = FaultyLoop(deliveries, hold_ticks)
-    truth = accounts(loop.arrivals)
-    for name in truth[0]:
-        assert loop.column(name).tolist() == [row[name] for row in truth], name
+    expected = expected_counts(loop.arrivals)
+    for name in expected[0]:
+        assert loop.column(name).tolist() == [row[name] for row in expected], name
     assert not np.any(loop.column("can_invalid_frames"))
-    held = np.diff([0, *(row["can_held_ticks"] for row in truth)])
+    held = np.diff([0, *(row["can_held_ticks"] for row in expected)])
     assert loop.column("driver_status").tolist() == held.tolist()
     runs = list(accumulate(held, lambda run, is_held: (run + 1) * bool(is_held), initial=0))
     beyond = np.array(runs[1:]) > hold_ticks
@@ -106,7 +110,7 @@ def test_the_sample_is_that_of_the_drive_before():
 
 @pytest.mark.parametrize("highest", [1500, 65535])
 def test_numbers_wrap_round(highest):
-    """Three rounds with every 7th answer lost, every 11th doubled, every 13th and its successor swapped."""
+    """Count three rounds of sequence numbers with lost (every 7th), doubled (11th) and swapped (13th) answers."""
     stream, waiting = AnswerStream(highest), None
     lost = doubled = swapped = 0
     for number in range(1, 3 * highest + 1):

@@ -1,4 +1,4 @@
-"""The simulated node's outputs when drive frames stop and come again, by a clock that the test turns."""
+"""Outputs of the simulated CAN node when drive frames stop and come again, by a clock that the test advances."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ SILENT = None
 
 
 class Wire:
-    """A bus with one node: messages for it, one at a time; nobody hears its answers."""
+    """A bus that gives the node queued messages, one at a time, and drops its answers."""
 
     def __init__(self) -> None:
         self.messages: deque[Any] = deque()
@@ -34,7 +34,7 @@ class Wire:
 
 
 class Bench:
-    """A node that is stepped once a period, with a drive frame or without."""
+    """A node that a test steps once a period, with or without a drive frame."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.now_s, self.sequence = 0.0, 0
@@ -43,45 +43,46 @@ class Bench:
         self.drive = choose_exchange(load_frames(self.options), 1, self.options).drive
         self.wire = Wire()
         self.node = RigNode(self.wire, self.options, ["x"])
-        self._hear(0, 0.0)
+        self._queue_drive(0, 0.0)
         self.node.step()
 
     def outputs(self, drive_v: float | None, periods: int) -> np.ndarray:
-        """Volts at the node's output after each of some periods in which it is asked for `drive_v`, or for nothing."""
+        """Return the output in V after each of `periods` periods with the drive `drive_v`, or with none (SILENT)."""
         outputs_v = []
         for _ in range(periods):
             self.now_s += PERIOD_S
             if drive_v is not SILENT:
                 self.sequence += 1
-                self._hear(self.sequence, drive_v)
+                self._queue_drive(self.sequence, drive_v)
             self.node.step()
             outputs_v.append(self.node.drive_v[0])
         return np.array(outputs_v)
 
-    def _hear(self, sequence: int, drive_v: float) -> None:
+    def _queue_drive(self, sequence: int, drive_v: float) -> None:
         self.wire.messages.append(self.drive.message(self.options, (sequence, drive_v)))
 
 
 @pytest.fixture
 def bench(monkeypatch: pytest.MonkeyPatch) -> Bench:
+    """Return a node that has received its first drive frame."""
     return Bench(monkeypatch)
 
 
 def test_a_silence_is_bridged_and_then_ramped_to_zero(bench):
     assert np.allclose(bench.outputs(5.0, 3), 5.0, atol=LSB_V)
-    silent = bench.outputs(SILENT, 120)
-    assert np.allclose(silent[:50], 5.0, atol=LSB_V)
-    assert np.allclose(-np.diff(silent[51:100]), STEP_V)
-    assert np.all(silent[101:] == 0.0)
+    outputs_v = bench.outputs(SILENT, 120)
+    assert np.allclose(outputs_v[:50], 5.0, atol=LSB_V)
+    assert np.allclose(-np.diff(outputs_v[51:100]), STEP_V)
+    assert np.all(outputs_v[101:] == 0.0)
     assert bench.node.parked == 1
 
 
 def test_drives_that_come_again_are_reached_by_the_ramp(bench):
     bench.outputs(5.0, 3)
     bench.outputs(SILENT, 120)
-    again = bench.outputs(3.0, 40)
-    assert np.allclose(again[:29], STEP_V * np.arange(29), atol=2 * LSB_V)
-    assert np.allclose(again[31:], 3.0, atol=LSB_V)
+    outputs_v = bench.outputs(3.0, 40)
+    assert np.allclose(outputs_v[:29], STEP_V * np.arange(29), atol=2 * LSB_V)
+    assert np.allclose(outputs_v[31:], 3.0, atol=LSB_V)
     assert bench.outputs(-4.0, 1) == pytest.approx(-4.0, abs=LSB_V)
 
 
@@ -89,6 +90,6 @@ def test_drives_that_come_again_during_the_ramp_turn_it(bench):
     bench.outputs(5.0, 3)
     half_way = bench.outputs(SILENT, 75)[-1]
     assert 2.0 < half_way < 3.0
-    again = bench.outputs(4.0, 30)
-    assert np.all(np.abs(np.diff([half_way, *again])) <= STEP_V + 1e-9)
-    assert again[-1] == pytest.approx(4.0, abs=LSB_V)
+    outputs_v = bench.outputs(4.0, 30)
+    assert np.all(np.abs(np.diff([half_way, *outputs_v])) <= STEP_V + 1e-9)
+    assert outputs_v[-1] == pytest.approx(4.0, abs=LSB_V)

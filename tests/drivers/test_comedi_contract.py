@@ -1,4 +1,4 @@
-"""The comedi driver keeps the contract on a stand-in for libcomedi; `make rig` runs it on the kernel's own board."""
+"""The comedi driver keeps the contract on a stand-in for libcomedi; `make rig` runs it on a board of the kernel."""
 
 from __future__ import annotations
 
@@ -18,25 +18,26 @@ from tests.drivers.bench_driver import opened
 from tests.drivers.comedi_board import hardware, new_board, output_v, stub_library
 from tests.drivers.processes import completed
 
-ONE = {"x": Wiring("ai0", "ao0")}
+ONE_AXIS = {"x": Wiring("ai0", "ao0")}
 CROSSED = {"y": Wiring("ai1", "ao3"), "x": Wiring("ai3", "ao1")}
 LSB_V = 20.0 / 65535
 
 
-def comedi(path: Path, wiring: dict[str, Wiring] = ONE, **options: Any) -> ComediDriver:
+def comedi(path: Path, wiring: dict[str, Wiring] = ONE_AXIS, **options: Any) -> ComediDriver:
+    """Return a driver of the board in a file, on the stand-in for libcomedi."""
     values = {"device": str(path), "library": str(stub_library()), **options}
     return ComediDriver(ComediOptions.model_validate(values), wiring, 1000.0)
 
 
 @pytest.fixture
 def device(tmp_path: Path) -> Path:
-    """A board with its outputs at 7 V."""
+    """Return the path of a board with its outputs at 7 V."""
     return new_board(tmp_path / "comedi0")
 
 
 class TestOneAxis(DriverContract):
     tolerance_v = LSB_V
-    wiring = ONE
+    wiring = ONE_AXIS
     options: dict[str, Any] = {}  # noqa: RUF012
     is_mute, output_range = False, 0
 
@@ -53,7 +54,7 @@ class TestOneAxis(DriverContract):
 
 
 class TestMuteBoard(TestOneAxis):
-    """The board's kernel driver does not store the outputs."""
+    """A board whose outputs cannot be read back."""
 
     is_mute = True
 
@@ -64,7 +65,7 @@ class TestTwoAxesAndAnEnableInput(TestOneAxis):
 
 
 class TestUnipolarOutput(TestOneAxis):
-    """The output's lowest code is 0 V; the other outputs have another range and must keep their values."""
+    """An output whose lowest code is 0 V; the other outputs have another range and must keep their values."""
 
     output_range = 1
     options = {"output_range_v": [0, 5], "input_range_v": [0.0, 5.0], "safe_v": 1.0}  # noqa: RUF012
@@ -142,9 +143,10 @@ def test_a_failing_board_is_a_failed_driver_that_names_the_channel(device):
 
 FAULTS = {
     "channel": ({}, {"x": Wiring("ai0", "ao4")}, "ao4 is not a channel of this board; allowed: ao0 … ao3"),
-    "range": ({"input_range_v": [-1, 1]}, ONE, r"ai0 has no range \[-1.0, 1.0\] V; allowed: \[-10, 10\], \[-5, 5\]"),
-    "subdevice": ({"output_subdevice": 2}, ONE, "output_subdevice: 2 has no analogue outputs; allowed: 1"),
-    "no such subdevice": ({"input_subdevice": 9}, ONE, "input_subdevice: 9 has no analogue inputs; allowed: 0"),
+    "range": ({"input_range_v": [-1, 1]}, ONE_AXIS,
+              r"ai0 has no range \[-1.0, 1.0\] V; allowed: \[-10, 10\], \[-5, 5\]"),
+    "subdevice": ({"output_subdevice": 2}, ONE_AXIS, "output_subdevice: 2 has no analogue outputs; allowed: 1"),
+    "no such subdevice": ({"input_subdevice": 9}, ONE_AXIS, "input_subdevice: 9 has no analogue inputs; allowed: 0"),
 }  # fmt: skip
 
 
@@ -161,8 +163,8 @@ def test_a_missing_part_of_a_board_is_named_and_the_board_released(device, optio
     [
         ({}, {"x": Wiring("ai0", "ao01")}, r"channels\.x\.output: 'ao01'; allowed: ao0, ao1, …"),
         ({}, {"x": Wiring("ai0", "ao0"), "y": Wiring("ai1", "ao0")}, r"channels\.y\.output: axis x uses 'ao0' already"),
-        ({"more_inputs": ["enable"]}, ONE, "more_inputs: 'enable'; allowed: ai0"),
-        ({"output_range_v": [1, 5]}, ONE, "safe_v: 0 V; allowed by output_range_v: 1 … 5 V"),
+        ({"more_inputs": ["enable"]}, ONE_AXIS, "more_inputs: 'enable'; allowed: ai0"),
+        ({"output_range_v": [1, 5]}, ONE_AXIS, "safe_v: 0 V; allowed by output_range_v: 1 … 5 V"),
     ],
 )
 def test_bad_options_and_channels_are_refused_without_a_board(options, wiring, message):

@@ -1,4 +1,4 @@
-"""The drivers of docs/drivers.md, taken from the page as they stand there, keep the contract."""
+"""The drivers printed in docs/drivers.md keep the contract."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ FILE = re.compile(r"^    (?:# |/\* )(\w+\.(?:py|c))(?: \*/)?\n((?:    .*\n|\n)+)
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    """The page's files."""
+    """Write the files printed on the page into a folder, and return the folder."""
     for name, text in FILE.findall((ROOT / "docs" / "drivers.md").read_text()):
         (tmp_path / name).write_text(textwrap.dedent(text))
     return tmp_path
 
 
-def last_line(folder: Path, test: str) -> str:
-    """The last line of pytest's report."""
+def pytest_summary(folder: Path, test: str) -> str:
+    """Run a test file of the folder with pytest and return the last line of the report."""
     command = [
         sys.executable,
         "-m",
@@ -46,7 +46,7 @@ def last_line(folder: Path, test: str) -> str:
 
 
 def test_in_plain_python(folder):
-    assert last_line(folder, "test_mycard.py").startswith("13 passed")
+    assert pytest_summary(folder, "test_mycard.py").startswith("13 passed")
 
 
 def test_as_native_functions(folder):
@@ -62,21 +62,21 @@ def test_as_native_functions(folder):
     )
     test = test.replace("return list(vendor.volts)", 'return list(driver.card.at) if hasattr(driver, "card") else None')
     (folder / "test_native.py").write_text(test)
-    assert last_line(folder, "test_native.py").startswith("13 passed")
+    assert pytest_summary(folder, "test_native.py").startswith("13 passed")
 
 
 def test_a_broken_copy_fails(folder):
-    """The page's driver without its parking: the documented suite must see it."""
+    """The page's driver with outputs wrong by 0.1 V fails the page's test."""
     text = (folder / "mycard.py").read_text()
     assert text.count("vendor.write(channel, value)") == 1
     (folder / "mycard.py").write_text(
         text.replace("vendor.write(channel, value)", "vendor.write(channel, value + 0.1)")
     )
-    assert "failed" in last_line(folder, "test_mycard.py")
+    assert "failed" in pytest_summary(folder, "test_mycard.py")
 
 
 def test_the_installed_package_has_all_its_modules(folder):
-    """The page's packaging, built by setuptools: what the driver imports of its own is in it."""
+    """A package built by setuptools as the page says holds all modules that the driver imports."""
     page = (ROOT / "docs" / "drivers.md").read_text()
     (lines,) = re.findall(r'^    \[project\.entry-points\."rtloop\.drivers"\]\n(?:    .*\n|\n)+', page, re.MULTILINE)
     project = '[project]\nname = "mycard"\nversion = "1"\n'

@@ -1,4 +1,4 @@
-"""The self-test: its figures on wires of known gain, offset, noise and delay, and its command on a wire."""
+"""The drivers' self-test: its figures on simulated wires of known gain, offset, noise and delay, and its command."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ drive_v = {{drive_v}}
 
 
 def staircase() -> np.ndarray:
-    """±1 V with ramps of 20 ticks between the levels."""
+    """Return a drive in V of levels 0, 1, 0, −1 V, DWELL ticks each, with ramps of 20 ticks between them."""
     levels = np.tile([0.0, 1.0, 0.0, -1.0], 5)
     corners = np.arange(levels.size) * DWELL
     return np.interp(
@@ -40,6 +40,7 @@ def staircase() -> np.ndarray:
 
 
 def wire(drive_v: np.ndarray, gain: float, offset_v: float, delay: int, noise_v: float = 0.0) -> np.ndarray:
+    """Return the input in V at the end of a wire with these properties."""
     delayed = np.concatenate([np.full(delay, drive_v[0]), drive_v[: drive_v.size - delay]])
     return gain * delayed + offset_v + np.random.default_rng(5).normal(0.0, noise_v, drive_v.size)
 
@@ -76,7 +77,7 @@ def test_a_constant_drive_is_refused():
 
 @pytest.fixture
 def selftest(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """The self-test on a new board, at one rate; returns its result and the board."""
+    """Return a function that runs the self-test on a new board at one rate; it returns result and board."""
     monkeypatch.setattr("rtloop.doctor.selftest.MAX_RATE_TRIALS", 1)
     monkeypatch.setenv("RUNTIME_DIRECTORY", str(tmp_path / "run"))
 
@@ -108,10 +109,10 @@ def test_a_wire_passes_and_the_output_is_parked(selftest, tmp_path):
 
 
 def test_a_failed_loopback_is_exit_1_and_limits_of_axis_and_range_hold(selftest):
-    """At most 0.5 V: nothing is wrong with the wire but a tolerance that no code can keep."""
+    """The loopback fails by a tolerance below the step of a code; the drive stays within ±0.5 V."""
     result, device = selftest("--loopback", "--gain-tolerance", "1e-9", drive_v=0.5)
     assert result.exit_code == 1, result.output
-    assert not (device.parent / "run").exists()  # what is no wire says nothing of the host
+    assert not (device.parent / "run").exists()  # a failed loopback writes no note of the host
     assert "no loopback" in result.stdout
     assert "ao0 from -0.5 V to 0.5 V" in result.stderr
     assert output_v(device, 0) == pytest.approx(0.0, abs=LSB_V)

@@ -1,4 +1,4 @@
-"""A simulated node with more than ten outputs gives each axis the plant of its own output."""
+"""A simulated node with more than ten outputs orders its axes, and so their plants, by the numbers of their outputs."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Accidents around a node in a process of its own: dead and rival masters, garbage, a loop that stands still."""
+"""Accidents around a node in a separate process: dead and rival masters, garbage, a loop that stands still."""
 
 from __future__ import annotations
 
@@ -31,11 +31,11 @@ MASTERS = 8
 DEAD_MASTER = """
 import json, os, signal, sys
 from rtloop.drivers.contract import DriverCalls
-from tests.drivers.node_bench import ONE, options_of
+from tests.drivers.node_bench import ONE_AXIS, make_options
 from rtloop.drivers.node.driver import UdpDriver
 
 options, writes = json.loads(sys.argv[1]), json.loads(sys.argv[2])
-driver = UdpDriver(options_of("udp", options), ONE, 500.0)
+driver = UdpDriver(make_options("udp", options), ONE_AXIS, 500.0)
 calls = DriverCalls(driver.open(), driver.facts)
 calls.read()
 for volts in writes:
@@ -46,12 +46,13 @@ os.kill(os.getpid(), signal.SIGKILL)
 
 @pytest.fixture(scope="module")
 def node(tmp_path_factory: pytest.TempPathFactory) -> Iterator[NodeProcess]:
+    """Yield a node's process on UDP that runs for the whole module."""
     node = NodeProcess("udp", tmp_path_factory.mktemp("node"))
     yield node
     node.end()
 
 
-def die_as_master(node: NodeProcess, writes: list[float], watchdog_ms: float) -> None:
+def run_dying_master(node: NodeProcess, writes: list[float], watchdog_ms: float) -> None:
     """Run a master that opens the node, reads, writes some volts, and dies by SIGKILL."""
     options = json.dumps(node.options | {"watchdog_ms": watchdog_ms, "wait_s": 60.0})
     command = [sys.executable, "-c", DEAD_MASTER, options, json.dumps(writes)]
@@ -60,8 +61,8 @@ def die_as_master(node: NodeProcess, writes: list[float], watchdog_ms: float) ->
 
 def test_a_master_that_dies_before_its_first_write_leaves_safe_outputs_and_a_free_node(node):
     parkings = node.parkings
-    die_as_master(node, [5.0], 300.0)  # A master before it leaves an output that is not safe.
-    die_as_master(node, [], 200.0)
+    run_dying_master(node, [5.0], 300.0)  # An earlier master leaves an output that is not safe.
+    run_dying_master(node, [], 200.0)
     wait_for(lambda: abs(node.settled_output_v()) < 1e-5, "a safe output")
     assert node.parkings == parkings + 1
     with opened(node.driver(**PATIENT)) as calls:
@@ -82,7 +83,7 @@ def test_of_eight_masters_at_once_one_drives_undisturbed_and_the_others_are_told
         except DriverError as error:
             outcomes[number] = str(error)
 
-    for _ in range(2):  # The second round shows that the first one's losers left nothing behind.
+    for _ in range(2):  # The second round shows that refused masters leave no state in the node.
         outcomes.clear()
         threads = [threading.Thread(target=master, args=(number,)) for number in range(MASTERS)]
         for thread in threads:
@@ -111,7 +112,7 @@ def test_a_master_that_drives_is_never_evicted(node):
 
 
 def flood(ports: list[int], is_ended: threading.Event) -> int:
-    """Send garbage and the beginnings of frames to ports of this computer until told; return the number."""
+    """Send garbage and beginnings of frames to ports of this computer until `is_ended`; return their number."""
     chance, count = random.Random(1), 0
     contents = [chance.randbytes(n) for n in (0, 1, 7, 32, 36, 200, 1400)] + [b"\x7b\x05\x72\x01" + bytes(28)]
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
@@ -123,7 +124,7 @@ def flood(ports: list[int], is_ended: threading.Event) -> int:
 
 
 def local_port(driver: NodeDriver) -> int:
-    """The port of an open driver of kind `udp`."""
+    """Return the local port of an open driver of kind `udp`."""
     assert driver._link is not None
     with socket.socket(fileno=os.dup(driver._link.fd)) as copy:
         return copy.getsockname()[1]
@@ -179,7 +180,7 @@ def test_the_screen_and_the_recording_say_in_words_that_the_watchdog_bit(node, t
     parkings = node.parkings
     run = start_rtloop("run", config, "--duration", "600", "--out", tmp_path / "out")
     wait_for(lambda: node.output_v == pytest.approx(1.0, abs=1e-5), "the drive")
-    loops = children(run.pid)
+    loops = child_processes(run.pid)
     for pid in loops:
         os.kill(pid, signal.SIGSTOP)
     wait_for(lambda: node.parkings == parkings + 1, "the watchdog")
@@ -195,7 +196,7 @@ def test_the_screen_and_the_recording_say_in_words_that_the_watchdog_bit(node, t
     assert reason in str(events)
 
 
-def children(pid: int) -> list[int]:
-    """Processes that a process has started, its threads' too."""
+def child_processes(pid: int) -> list[int]:
+    """Return the ids of the processes that a process and its threads have started."""
     tasks = Path(f"/proc/{pid}/task").iterdir()
     return [int(child) for task in tasks for child in (task / "children").read_text().split()]

@@ -16,15 +16,16 @@ from rtloop.drivers.errors import DriverError
 from rtloop.drivers.node.driver import SerialDriver, UdpDriver
 from rtloop.drivers.node.options import UdpOptions
 from tests.drivers.bench_driver import opened
-from tests.drivers.node_bench import NodeProcess, options_of
+from tests.drivers.node_bench import NodeProcess, make_options
 from tests.faults.evidence import wait_for
 
 PATIENT = {"watchdog_ms": 5000.0, "error_limit": 100_000, "hold_ticks": 1000}
-"""A machine that stands still for a moment is not what these tests are about."""
+"""Limits so wide that a short stall of this machine fails no test."""
 
 
 @pytest.fixture(scope="module", params=["udp", "serial"])
 def node(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[NodeProcess]:
+    """Yield a node's process, on UDP or on a serial line, that runs for the whole module."""
     node = NodeProcess(request.param, tmp_path_factory.mktemp("node"))
     yield node
     node.end()
@@ -71,7 +72,7 @@ def test_the_reason_of_a_failure_is_told(node):
         time.sleep(0.3)
         calls.write([1.0])
         wait_for(lambda: calls.read()[0] < 0, "a driver that has failed")
-    assert driver.error is None  # it is closed
+    assert driver.error is None  # a closed driver has no error
 
 
 def test_a_stopped_node_shows_in_status_and_age(node):
@@ -125,7 +126,7 @@ def test_a_restarted_node_ends_the_exchange(node):
     ending = (
         contextlib.nullcontext() if node.kind == "udp" else pytest.raises(DriverError, match="only the node's watchdog")
     )
-    with ending:  # The terminal has gone with the first node.
+    with ending:  # The serial terminal ended with the first process.
         driver.close()
 
 
@@ -158,7 +159,7 @@ def test_a_missing_node_is_named_with_what_to_do():
 
 
 def test_a_missing_terminal_is_named(tmp_path):
-    options = options_of("serial", {"device": str(tmp_path / "none"), "wait_s": 0.1})
+    options = make_options("serial", {"device": str(tmp_path / "none"), "wait_s": 0.1})
     with pytest.raises(DriverError, match="No such file or directory; plug the node in"):
         SerialDriver(options, {"x": Wiring("adc0", "dac0")}, 1000.0).open()
 

@@ -1,4 +1,4 @@
-"""The exchange with a node keeps its arrays' bounds, whatever bytes come: its kernels run as plain Python here."""
+"""Random bytes never lead the exchange with a node outside its arrays; its kernels run as plain Python here."""
 
 from __future__ import annotations
 

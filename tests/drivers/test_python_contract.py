@@ -1,4 +1,4 @@
-"""A driver in plain Python keeps the contract; one that breaks any promise of it does not pass."""
+"""A driver in plain Python keeps the contract; a driver that breaks any promise of the contract fails the suite."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ class TestNative(LoopBackContract):
     kind = Native
 
 
-def broken_promises(mutant: type[LoopBack]) -> list[tuple[str, int]]:
-    """Tests that fail for a mutant, each with the line of the contract's own assertion, 0 where it was not one."""
+def failed_tests(mutant: type[LoopBack]) -> list[tuple[str, int]]:
+    """Return the tests that fail for a mutant, each with the line of the contract's assertion, 0 for another error."""
     suite = type("Suite", (LoopBackContract,), {"kind": mutant})
     failures = []
     for name in dir(suite):
@@ -44,15 +44,15 @@ def broken_promises(mutant: type[LoopBack]) -> list[tuple[str, int]]:
 
 @pytest.mark.parametrize("mutant", MUTANTS)
 def test_a_broken_promise_fails_the_suite(mutant):
-    assert broken_promises(MUTANTS[mutant])
+    assert failed_tests(MUTANTS[mutant])
 
 
 def test_every_promise_is_broken_by_a_mutant():
-    """No assertion of the suite stands there that none of the mutants sets off."""
+    """Each assertion of the suite fails for at least one mutant."""
     tree = ast.parse(Path(contract.__file__).read_text())
-    promises = {node.lineno: ast.unparse(node) for node in ast.walk(tree) if isinstance(node, ast.Assert)}
-    broken = {line for mutant in MUTANTS.values() for _, line in broken_promises(mutant)}
-    assert [text for line, text in promises.items() if line not in broken] == []
+    assertions = {node.lineno: ast.unparse(node) for node in ast.walk(tree) if isinstance(node, ast.Assert)}
+    failed_lines = {line for mutant in MUTANTS.values() for _, line in failed_tests(mutant)}
+    assert [text for line, text in assertions.items() if line not in failed_lines] == []
 
 
 @pytest.mark.parametrize(
@@ -69,12 +69,13 @@ def test_a_failure_shows_the_exception_of_the_driver(mutant, test, message):
         getattr(suite(), test)()
 
 
-def opened(driver: LoopBack) -> tuple[LoopBack, DriverCalls]:
+def open_driver(driver: LoopBack) -> tuple[LoopBack, DriverCalls]:
+    """Open a driver and return it with its calls."""
     return driver, DriverCalls(driver.open(), driver.facts)
 
 
 def test_an_exception_in_read_is_a_failed_driver_and_is_stored():
-    driver, calls = opened(LoopBack())
+    driver, calls = open_driver(LoopBack())
     driver.volts = ["not a number", 0.0]  # type: ignore[list-item]
     assert calls.read()[0] == -1
     assert isinstance(driver.error, TypeError)
@@ -82,7 +83,7 @@ def test_an_exception_in_read_is_a_failed_driver_and_is_stored():
 
 @pytest.mark.parametrize("volts", [[5.1, 2.0], [0.0, -0.1], [math.nan, 2.0], [0.0, math.inf]])
 def test_an_output_outside_its_range_is_refused_with_a_message(volts):
-    driver, calls = opened(LoopBack())
+    driver, calls = open_driver(LoopBack())
     assert calls.write([1.0, 3.0]) == 0
     assert calls.write(volts) == -1
     assert driver.volts == [1.0, 3.0]
@@ -90,7 +91,7 @@ def test_an_output_outside_its_range_is_refused_with_a_message(volts):
 
 
 def test_a_wrong_number_of_inputs_is_refused_with_a_message():
-    driver, calls = opened(MUTANTS["ForgetsAnInput"]())
+    driver, calls = open_driver(MUTANTS["ForgetsAnInput"]())
     assert calls.read()[0] == -1
     assert str(driver.error) == (
         "driver 'loopback': the methods `read` and `observe` together returned 2 numbers; allowed: 3, one for each "

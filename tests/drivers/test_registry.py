@@ -1,4 +1,4 @@
-"""Kinds by name: the built-in ones, and those that third parties register as entry points."""
+"""Drivers are found by their kind, among the built-in ones and the entry points of installed packages."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ class AcmeDriver(PythonDriver):
 
 @pytest.fixture
 def acme(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """An installed distribution, as far as Python can see."""
+    """Install a distribution `acme-card` with working and broken entry points."""
     (tmp_path / "acme_card.py").write_text(MODULE)
     (tmp_path / "acme_failing.py").write_text("1 / 0\n")
     (tmp_path / "acme_torn.py").write_text("print(\n")
@@ -58,6 +58,7 @@ def acme(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def acme_text(rate_hz: float = 1000, drive_v: float = 5.0, options: str = "port = 3") -> str:
+    """Return the text of a configuration with the driver `acme`."""
     head = text(mode="raw", rate_hz=rate_hz).replace('"sim"', '"acme"').replace("adc0", "in0").replace("dac0", "out0")
     head = head.replace("seed = 1", options).replace("latency_ticks = 0", "")
     return f"{head}{AXIS}[axis.limits]\ndrive_v = {drive_v}\n"

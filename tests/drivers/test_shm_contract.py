@@ -1,4 +1,4 @@
-"""A board in a process of its own keeps the drivers' contract, and what its card did is read from the board."""
+"""The driver shm keeps the contract on a board in a separate process; the outputs are read from the board's memory."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from rtloop.hil.board import LSB_V
 from tests.drivers.bench_driver import opened
 from tests.drivers.processes import ENVIRONMENT, board_memory
 
-ONE = {"x": Wiring("adc0", "dac0")}
+ONE_AXIS = {"x": Wiring("adc0", "dac0")}
 RATE_HZ = 1000.0
 TIMEOUT_S = 250.0
 PROGRAM = """
@@ -32,11 +32,12 @@ serve(Path(sys.argv[1]), BoardOptions(), ["x"], 1000.0, lambda: False)
 
 
 def shm(path: Path) -> ShmDriver:
-    return ShmDriver(ShmOptions(file=str(path)), ONE, RATE_HZ)
+    """Return a driver of the board at `path`, not yet open."""
+    return ShmDriver(ShmOptions(file=str(path)), ONE_AXIS, RATE_HZ)
 
 
 def start_board(path: Path) -> subprocess.Popen[bytes]:
-    """A running board at `path`."""
+    """Start a board with its memory at `path`, wait until it can be opened, and return its process."""
     board = subprocess.Popen([sys.executable, "-c", PROGRAM, str(path)], env=ENVIRONMENT)
     deadline_s = time.monotonic() + TIMEOUT_S
     while time.monotonic() < deadline_s:
@@ -51,7 +52,7 @@ def start_board(path: Path) -> subprocess.Popen[bytes]:
 
 @pytest.fixture(scope="module")
 def file(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
-    """The memory of a board that runs for the whole module."""
+    """Yield the path of the memory of a board that runs for the whole module."""
     path = tmp_path_factory.mktemp("board") / "board"
     board = start_board(path)
     yield path

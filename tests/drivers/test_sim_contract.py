@@ -11,13 +11,13 @@ from rtloop.drivers.contract import DriverCalls, DriverContract
 from rtloop.drivers.sim import SimDriver
 from rtloop.hil.options import RigOptions
 
-ONE = {"x": Wiring("adc0", "dac0")}
-THREE = {"z": Wiring("adc2", "dac2"), "x": Wiring("adc0", "dac0"), "y": Wiring("adc1", "dac1")}
+ONE_AXIS = {"x": Wiring("adc0", "dac0")}
+THREE_AXES = {"z": Wiring("adc2", "dac2"), "x": Wiring("adc0", "dac0"), "y": Wiring("adc1", "dac1")}
 
 
 class TestOneAxis(DriverContract):
     def driver(self) -> Driver:
-        return SimDriver(RigOptions(), ONE, 10_000.0)
+        return SimDriver(RigOptions(), ONE_AXIS, 10_000.0)
 
     def outputs(self, driver: Driver) -> Sequence[float] | None:
         return driver.outputs_v()
@@ -25,13 +25,13 @@ class TestOneAxis(DriverContract):
 
 class TestThreeAxes(TestOneAxis):
     def driver(self) -> Driver:
-        return SimDriver(RigOptions(latency_ticks=2, seed=9), THREE, 5_000.0)
+        return SimDriver(RigOptions(latency_ticks=2, seed=9), THREE_AXES, 5_000.0)
 
 
 class TestNarrowConverters(TestOneAxis):
     def driver(self) -> Driver:
         plant = {"dac": {"range_v": 5.0, "bits": 12}, "adc": {"range_v": 2.5}}
-        return SimDriver(RigOptions.model_validate({"plants": {"y": plant}}), THREE, 10_000.0)
+        return SimDriver(RigOptions.model_validate({"plants": {"y": plant}}), THREE_AXES, 10_000.0)
 
 
 def test_ranges_are_the_converters():
@@ -41,8 +41,8 @@ def test_ranges_are_the_converters():
 
 
 def test_observed_signals_have_the_name_of_their_plant_s_axis():
-    """A plant's truth has the name of the axis that is wired to it, whatever the order of the axes."""
-    driver = SimDriver(RigOptions(), THREE, 10_000.0)
+    """A plant's observed signals have the name of the axis wired to the plant, in any order of the axes."""
+    driver = SimDriver(RigOptions(), THREE_AXES, 10_000.0)
     calls = DriverCalls(driver.open(), driver.facts)
     for _ in range(200):
         calls.read()

@@ -1,4 +1,4 @@
-"""A third party's package, installed and found by its entry point, closes the loop and replays."""
+"""A third party's driver, installed and found by its entry point, closes the loop, and the run replays."""
 
 from __future__ import annotations
 
@@ -38,10 +38,12 @@ dwell_s = 0.5
 
 @pytest.fixture(scope="module")
 def installed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return the folder into which the package is installed."""
     return install(tmp_path_factory.mktemp("installed"))
 
 
-def run(installed: Path, *arguments: str) -> str:
+def run_rtloop(installed: Path, *arguments: str) -> str:
+    """Run a command of rtloop that finds the package, and return its stdout."""
     result = completed(sys.executable, "-m", "rtloop", *arguments, folder=installed)
     assert result.returncode == 0, result.stderr
     return result.stdout
@@ -58,14 +60,14 @@ class TestContract(DriverContract):
 
 
 def test_it_is_listed(installed):
-    assert "bench_card:BenchCard" in run(installed, "drivers")
+    assert "bench_card:BenchCard" in run_rtloop(installed, "drivers")
 
 
 @pytest.mark.parametrize("rate_hz", [2_000, 10_000])
 def test_it_closes_the_loop_and_replays(installed, tmp_path, rate_hz):
     config = tmp_path / "bench.toml"
     config.write_text(CONFIG.format(rate_hz=rate_hz, axis=one_axis(20.0)))
-    summary = json.loads(run(installed, "run", str(config), "--duration", "2", "--out", str(tmp_path), "--json"))
+    summary = json.loads(run_rtloop(installed, "run", str(config), "--duration", "2", "--out", str(tmp_path), "--json"))
     assert summary["ticks_logged"] == summary["ticks_expected"] == 2 * rate_hz
     assert summary["ticks_lost"] == 0
     recording = rtloop.load(summary["recording"])

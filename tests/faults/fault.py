@@ -22,7 +22,7 @@ class NotPossible(Exception):
 
 @dataclass
 class Outcome:
-    """Result of an injected fault: time to the safe output in ms, and what the verdict has to accept."""
+    """Result of an injected fault: time to the safe output in ms, and effects that the verdict has to accept."""
 
     safe_ms: float | None = None
     lost_allowed: bool = False

@@ -31,6 +31,8 @@ class CardOptions(Options):
 
 
 class PlainCard(PythonDriver):
+    """A driver of the card in a file: a first-order plant, an enable input, and the faults that a test sets."""
+
     kind = "plain_card"
     options_model = CardOptions
 

@@ -65,6 +65,7 @@ def await_recording(bench: Bench, state: str) -> dict[str, Any]:
 
 
 def disk_full(bench: Bench) -> Outcome:
+    """Run on a small disk until it is full: the loop runs on, and status names the reason."""
     bench.strike()
     recording = await_recording(bench, "not recording")
     assert recording["reason"] == "No space left on device"
@@ -72,6 +73,7 @@ def disk_full(bench: Bench) -> Outcome:
 
 
 def disk_full_then_room(bench: Bench) -> Outcome:
+    """Enlarge the full disk: the service records again and states the gap."""
     outcome = disk_full(bench)
     command = ["mount", "-o", f"remount,{LARGE}", str(bench.folder / "recordings")]
     subprocess.run(command, check=True, capture_output=True)
@@ -80,6 +82,7 @@ def disk_full_then_room(bench: Bench) -> Outcome:
 
 
 def folder_removed(bench: Bench) -> Outcome:
+    """Remove the folder of the recordings, then create it again: the service records again and states the gap."""
     folder = bench.folder / "recordings"
     bench.strike(lambda: shutil.rmtree(folder))
     recording = await_recording(bench, "not recording")

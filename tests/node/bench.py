@@ -1,4 +1,4 @@
-"""A node on a board of arrays, under a clock that the test turns."""
+"""The node's C library on a simulated board, with a clock that the test advances."""
 
 from __future__ import annotations
 
@@ -14,12 +14,14 @@ SAFE = [channel.safe for channel in OUTPUTS]
 FAR = [3000, 20000]
 """Codes that are 97 and 2886 steps of a ramp away from the safe ones."""
 LOOP, OTHER = 0xC0A80001_1234, 0xC0A80002_1234
-"""Addresses of two loops."""
+"""Addresses of two rival loops."""
 BOOT = 0xB0070001
 LONGEST_HOLD_US = 50_000
 
 
 class _Channel(ctypes.Structure):
+    """A channel in the memory of the C library."""
+
     _fields_ = [
         ("lowest", ctypes.c_int32),
         ("highest", ctypes.c_int32),
@@ -31,7 +33,7 @@ class _Channel(ctypes.Structure):
 
 
 class Write(NamedTuple):
-    """One write of the outputs."""
+    """A write of all outputs: time by the node's clock, codes, digital outputs."""
 
     time_us: int
     codes: list[int]
@@ -39,7 +41,7 @@ class Write(NamedTuple):
 
 
 class Counters(NamedTuple):
-    """Counters of the node, then of its board."""
+    """Counters of the node, then those of its board (from `reads` on)."""
 
     invalid: int
     old: int
@@ -76,7 +78,7 @@ class Bench:
         hold_us: int = LONGEST_HOLD_US,
         boot: int = BOOT,
     ) -> bool:
-        """Start the node, and return whether it took its configuration."""
+        """Start the node, and return whether it accepted its configuration."""
         self.outputs = len(outputs)
         channels = [*inputs, *outputs]
         if len(channels) <= 44:
@@ -115,53 +117,53 @@ class Bench:
         digital: int = 0,
         hold_us: int = 10_000,
     ) -> Sample | Refusal | None:
-        """Send the next DRIVE, or the one with a given sequence, and return the fields of its answer."""
+        """Send the next DRIVE, or a DRIVE with a given sequence, and return the fields of the answer."""
         self.sequence = self.sequence + 1 if sequence is None else sequence
         answer = self.send(drive(session, self.sequence, flags, codes, digital, hold_us), sender)
         assert not isinstance(answer, Welcome)
         return answer
 
     def sample(self, *arguments: Any, **fields: Any) -> Sample:
-        """Send a DRIVE as `drive` does, and return the fields of the SAMPLE that answers it."""
+        """Send a DRIVE as `drive` does, and return the fields of its answer, which must be a SAMPLE."""
         answer = self.drive(*arguments, **fields)
         assert isinstance(answer, Sample)
         return answer
 
     def open(self, **fields: Any) -> Sample:
-        """Open a session whose outputs are at their safe codes."""
+        """Open a session and return its SAMPLE; the outputs must be at their safe codes."""
         answer = self.sample(OPEN | ANSWER, **fields)
         assert answer.flags == READY | AT_SAFE
         return answer
 
-    def open_at(
+    def open_and_set(
         self, codes: Sequence[int], digital: int = 0, session: int = 5, sender: int = LOOP, hold_us: int = 10_000
     ) -> None:
-        """Open a session and set its outputs."""
+        """Open a session and set its outputs to codes."""
         self.open(session=session, sender=sender, hold_us=hold_us)
         self.sample(APPLY | ANSWER, codes, session, sender, digital=digital, hold_us=hold_us)
         assert (self.codes, self.digital) == (list(codes), digital)
 
     def poll(self, step_us: int = 0) -> None:
-        """Turn the clock and call the node once."""
+        """Advance the clock and call the node once."""
         self.now_us += step_us
         self.library.bench_poll(self._bench, ctypes.c_uint64(self.now_us))
 
     def run(self, duration_us: int, step_us: int = 1000) -> None:
-        """Turn the clock by steps, with a call of the node at each."""
+        """Advance the clock by steps, with a call of the node at each."""
         for _ in range(duration_us // step_us):
             self.poll(step_us)
 
     def park(self) -> None:
-        """End the session from the node's side."""
+        """Make the node park, which ends the session."""
         self.library.bench_park(self._bench, ctypes.c_uint64(self.now_us))
 
     def set_inputs(self, codes: Sequence[int], digital: int = 0, conversion_ns: int = 0) -> None:
-        """Set what the board converts, and how long a conversion takes."""
+        """Set the board's inputs, and the duration of a conversion."""
         array = (ctypes.c_int32 * len(codes))(*codes)
         self.library.bench_set_inputs(self._bench, array, ctypes.c_uint16(digital), ctypes.c_uint64(conversion_ns))
 
     def writes(self, start: int = 0) -> list[Write]:
-        """Return the writes of the outputs from one number on."""
+        """Return the writes of the outputs from number `start` on."""
         codes, digital = (ctypes.c_int32 * 44)(), ctypes.c_uint16()
         writes = []
         for number in range(start, self.counters.writes):
@@ -171,22 +173,22 @@ class Bench:
 
     @property
     def counters(self) -> Counters:
-        """What node and board counted."""
+        """Present counters of node and board."""
         array = (ctypes.c_uint32 * 8)()
         self.library.bench_counters(self._bench, array)
         return Counters(*array)
 
     @property
     def codes(self) -> list[int]:
-        """The codes at the outputs."""
+        """Present codes of the outputs."""
         return self.writes(self.counters.writes - 1)[0].codes
 
     @property
     def digital(self) -> int:
-        """The digital outputs."""
+        """Present digital outputs, one bit each."""
         return self.writes(self.counters.writes - 1)[0].digital
 
     @property
     def due_us(self) -> int:
-        """The time at which the node must be called next."""
+        """Time at which the node must be called next; 2**64 − 1 if no call is due."""
         return self.library.bench_due_us(self._bench)

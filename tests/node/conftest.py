@@ -1,4 +1,4 @@
-"""The node's library and programs, compiled once for the tests of a worker."""
+"""Fixtures of the node's tests: library and programs, compiled once in each test process."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ COMPILER = next((path for name in ("cc", "gcc", "clang") if (path := shutil.whic
 
 @pytest.fixture(scope="session")
 def compiler() -> str:
-    """The C compiler's path."""
+    """Return the path of the C compiler; skip the test without one."""
     if COMPILER is None:
         pytest.skip("no C compiler")
     return COMPILER
@@ -27,7 +27,7 @@ def compiler() -> str:
 
 @pytest.fixture(scope="session")
 def library(compiler: str, tmp_path_factory: pytest.TempPathFactory) -> ctypes.CDLL:
-    """The node's library with a board of arrays."""
+    """Return the node's library, linked with the simulated board of shim.c."""
     output = tmp_path_factory.mktemp("node") / "node.so"
     sources = [NODE / "rtloop_node.c", NODE / "rtloop_cobs.c", Path(__file__).with_name("shim.c")]
     subprocess.run([compiler, *STRICT, "-O1", "-fPIC", "-shared", f"-I{NODE}", *sources, "-o", output], check=True)
@@ -45,7 +45,7 @@ def library(compiler: str, tmp_path_factory: pytest.TempPathFactory) -> ctypes.C
 
 @pytest.fixture
 def bench(library: ctypes.CDLL) -> Iterator[Bench]:
-    """A node that has started at 1 s of its clock."""
+    """Yield a node that has started at 1 s of its clock."""
     with Bench(library) as bench:
         assert bench.start()
         yield bench
@@ -53,11 +53,11 @@ def bench(library: ctypes.CDLL) -> Iterator[Bench]:
 
 @pytest.fixture(scope="session")
 def programs(compiler: str, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with the programs `rtloop-node` and `exchange`."""
+    """Return a folder with the compiled programs `rtloop-node` and `exchange`."""
     if shutil.which("make") is None:
         pytest.skip("no make")
     folder = tmp_path_factory.mktemp("programs")
     command = ["make", "-C", str(NODE), "all", f"BUILD={folder}", f"CC={compiler}", "CFLAGS=-O1"]
-    made = subprocess.run(command, capture_output=True, text=True)
-    assert made.returncode == 0, made.stderr
+    result = subprocess.run(command, capture_output=True, text=True)
+    assert result.returncode == 0, result.stderr
     return folder

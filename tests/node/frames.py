@@ -25,7 +25,7 @@ class Channel(NamedTuple):
 
 
 class Welcome(NamedTuple):
-    """The fields of a WELCOME."""
+    """Fields of a WELCOME, the node's description of itself."""
 
     sequence: int
     session: int
@@ -39,7 +39,7 @@ class Welcome(NamedTuple):
 
 
 class Sample(NamedTuple):
-    """The fields of a SAMPLE."""
+    """Fields of a SAMPLE, the node's answer to a DRIVE."""
 
     sequence: int
     session: int
@@ -52,7 +52,7 @@ class Sample(NamedTuple):
 
 
 class Refusal(NamedTuple):
-    """The fields of a REFUSAL."""
+    """Fields of a REFUSAL, the node's answer to a frame that it refuses."""
 
     sequence: int
     session: int
@@ -62,26 +62,26 @@ class Refusal(NamedTuple):
 
 
 def frame(kind: int, sequence: int, content: bytes) -> bytes:
-    """Return a frame with its header and check."""
+    """Return the bytes of a frame: header, content, CRC."""
     body = struct.pack("<HBBI", 0x057B, kind, 1, sequence % 2**32) + content
     return body + struct.pack("<I", zlib.crc32(body))
 
 
 def hello(session: int = 5, version: int = 1, sequence: int = 1) -> bytes:
-    """Return a HELLO."""
+    """Return the bytes of a HELLO, which asks for a WELCOME."""
     return frame(HELLO, sequence, struct.pack("<IHH", session, version, 0))
 
 
 def drive(
     session: int, sequence: int, flags: int, codes: Sequence[int], digital: int = 0, hold_us: int = 10_000
 ) -> bytes:
-    """Return a DRIVE."""
+    """Return the bytes of a DRIVE, which sets outputs and asks for a SAMPLE by `flags`."""
     head = struct.pack("<IBBHII", session, flags, len(codes), digital, hold_us, 0)
     return frame(DRIVE, sequence, head + struct.pack(f"<{len(codes)}i", *codes))
 
 
 def parse(answer: bytes) -> Welcome | Sample | Refusal | None:
-    """Return the fields of a node's answer, None for no answer; raises AssertionError for a frame that is not valid."""
+    """Return the fields of a node's answer, None for no answer. Raises AssertionError for an invalid frame."""
     if not answer:
         return None
     magic, kind, batches, sequence = struct.unpack_from("<HBBI", answer)
@@ -111,26 +111,26 @@ def reason(answer: Sample | Refusal | None) -> int:
 
 
 def flags(answer: Sample | Refusal | None) -> int:
-    """Return a SAMPLE's flags."""
+    """Return the flags of an answer that must be a SAMPLE."""
     assert isinstance(answer, Sample)
     return answer.flags
 
 
 def cobs(content: bytes) -> bytes:
-    """Return a frame as it stands on a serial line, with its byte 0 (Cheshire and Baker 1999)."""
+    """Return the bytes of a frame on a serial line, with the final byte 0 (Cheshire and Baker 1999)."""
     line = bytearray()
     blocks = content.split(b"\0")
     for number, block in enumerate(blocks, start=1):
         for start in range(0, len(block) - 253, 254):
             line += b"\xff" + block[start : start + 254]
-        rest = block[len(block) // 254 * 254 :]
-        if rest or not block or number < len(blocks):
-            line += bytes([len(rest) + 1]) + rest
+        last = block[len(block) // 254 * 254 :]
+        if last or not block or number < len(blocks):
+            line += bytes([len(last) + 1]) + last
     return bytes(line) + b"\0"
 
 
 def uncobs(line: bytes) -> bytes:
-    """Return the frame in the bytes before a byte 0; raises ValueError for a line that was cut."""
+    """Return the frame in the bytes before a byte 0. Raises ValueError for a frame that was cut."""
     content = bytearray()
     place = 0
     while place < len(line):

@@ -20,12 +20,12 @@ from typing import NamedTuple
 from tests.node.frames import Refusal, Sample, Welcome, cobs, parse, uncobs
 
 LONGEST_S = 10.0
-"""For one answer on a busy machine."""
+"""Time-out in s of an answer on a busy machine."""
 Exchange = Callable[[bytes], Welcome | Sample | Refusal | None]
 
 
 class Output(NamedTuple):
-    """One output in the witness file."""
+    """An output in the witness file: code, largest change of a step, largest change in 1 ms."""
 
     code: int
     change: int
@@ -33,7 +33,7 @@ class Output(NamedTuple):
 
 
 class Witness(NamedTuple):
-    """The witness file of the program."""
+    """Content of the program's witness file."""
 
     digital: int
     writes: int
@@ -53,7 +53,7 @@ def read_witness(path: Path) -> Witness:
 
 
 class NodeProcess:
-    """A running rtloop-node."""
+    """A process of rtloop-node, with the port and the boot number that it prints."""
 
     def __init__(self, programs: Path, *options: str | Path):
         command = [programs / "rtloop-node", *map(str, options)]
@@ -66,7 +66,7 @@ class NodeProcess:
         self.boot: int = fields["boot"]
 
     def stop(self, number: int = signal.SIGTERM) -> dict[str, int]:
-        """Stop the program by a signal, and return its counters; after SIGKILL none."""
+        """Stop the program by a signal and return its counters; after SIGKILL, an empty dict."""
         self.process.send_signal(number)
         output, errors = self.process.communicate(timeout=LONGEST_S)
         if number == signal.SIGKILL:
@@ -77,7 +77,7 @@ class NodeProcess:
 
 @contextmanager
 def running(programs: Path, *options: str | Path) -> Iterator[NodeProcess]:
-    """A node that is killed at the end of the test if it still runs."""
+    """Yield a node's process, and kill it at the end if it still runs."""
     node = NodeProcess(programs, *options)
     try:
         yield node
@@ -88,7 +88,7 @@ def running(programs: Path, *options: str | Path) -> Iterator[NodeProcess]:
 
 @contextmanager
 def udp_client(port: int, host: str = "127.0.0.1") -> Iterator[Exchange]:
-    """A function that sends a frame over UDP and returns the fields of its answer."""
+    """Yield a function that sends a frame over UDP and returns the fields of the answer."""
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     with socket.socket(family, socket.SOCK_DGRAM) as client:
         client.settimeout(LONGEST_S)
@@ -103,7 +103,7 @@ def udp_client(port: int, host: str = "127.0.0.1") -> Iterator[Exchange]:
 
 @contextmanager
 def serial_line(device: Path) -> Iterator[Callable[[bytes, int], list[bytes]]]:
-    """A function that writes bytes to a serial device and returns a number of frames that come back."""
+    """Yield a function that writes bytes to a serial device and returns a number of answered frames."""
     file = os.open(device, os.O_RDWR | os.O_NOCTTY)
     tty.setraw(file, termios.TCSANOW)
 
@@ -123,13 +123,13 @@ def serial_line(device: Path) -> Iterator[Callable[[bytes, int], list[bytes]]]:
 
 @contextmanager
 def serial_client(device: Path) -> Iterator[Exchange]:
-    """A function that sends a frame over a serial device and returns the fields of its answer."""
+    """Yield a function that sends a frame over a serial device and returns the fields of the answer."""
     with serial_line(device) as exchange:
         yield lambda frame: parse(exchange(cobs(frame), 1)[0])
 
 
 def wait_until(condition: Callable[[], bool]) -> None:
-    """Wait until a condition holds; raises AssertionError after ten seconds."""
+    """Wait until a condition holds. Raises AssertionError after LONGEST_S."""
     end_s = time.monotonic() + LONGEST_S
     while not condition():
         assert time.monotonic() < end_s

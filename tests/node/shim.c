@@ -1,4 +1,4 @@
-/* A board of arrays below the node's library, for tests that call it through ctypes. */
+/* A simulated board for the node's library, for tests that call the library through ctypes. */
 #include <stdlib.h>
 #include <string.h>
 
@@ -17,7 +17,7 @@ struct bench {
     uint32_t reads;
     uint32_t writes;
     uint64_t clock_ns;
-    uint64_t conversion_ns;       /* how long a conversion takes */
+    uint64_t conversion_ns;       /* duration of a conversion */
     uint64_t times_us[MOST_WRITES];
     uint16_t digital[MOST_WRITES];
     int32_t codes[MOST_WRITES][RTLOOP_MAX_CHANNELS];

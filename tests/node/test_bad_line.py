@@ -1,4 +1,7 @@
-"""The driver `serial` on a line that loses, doubles and damages bytes, and puts garbage between frames."""
+"""The driver `serial` counts and reads exactly on a line that loses, doubles, damages and inserts bytes.
+
+The oracle, `expected_counts`, is fed with the frames that the test parses from the bytes on the line.
+"""
 
 from __future__ import annotations
 
@@ -25,76 +28,77 @@ from tests.drivers.node_calls import open_calls
 from tests.drivers.relay_frames import LOOP, Arrival
 from tests.drivers.relayed_nodes import PythonNode
 from tests.faults.evidence import wait_for
-from tests.node.accounts import COUNTS, accounts
+from tests.node.accounts import COUNTS, expected_counts
 from tests.node.frames import SAMPLE, cobs, uncobs
 
 TICKS, PERIOD_US = 300, 1000
 LONGEST_CODE = 2896
-"""Bytes of a frame on the line from which on the driver skips to its end."""
+"""Length in bytes from which on the driver skips a frame on the line."""
 
 
 class Line:
-    """A pseudo-terminal with a node; a thread answers until `leave`, then the test does by `exchange`."""
+    """A pseudo-terminal with a node; a thread answers until `end_thread`, then the test by `exchange`."""
 
     def __init__(self, link: Path) -> None:
         self._fd, self._end = os.openpty()
         tty.setraw(self._end)
         link.symlink_to(os.ttyname(self._end))
-        self.node, self._now_us, self._rest = PythonNode(), 0, b""
-        self._is_left = threading.Event()
+        self.node, self._now_us, self._unfinished = PythonNode(), 0, b""
+        self._is_ended = threading.Event()
         self._thread = threading.Thread(target=self._serve)
         self._thread.start()
 
     def _serve(self) -> None:
-        while not self._is_left.is_set():
+        """Answer all frames until the thread shall end."""
+        while not self._is_ended.is_set():
             for answer in self._answers(0.01):
                 os.write(self._fd, cobs(answer))
 
-    def leave(self) -> None:
-        """End the thread."""
-        self._is_left.set()
+    def end_thread(self) -> None:
+        """End the thread that answers."""
+        self._is_ended.set()
         self._thread.join()
 
     def serve_again(self) -> None:
-        """Answer by a thread again."""
-        self._is_left.clear()
+        """Start a thread that answers again."""
+        self._is_ended.clear()
         self._thread = threading.Thread(target=self._serve)
         self._thread.start()
 
     def _answers(self, timeout_s: float) -> list[bytes]:
-        """Return the node's answers to the frames that have come, which must be whole."""
+        """Return the node's answers to the complete frames that have arrived."""
         if not select.select([self._fd], [], [], timeout_s)[0]:
             return []
-        *frames, self._rest = (self._rest + os.read(self._fd, 65_536)).split(b"\0")
+        *frames, self._unfinished = (self._unfinished + os.read(self._fd, 65_536)).split(b"\0")
         self._now_us += PERIOD_US
         answers = [self.node.receive(uncobs(frame), LOOP, self._now_us) for frame in frames if frame]
         return [answer for answer in answers if answer]
 
     def exchange(self, damage: random.Random, fd: int) -> bytes:
-        """Answer a drive by bytes that are damaged at random; return them once they are at the driver's end."""
+        """Answer a drive with randomly damaged bytes; return the bytes once all have reached the driver's end."""
         answers: list[bytes] = []
         while not answers:
             answers = self._answers(60.0)
-        sent = b"".join(spoilt(cobs(answer), damage) for answer in answers)
+        sent = b"".join(damage_half(cobs(answer), damage) for answer in answers)
         os.write(self._fd, sent)
         waiting = array.array("i", [0])
 
-        def have_come() -> bool:
+        def have_arrived() -> bool:
             fcntl.ioctl(fd, termios.FIONREAD, waiting)
             return waiting[0] == len(sent)
 
-        wait_for(have_come, "the bytes", poll_s=0.0)
+        wait_for(have_arrived, "the bytes", poll_s=0.0)
         return sent
 
     def close(self) -> None:
         """End the thread and close the line."""
-        self.leave()
+        self.end_thread()
         os.close(self._fd)
         os.close(self._end)
 
 
-def spoilt(line: bytes, chance: random.Random) -> bytes:
-    """Return the bytes of a frame with something wrong at one of two, or a good frame."""
+def damage_half(line: bytes, chance: random.Random) -> bytes:
+    """Return the bytes of a frame; every second one, on average, is damaged."""
     place = chance.randrange(len(line))
     return {
         0: lambda: b"",
@@ -107,17 +111,17 @@ def spoilt(line: bytes, chance: random.Random) -> bytes:
     }.get(chance.randrange(14), lambda: line)()
 
 
-def arrivals_of(stream: list[bytes], boot: int, session: int) -> list[list[Arrival]]:
-    """Return the frames that end in the bytes of each tick."""
-    ticks, rest = [], b""
+def parse_arrivals(stream: list[bytes], boot: int, session: int) -> list[list[Arrival]]:
+    """Return, for each tick, the arrivals of the frames that end in its bytes."""
+    ticks, unfinished = [], b""
     for data in stream:
-        *lines, rest = (rest + data).split(b"\0")
-        ticks.append([arrival_of(line, boot, session) for line in lines if line])
+        *lines, unfinished = (unfinished + data).split(b"\0")
+        ticks.append([parse_arrival(line, boot, session) for line in lines if line])
     return ticks
 
 
-def arrival_of(line: bytes, boot: int, session: int) -> Arrival:
-    """Return what the bytes between two 0 are."""
+def parse_arrival(line: bytes, boot: int, session: int) -> Arrival:
+    """Return the arrival of the bytes between two bytes 0: a sample or an invalid frame."""
     try:
         content = uncobs(line) if len(line) < LONGEST_CODE else b""
     except ValueError:
@@ -138,7 +142,7 @@ def test_the_counts_are_what_the_line_did(seed, tmp_path):
     driver = SerialDriver(options, {"x": Wiring("adc0", "dac0")}, 100.0)
     calls = open_calls(driver)
     calls.read()
-    line.leave()
+    line.end_thread()
     card = driver._opened_card
     first, results, stream = int(card["sequence"][0]), [], []
     start_s = time.monotonic()
@@ -153,10 +157,10 @@ def test_the_counts_are_what_the_line_did(seed, tmp_path):
     line.serve_again()
     driver.close()
     line.close()
-    arrivals = [[Arrival("sample", first)], *arrivals_of(stream, boot, session)[: TICKS - 1]]
-    truth, got = accounts(arrivals, first), [values[2 : 2 + len(COUNTS)] for _, values in results]
-    assert got == truth
-    assert truth[-1][0] > 0 < truth[-1][2]
+    arrivals = [[Arrival("sample", first)], *parse_arrivals(stream, boot, session)[: TICKS - 1]]
+    expected, counted = expected_counts(arrivals, first), [values[2 : 2 + len(COUNTS)] for _, values in results]
+    assert counted == expected
+    assert expected[-1][0] > 0 < expected[-1][2]
     newest, reading = first, 0.0
     for arrived, (_, values) in zip(arrivals, results, strict=True):
         for sample in arrived:

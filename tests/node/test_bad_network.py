@@ -1,7 +1,7 @@
 """The driver `udp` behind a network that loses, delays, reorders, doubles, damages and forges datagrams by a plan.
 
-The relay says what arrived; `accounts` counts it by the definitions in docs/drivers.md, and the driver must have
-counted the same in each tick.
+The oracle, `expected_counts`, counts the relay's arrivals by the definitions in docs/drivers.md; the driver's counts
+must be the same in each tick.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from tests.drivers.network_plan import DAMAGES, Copy, Plan, Script
 from tests.drivers.node_calls import open_calls
 from tests.drivers.relay_frames import Arrival
 from tests.drivers.relayed_nodes import LibraryNode, PythonNode
-from tests.node.accounts import COUNTS, accounts
+from tests.node.accounts import COUNTS, expected_counts
 
 TICKS = 400
 PATIENT = {"error_limit": 1_000_000, "watchdog_ms": 5000.0, "wait_s": 60.0}
@@ -33,18 +33,18 @@ AnyNode = PythonNode | LibraryNode
 
 @pytest.fixture(params=["Python", "C"])
 def node(request: pytest.FixtureRequest) -> AnyNode:
-    """A node without a line."""
+    """Return a node without a line: the simulated node, then the C library."""
     return PythonNode() if request.param == "Python" else LibraryNode(request.getfixturevalue("library"))
 
 
-def driver_behind(relay: Relay, **options: object) -> UdpDriver:
-    """A driver, not open, whose node is the relay."""
+def relay_driver(relay: Relay, **options: object) -> UdpDriver:
+    """Return a driver, not yet open, whose node is the relay."""
     values = {"host": "127.0.0.1", "port": relay.port} | PATIENT | options
     return UdpDriver(UdpOptions.model_validate(values), {"x": Wiring("adc0", "dac0")}, 1000.0)
 
 
-def started(driver: UdpDriver) -> DriverCalls:
-    """Open a driver and make its first read, again where this machine let the relay wait too long meanwhile."""
+def start(driver: UdpDriver) -> DriverCalls:
+    """Open a driver, make its first read, and return its calls; retry while a stall of the machine makes it fail."""
     while True:
         calls = open_calls(driver)
         if calls.read()[0] == 0:
@@ -53,12 +53,12 @@ def started(driver: UdpDriver) -> DriverCalls:
         driver.close()
 
 
-class Run:
-    """A driver behind a bad network for a number of ticks with another drive in each, and what it returned."""
+class RecordedExchange:
+    """An exchange behind a bad network: a different drive in each tick, and the values that the driver returned."""
 
     def __init__(self, relay: Relay, plan: Plan, hold_ticks: int = 2, ticks: int = TICKS) -> None:
-        self.relay, driver = relay, driver_behind(relay, hold_ticks=hold_ticks)
-        calls = started(driver)
+        self.relay, driver = relay, relay_driver(relay, hold_ticks=hold_ticks)
+        calls = start(driver)
         self.first = max(relay.drives)
         """Sequence of the newest request before the first tick."""
         relay.begin(plan)
@@ -76,24 +76,24 @@ class Run:
         self._rows = np.array([values for _, values in results])
 
     def column(self, name: str) -> np.ndarray:
-        """Return a value of each tick: the reading in V, the age in µs, or an observed signal."""
+        """Return one column (ticks): reading_v, age_us, or an observed signal."""
         return self._rows[:, ("reading_v", "age_us", *OBSERVED).index(name)]
 
 
-def assert_counted(run: Run, hold_ticks: int = 2) -> None:
-    """Compare counts, status and age of each tick with what the relay did, and samples with the node's."""
-    truth = accounts(run.arrivals, run.first)
+def assert_counts(run: RecordedExchange, hold_ticks: int = 2) -> None:
+    """Require the expected counts, status and age in each tick."""
+    expected = expected_counts(run.arrivals, run.first)
     for place, name in enumerate(COUNTS):
-        assert run.column(name).tolist() == [row[place] for row in truth], name
-    held = np.diff([0, *(row[5] for row in truth)])
+        assert run.column(name).tolist() == [row[place] for row in expected], name
+    held = np.diff([0, *(row[5] for row in expected)])
     assert run.statuses == held.tolist()
-    runs = list(accumulate(held, lambda run, is_held: (run + 1) * bool(is_held), initial=0))[1:]
-    np.testing.assert_array_equal(np.isinf(run.column("age_us")), np.array(runs) > hold_ticks)
+    held_in_row = list(accumulate(held, lambda run, is_held: (run + 1) * bool(is_held), initial=0))[1:]
+    np.testing.assert_array_equal(np.isinf(run.column("age_us")), np.array(held_in_row) > hold_ticks)
 
 
-def assert_true(run: Run, node: AnyNode) -> None:
-    """Require that each output and each sample is the one that belongs to its sequence."""
-    assert run.relay.wrong == []
+def assert_samples(run: RecordedExchange, node: AnyNode) -> None:
+    """Require that each output and each reading has the value of its sequence number."""
+    assert run.relay.output_problems == []
     lsb_v = node.volts(1) - node.volts(0)
     assert run.relay.applied
     for sequence, codes in run.relay.applied:
@@ -111,30 +111,30 @@ def assert_true(run: Run, node: AnyNode) -> None:
 @pytest.mark.parametrize("seed", [1, 2, 3])
 def test_the_counts_are_what_the_network_did(node, seed):
     with relayed(node) as relay:
-        run = Run(relay, Plan(seed), hold_ticks=seed)
-    assert_counted(run, hold_ticks=seed)
-    assert_true(run, node)
-    sent = relay.done
+        run = RecordedExchange(relay, Plan(seed), hold_ticks=seed)
+    assert_counts(run, hold_ticks=seed)
+    assert_samples(run, node)
+    sent = relay.fates
     assert all(sent[f"{way} {kind}"] for way in ("drive", "sample") for kind in ("lost", "late", "doubled", "good"))
 
 
 @pytest.mark.parametrize("seed", [4, 5])
 def test_damaged_and_forged_datagrams_reach_no_output_and_no_sample(node, seed):
     with relayed(node) as relay:
-        Run(relay, Plan(0, 0, 0, 0, 0), ticks=20)  # a run before, whose frames come back in this one
+        RecordedExchange(relay, Plan(0, 0, 0, 0, 0), ticks=20)  # frames of this run are forged in the next one
         before = node.counts[0]
-        run = Run(relay, Plan(seed, damage=0.4, strangers=0.2))
-    assert_counted(run)
-    assert_true(run, node)
-    assert all(relay.done[f"{way} {damage}"] for way in ("drive", "sample") for damage in DAMAGES)
-    assert node.counts[0] - before >= sum(relay.done[f"drive {damage}"] for damage in DAMAGES)
-    last = accounts(run.arrivals, run.first)[-1]
+        run = RecordedExchange(relay, Plan(seed, damage=0.4, strangers=0.2))
+    assert_counts(run)
+    assert_samples(run, node)
+    assert all(relay.fates[f"{way} {damage}"] for way in ("drive", "sample") for damage in DAMAGES)
+    assert node.counts[0] - before >= sum(relay.fates[f"drive {damage}"] for damage in DAMAGES)
+    last = expected_counts(run.arrivals, run.first)[-1]
     assert min(last) > 0
 
 
 def test_a_good_network_has_no_faults(node):
     with relayed(node) as relay:
-        run = Run(relay, Script(), ticks=50)
+        run = RecordedExchange(relay, Script(), ticks=50)
     assert not any(np.any(run.column(name)) for name in COUNTS)
     assert run.statuses == [0] * 50
     assert [sequence for sequence, _ in relay.applied] == list(range(run.first + 1, run.first + 51))
@@ -164,8 +164,8 @@ DRIVE_5, SAMPLE_5 = ("drive", 5), ("sample", 5)
 def test_each_fault_in_each_direction_counts_as_documented(copies, counts):
     node = PythonNode()
     with relayed(node) as relay:
-        run = Run(relay, Script(copies), ticks=20)
-    assert_counted(run)
+        run = RecordedExchange(relay, Script(copies), ticks=20)
+    assert_counts(run)
     for name, count in zip(COUNTS, counts, strict=False):
         assert count is None or run.column(name)[-1] == count, name
 
@@ -173,14 +173,14 @@ def test_each_fault_in_each_direction_counts_as_documented(copies, counts):
 @contextmanager
 def opened(relay: Relay, **options: object) -> Iterator[tuple[UdpDriver, DriverCalls]]:
     """Yield an open driver behind a relay, and its calls."""
-    driver = driver_behind(relay, **options)
-    yield driver, started(driver)
+    driver = relay_driver(relay, **options)
+    yield driver, start(driver)
     relay.end()
     driver.close()
 
 
 def exchange(relay: Relay, calls: DriverCalls, volts: float = 1.0) -> tuple[int, list[float]]:
-    """Write, wait until the relay has dealt with the drive, and read."""
+    """Write, wait until the relay has carried the drive, and return the result of a read."""
     handled = relay.handled
     assert calls.write([volts]) == 0
     relay.wait_handled(handled + 1)
@@ -189,7 +189,7 @@ def exchange(relay: Relay, calls: DriverCalls, volts: float = 1.0) -> tuple[int,
 
 @pytest.mark.parametrize("limit", [2, 7, 10])
 def test_the_error_level_ends_the_exchange_at_its_limit(limit):
-    """One of three answers is lost: the level rises by 2, falls by 1 and by 1; two of three: it ends the exchange."""
+    """The level rises by 2 for a lost answer and falls by 1 for an answer: two losses of three end the exchange."""
     with relayed(PythonNode()) as relay, opened(relay, error_limit=limit) as (driver, calls):
         relay.begin(Script({("sample", 3 * i): () for i in range(20)} if limit > 2 else {}))
         statuses = [exchange(relay, calls)[0] for _ in range(60)]
@@ -208,23 +208,23 @@ def test_the_error_level_ends_the_exchange_at_its_limit(limit):
 def test_an_answer_after_more_than_a_thousand_requests_is_invalid():
     with relayed(PythonNode()) as relay:
         late = {("sample", 5): (Copy(1023),), ("sample", 6): (Copy(1024),)}
-        late |= {("sample", 5 + 1023): (), ("sample", 6 + 1024): ()}  # no newer answer comes with them
-        run = Run(relay, Script(late), hold_ticks=1, ticks=1100)
+        late |= {("sample", 5 + 1023): (), ("sample", 6 + 1024): ()}  # no newer answer arrives with them
+        run = RecordedExchange(relay, Script(late), hold_ticks=1, ticks=1100)
     assert [run.column(name)[-1] for name in COUNTS[:5]] == [3, 1, 0, 1, 0]
 
 
 def test_each_of_thousands_of_lost_requests_counts():
     with relayed(PythonNode()) as relay:
-        run = Run(relay, Script({("drive", k): () for k in range(5, 3005)}), hold_ticks=1, ticks=3010)
-    assert_counted(run, hold_ticks=1)
+        run = RecordedExchange(relay, Script({("drive", k): () for k in range(5, 3005)}), hold_ticks=1, ticks=3010)
+    assert_counts(run, hold_ticks=1)
     assert run.column("node_lost_samples")[-1] == 3000
 
 
 def test_datagrams_beyond_those_of_a_tick_wait_for_the_next_one():
     with relayed(PythonNode()) as relay:
         relay.floods = {10: 64, 20: 63, 30: 200}
-        run = Run(relay, Script(), hold_ticks=5, ticks=50)
-    assert_counted(run, hold_ticks=5)
+        run = RecordedExchange(relay, Script(), hold_ticks=5, ticks=50)
+    assert_counts(run, hold_ticks=5)
     assert run.column("node_held_ticks")[-1] == 1 + 3
     assert run.column("node_invalid_frames")[-1] == 327
     assert run.column("node_lost_samples")[-1] == 0
@@ -235,12 +235,12 @@ def test_a_node_that_restarts_between_two_datagrams_ends_the_exchange(node, requ
     with relayed(first) as relay, opened(relay) as (driver, calls):
         assert [exchange(relay, calls, 4.0)[0] for _ in range(5)] == [0] * 5
         fresh = PythonNode() if isinstance(first, PythonNode) else LibraryNode(request.getfixturevalue("library"), 2)
-        at_rest = fresh.outputs
+        start_outputs = fresh.outputs
         relay.node = fresh
         assert exchange(relay, calls, 4.0)[0] == -1
         assert "the node has restarted" in str(driver.error)
         assert [exchange(relay, calls, 4.0)[0] for _ in range(5)] == [-1] * 5
-        assert fresh.outputs == at_rest
+        assert fresh.outputs == start_outputs
 
 
 def test_a_cable_that_is_out_and_in_again_moves_nothing(node):
@@ -248,7 +248,7 @@ def test_a_cable_that_is_out_and_in_again_moves_nothing(node):
         assert exchange(relay, calls, 5.0)[0] == 0
         relay.begin(Script({("drive", i): () for i in range(80)}))
         ages = [exchange(relay, calls, 5.0)[1][1] for _ in range(80)]
-        assert [math.isinf(age) for age in ages] == [False] * 3 + [True] * 77  # noticed while it is out
+        assert [math.isinf(age) for age in ages] == [False] * 3 + [True] * 77  # noticed while the cable is out
         answers = [exchange(relay, calls, 5.0)[0] for _ in range(20)]
         assert answers == [-1] * 20
         assert "the node's watchdog has parked the outputs" in str(driver.error)
@@ -258,15 +258,15 @@ def test_a_cable_that_is_out_and_in_again_moves_nothing(node):
 
 
 def test_same_tick_requests_are_counted_too(node):
-    """Each tick asks for a sample and waits for it; its second datagram, the drive, asks for none."""
-    chance, copies, expected = Plan(9, lost=0.1, late=0, doubled=0.1, damage=0), {}, []
+    """A tick requests a sample and waits for it; the tick's second datagram, the drive, requests none."""
+    plan, copies, copies_arriving = Plan(9, lost=0.1, late=0, doubled=0.1, damage=0), {}, []
     for tick in range(150):
-        copies[("sample", tick)] = fate = chance.fate("sample")
-        expected.append(len(fate))
+        copies[("sample", tick)] = fate = plan.fate("sample")
+        copies_arriving.append(len(fate))
     with relayed(node) as relay, opened(relay, answer="same tick", deadline_us=1e6, hold_ticks=1) as (driver, calls):
         relay.begin(Script(copies))
         lost = doubled = held = 0
-        for tick, count in enumerate(expected):
+        for tick, count in enumerate(copies_arriving):
             handled = relay.handled
             assert calls.write([0.01 * tick]) == 0
             relay.wait_handled(handled + 1)
@@ -283,4 +283,4 @@ def test_same_tick_requests_are_counted_too(node):
         calls.write([0.0])
         values = calls.read()[1]
         assert values[2:5] == [lost, 0, doubled]
-        assert relay.wrong == []
+        assert relay.output_problems == []

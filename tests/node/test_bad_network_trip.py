@@ -1,4 +1,4 @@
-"""A whole loop behind a bad network: the interlock `stale` trips in the tick after the last held one, not before."""
+"""A loop behind a bad network trips by `stale` in the tick after the last tick that may be held, not before."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ RAW = text(AXIS, "[axis.interlocks]\nsample_age_us = 1e9\n", mode="raw", rate_hz
 
 
 class StartedDriver(UdpDriver):
-    """The driver after its first `read`: it waits for the node, and a loop in this process would stop the relay."""
+    """A driver whose `open` makes the first `read`, which waits for the node: in the loop it would stop the relay."""
 
     def open(self) -> Pointers:
         pointers = super().open()
@@ -54,4 +54,4 @@ def test_the_loop_trips_where_more_answers_are_missing_than_it_may_hold(hold_tic
     first = FIRST_LOST + hold_ticks + 1 if excess else TICKS
     np.testing.assert_array_equal((flags & Flag.TRIP_STALE) != 0, np.arange(TICKS) >= first)
     assert bench.kinds().count(Kind.TRIPPED) == excess
-    assert relay.wrong == []
+    assert relay.output_problems == []

@@ -1,4 +1,4 @@
-"""The library fits firmware: what it needs of the C library, C++, and a compiler for Cortex-M."""
+"""The node's library suits firmware: it needs only copying from the C library, works with C++ and on a Cortex-M."""
 
 from __future__ import annotations
 
@@ -48,8 +48,8 @@ def test_the_example_for_a_microcontroller_links(tmp_path: Path):
     if shutil.which("arm-none-eabi-gcc") is None or shutil.which("make") is None:
         pytest.skip("no arm-none-eabi-gcc, or no make")
     command = ["make", "-s", "-C", str(NODE), "arm", f"BUILD={tmp_path}"]
-    made = subprocess.run(command, capture_output=True, text=True)
-    assert made.returncode == 0, made.stderr
-    text_bytes, _, memory_bytes, *_ = made.stdout.splitlines()[-1].split()
+    result = subprocess.run(command, capture_output=True, text=True)
+    assert result.returncode == 0, result.stderr
+    text_bytes, _, memory_bytes, *_ = result.stdout.splitlines()[-1].split()
     assert int(text_bytes) < 4096  # the library, the example and memcpy
     assert int(memory_bytes) < 8192

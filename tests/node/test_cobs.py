@@ -1,4 +1,4 @@
-"""Frames on a serial line: both ways against a coder in Python, and after every kind of damage."""
+"""Coding of frames on a serial line, compared with a coder in Python, and decoding after every kind of damage."""
 
 from __future__ import annotations
 
@@ -22,26 +22,26 @@ class Line:
         self.buffer = ctypes.create_string_buffer(LONGEST)
 
     def feed(self, line: bytes) -> list[bytes]:
-        """Return the frames that complete while the receiver takes these bytes."""
+        """Give the receiver bytes, and return the frames that they complete."""
         lengths = ((self.library.cobs_receive(self.receiver, ctypes.c_uint8(byte), self.buffer)) for byte in line)
         return [self.buffer.raw[:length] for length in lengths if length]
 
     @property
     def damaged(self) -> int:
-        """How many frames were damaged."""
+        """Number of damaged frames."""
         return self.library.cobs_damaged(self.receiver)
 
 
 @pytest.fixture
 def line(library: ctypes.CDLL) -> Iterator[Line]:
-    """A serial line."""
+    """Yield a new receiver of the library."""
     line = Line(library)
     yield line
     library.cobs_delete(line.receiver)
 
 
 def encode(library: ctypes.CDLL, content: bytes) -> bytes:
-    """Return what the library's coder writes, and check that it stays within the memory that it asks for."""
+    """Return a frame coded by the library; require that the coder writes within its documented memory."""
     size = len(content) + len(content) // 254 + 2
     memory = ctypes.create_string_buffer(b"\xaa" * (size + 8), size + 8)
     length = library.cobs_encode(content, ctypes.c_size_t(len(content)), memory)
@@ -49,7 +49,7 @@ def encode(library: ctypes.CDLL, content: bytes) -> bytes:
     return memory.raw[:length]
 
 
-def contents() -> list[bytes]:
+def sample_frames() -> list[bytes]:
     """Return frames with few and many zeros, of lengths around the ends of blocks."""
     numbers = random.Random(3)
     lengths = [*range(1, 12), 20, 36, 252, 253, 254, 255, 256, 507, 508, 509, 510, 762, 1047, 1048]
@@ -78,7 +78,7 @@ def test_known_frames_are_coded_as_printed(library: ctypes.CDLL, content: bytes,
 
 
 def test_the_coder_agrees_with_python(library: ctypes.CDLL):
-    for content in contents():
+    for content in sample_frames():
         coded = encode(library, content)
         assert coded == cobs(content)
         assert uncobs(coded[:-1]) == content
@@ -86,8 +86,8 @@ def test_the_coder_agrees_with_python(library: ctypes.CDLL):
 
 
 def test_the_receiver_returns_what_was_sent(line: Line):
-    sent = contents()
-    assert line.feed(b"".join(map(cobs, sent))) == sent
+    frames = sample_frames()
+    assert line.feed(b"".join(map(cobs, frames))) == frames
     assert line.damaged == 0
 
 

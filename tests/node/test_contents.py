@@ -1,4 +1,4 @@
-"""Rules 6 and 7 of docs/node-protocol.md at the library of deploy/node: which codes reach the outputs."""
+"""Rules 6 and 7 of docs/node-protocol.md for the library of deploy/node: the codes that reach the outputs."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ from tests.node.frames import (
 def test_a_drive_is_judged_as_a_whole_before_any_output_moves(
     bench: Bench, act: int, codes: list[int], hold_us: int, expected: int
 ):
-    bench.open_at([1, 1], digital=2)
+    bench.open_and_set([1, 1], digital=2)
     before = bench.counters
     bench.now_us += 5000
     answer = bench.drive(act | ANSWER, codes, digital=1, hold_us=hold_us)
@@ -83,7 +83,7 @@ def test_a_hold_is_shortened_to_the_nodes_longest(bench: Bench, hold_us: int):
 
 
 def test_apply_before_ready_moves_no_output_and_feeds_the_watchdog(bench: Bench):
-    bench.open_at([100 + 90, -200], digital=5)
+    bench.open_and_set([100 + 90, -200], digital=5)
     bench.drive(OPEN)
     assert bench.digital == 0
     for _ in range(2):

@@ -1,4 +1,4 @@
-"""Every field of every frame, and frames that are not processed."""
+"""Every field of every frame of the protocol, and invalid frames, which the node only counts."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def test_welcome_says_what_the_node_is(bench: Bench):
 
 
 def test_hello_changes_nothing(bench: Bench):
-    bench.open_at([5, 5], hold_us=3000)
+    bench.open_and_set([5, 5], hold_us=3000)
     before = bench.counters
     for _ in range(3):
         bench.now_us += 900
@@ -123,8 +123,8 @@ def test_codes_at_the_safe_codes_are_at_safe_in_any_session(bench: Bench):
 GOOD = drive(5, 2, APPLY | ANSWER, [9, 9])
 
 
-def _checked(content: bytes) -> bytes:
-    """Return bytes with their CRC."""
+def _with_crc(content: bytes) -> bytes:
+    """Return the bytes followed by their CRC."""
     return content + struct.pack("<I", zlib.crc32(content))
 
 
@@ -138,16 +138,16 @@ def _checked(content: bytes) -> bytes:
             for bit in (0, 7)
         ),
         GOOD + b"\0",
-        _checked(GOOD[:-4] + b"\0"),
-        _checked(GOOD[:-5]),
-        _checked(GOOD[:-4] + bytes(4)),
-        _checked(b"\x7a" + GOOD[1:-4]),
-        _checked(GOOD[:3] + b"\2" + GOOD[4:-4]),
+        _with_crc(GOOD[:-4] + b"\0"),
+        _with_crc(GOOD[:-5]),
+        _with_crc(GOOD[:-4] + bytes(4)),
+        _with_crc(b"\x7a" + GOOD[1:-4]),
+        _with_crc(GOOD[:3] + b"\2" + GOOD[4:-4]),
         *(frame(kind, 2, GOOD[8:-4]) for kind in range(256) if kind != DRIVE),
         frame(HELLO, 2, bytes(9)),
         frame(HELLO, 2, bytes(7)),
         frame(DRIVE, 2, b""),
-        _checked(b""),
+        _with_crc(b""),
         bytes(36),
         GOOD[:-4] + bytes(4),
     ],

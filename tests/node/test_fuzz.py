@@ -1,4 +1,4 @@
-"""Random datagrams through the library, built with the sanitizers for addresses and undefined behaviour."""
+"""Random datagrams break no rule in the library, built with sanitizers for addresses and undefined behaviour."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from tests.node.conftest import NODE
 
 @pytest.fixture(scope="module")
 def fuzz(compiler: str, tmp_path_factory: pytest.TempPathFactory) -> list[str]:
-    """The command that runs random datagrams."""
+    """Return the command that builds the library and feeds it random datagrams."""
     if shutil.which("make") is None:
         pytest.skip("no make")
     folder = tmp_path_factory.mktemp("fuzz")
@@ -26,10 +26,10 @@ def fuzz(compiler: str, tmp_path_factory: pytest.TempPathFactory) -> list[str]:
 
 
 def run(command: list[str]) -> dict[str, float]:
-    """Run random datagrams, and return the figures that they print."""
-    ended = subprocess.run(command, capture_output=True, text=True)
-    assert ended.returncode == 0, ended.stdout + ended.stderr
-    return json.loads(ended.stdout)
+    """Run the command and return the figures that it prints."""
+    result = subprocess.run(command, capture_output=True, text=True)
+    assert result.returncode == 0, result.stdout + result.stderr
+    return json.loads(result.stdout)
 
 
 def test_random_datagrams_break_no_rule(fuzz: list[str]):

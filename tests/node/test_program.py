@@ -1,4 +1,4 @@
-"""The program rtloop-node on Linux as a real process, over UDP and over a pseudo-terminal."""
+"""The program rtloop-node as a process: sessions over UDP and a pseudo-terminal, watchdog, restarts, options."""
 
 from __future__ import annotations
 
@@ -33,11 +33,11 @@ from tests.node.frames import (
 from tests.node.node_process import Exchange, read_witness, running, serial_client, serial_line, udp_client, wait_until
 
 LONG_US = 4_000_000
-"""A hold that a busy machine does not exceed between two frames."""
+"""Hold time of the watchdog that a busy machine does not exceed between two frames."""
 
 
-def open_at(exchange: Exchange, codes: list[int], hold_us: int = LONG_US) -> None:
-    """Open session 5 and set the outputs."""
+def open_and_set(exchange: Exchange, codes: list[int], hold_us: int = LONG_US) -> None:
+    """Open session 5 and set the outputs to codes."""
     answer = exchange(drive(5, 1, OPEN | ANSWER, [0] * len(codes), hold_us=hold_us))
     assert isinstance(answer, Sample)
     assert answer.flags == READY | AT_SAFE
@@ -54,7 +54,7 @@ def test_a_session_over_udp_from_hello_to_park(programs: Path, tmp_path: Path):
         assert isinstance(welcome, Welcome)
         assert (welcome.counts, welcome.boot, welcome.driven) == ((2, 2, 4, 4), node.boot, 0)
         assert welcome.channels[2][:5] == (-32768, 32767, 0, 330, 10 / 32768)
-        open_at(exchange, [1000, -2000])
+        open_and_set(exchange, [1000, -2000])
         answer = exchange(drive(5, 3, APPLY | ANSWER, [-32768, 32767], hold_us=LONG_US))
         assert isinstance(answer, Sample)
         assert (answer.codes, answer.digital, answer.boot) == ((1000, -2000), 9, node.boot)
@@ -76,9 +76,9 @@ def test_the_watchdog_ramps_the_outputs_down(programs: Path, tmp_path: Path, spi
     witness = tmp_path / "witness"
     options = ["--port", "0", "--hold", "500000", "--change", "50", "--witness", str(witness), *["--spin"] * spin]
     with running(programs, *options) as node, udp_client(node.port) as exchange:
-        for code in range(0, 600, 40):  # so that no change is larger than a step of the ramp
+        for code in range(0, 600, 40):  # no change is larger than a step of the ramp
             if code == 0:
-                open_at(exchange, [0], hold_us=500_000)
+                open_and_set(exchange, [0], hold_us=500_000)
             else:
                 exchange(drive(5, 2 + code, APPLY | ANSWER, [code], hold_us=500_000))
             time.sleep(0.0015)  # more than 1 ms of the node's clock
@@ -97,7 +97,7 @@ def test_sigterm_parks_by_a_ramp_before_the_program_ends(programs: Path, tmp_pat
     witness = tmp_path / "witness"
     options = ("--port", "0", "--hold", str(LONG_US), "--change", "100", "--witness", str(witness))
     with running(programs, *options) as node, udp_client(node.port) as exchange:
-        open_at(exchange, [1050])
+        open_and_set(exchange, [1050])
         before = read_witness(witness)
         counters = node.stop()
     after = read_witness(witness)
@@ -108,11 +108,11 @@ def test_sigterm_parks_by_a_ramp_before_the_program_ends(programs: Path, tmp_pat
 
 def test_a_killed_and_restarted_node_has_another_boot(programs: Path):
     with running(programs, "--port", "0", "--hold", str(LONG_US)) as node, udp_client(node.port) as exchange:
-        open_at(exchange, [100])
+        open_and_set(exchange, [100])
         node.stop(signal.SIGKILL)
-        with running(programs, "--port", str(node.port)) as again:
-            assert again.boot != node.boot
-            assert exchange(drive(5, 3, APPLY | ANSWER, [100])) == Refusal(3, 5, again.boot, UNKNOWN, 1)
+        with running(programs, "--port", str(node.port)) as restarted:
+            assert restarted.boot != node.boot
+            assert exchange(drive(5, 3, APPLY | ANSWER, [100])) == Refusal(3, 5, restarted.boot, UNKNOWN, 1)
 
 
 def test_a_session_over_a_pseudo_terminal(programs: Path, tmp_path: Path):
@@ -120,7 +120,7 @@ def test_a_session_over_a_pseudo_terminal(programs: Path, tmp_path: Path):
     with running(programs, "--pty", str(link), "--channels", "3", "--hold", str(LONG_US)) as node:
         with serial_client(link) as exchange:
             assert isinstance(exchange(hello(5)), Welcome)
-            open_at(exchange, [1, 2, 3])
+            open_and_set(exchange, [1, 2, 3])
             assert exchange(hello(5, version=2)) == Refusal(1, 5, node.boot, 1, 1)
         with link.open("wb", buffering=0) as line:
             line.write(b"\3garbage\0" + bytes(100) + b"\5cut\0" + b"\x09begun" + b"\0")
@@ -143,14 +143,15 @@ def test_many_frames_in_one_write_are_all_answered(programs: Path, tmp_path: Pat
 
 def test_a_serial_device_that_goes_away_parks_the_outputs(programs: Path, tmp_path: Path):
     witness = tmp_path / "witness"
-    ours, theirs = os.openpty()
-    tty.setraw(theirs)
-    name = os.ttyname(theirs)
+    line_fd, device_fd = os.openpty()
+    tty.setraw(device_fd)
+    name = os.ttyname(device_fd)
     with running(programs, "--tty", name, "--hold", str(LONG_US), "--change", "100", "--witness", str(witness)) as node:
-        os.close(theirs)
-        os.write(ours, cobs(drive(5, 1, OPEN, [0], hold_us=LONG_US)) + cobs(drive(5, 2, APPLY, [250], hold_us=LONG_US)))
+        os.close(device_fd)
+        frames = drive(5, 1, OPEN, [0], hold_us=LONG_US), drive(5, 2, APPLY, [250], hold_us=LONG_US)
+        os.write(line_fd, b"".join(map(cobs, frames)))
         wait_until(lambda: read_witness(witness).outputs[0].code == 250)
-        os.close(ours)
+        os.close(line_fd)
         output, errors = node.process.communicate(timeout=10)
     assert (node.process.returncode, errors) == (1, f"--tty: {name}: the device is gone\n")
     assert json.loads(output)["sessions"] == 1
@@ -162,17 +163,17 @@ def test_a_node_that_was_killed_leaves_a_link_that_the_next_one_replaces(program
     with running(programs, "--pty", str(link)) as node:
         node.stop(signal.SIGKILL)
         assert link.is_symlink()
-        with running(programs, "--pty", str(link)) as again, serial_client(link) as exchange:
+        with running(programs, "--pty", str(link)) as successor, serial_client(link) as exchange:
             welcome = exchange(hello(5))
             assert isinstance(welcome, Welcome)
-            assert welcome.boot == again.boot != node.boot
+            assert welcome.boot == successor.boot != node.boot
 
 
 def test_a_node_is_reached_by_both_versions_of_ip(programs: Path):
     with running(programs, "--port", "0") as node:
         with udp_client(node.port) as exchange:
             assert isinstance(exchange(hello()), Welcome)
-            open_at(exchange, [7])
+            open_and_set(exchange, [7])
         try:
             socket.create_server(("::1", 0), family=socket.AF_INET6).close()
         except OSError:
@@ -198,15 +199,15 @@ def test_a_node_is_reached_by_both_versions_of_ip(programs: Path):
     ],
 )
 def test_a_mistake_on_the_command_line_is_named(programs: Path, options: list[str], message: str):
-    ended = subprocess.run([programs / "rtloop-node", *options], capture_output=True, text=True, timeout=10)
-    assert (ended.returncode, ended.stderr, ended.stdout) == (1, message, "")
+    result = subprocess.run([programs / "rtloop-node", *options], capture_output=True, text=True, timeout=10)
+    assert (result.returncode, result.stderr, result.stdout) == (1, message, "")
 
 
 def test_the_simulated_resonator_overshoots_and_settles_as_its_equation_says(programs: Path):
-    """After a step the first peak is g·u·(1 + q), the first dip g·u·(1 − q²), with q = e^(−π·d/√(1−d²))."""
+    """The oracle: after a step the first peak is g·u·(1 + q), the first dip g·u·(1 − q²), with q = e^(−π·d/√(1−d²))."""
     options = ("--port", "0", "--frequency", "40", "--damping", "0.1", "--gain", "2", "--hold", str(LONG_US))
     with running(programs, *options) as node, udp_client(node.port) as exchange:
-        open_at(exchange, [8000])
+        open_and_set(exchange, [8000])
         codes, end_s = [], time.monotonic() + 0.4
         while time.monotonic() < end_s:
             answer = exchange(drive(5, 3 + len(codes), ANSWER, [0], hold_us=LONG_US))
@@ -222,9 +223,9 @@ def test_the_simulated_resonator_overshoots_and_settles_as_its_equation_says(pro
 def test_the_benchmark_client_exchanges_and_parks(programs: Path, mode: list[str]):
     with running(programs, "--port", "0", "--hold", str(LONG_US)) as node:
         command = [programs / "exchange", "127.0.0.1", str(node.port), "--count", "50", "--hold", str(LONG_US), *mode]
-        ended = subprocess.run(command, capture_output=True, text=True, timeout=30)
-        assert ended.returncode == 0, ended.stderr
-        figures = json.loads(ended.stdout)
+        result = subprocess.run(command, capture_output=True, text=True, timeout=30)
+        assert result.returncode == 0, result.stderr
+        figures = json.loads(result.stdout)
         counters = node.stop()
     assert figures["exchanges"] == 50
     assert 0 <= figures["lost"] < 50  # a busy machine may answer too late

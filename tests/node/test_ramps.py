@@ -1,4 +1,4 @@
-"""Rules 8 and 10 of docs/node-protocol.md at the library of deploy/node: the watchdog, and ramps."""
+"""Rules 8 and 10 of docs/node-protocol.md for the library of deploy/node: the watchdog, and ramps."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from tests.node.frames import (
 
 @pytest.mark.parametrize("hold_us", [1, 999, 2500, LONGEST_HOLD_US])
 def test_the_watchdog_ends_the_session_at_its_microsecond(bench: Bench, hold_us: int):
-    bench.open_at([400, 100], digital=1, hold_us=hold_us)
+    bench.open_and_set([400, 100], digital=1, hold_us=hold_us)
     assert bench.due_us == bench.now_us + hold_us
     bench.poll(hold_us - 1)
     assert (bench.counters.watchdog_trips, bench.digital) == (0, 1)
@@ -48,7 +48,7 @@ def test_the_watchdog_counts_from_the_newest_drive(bench: Bench):
 
 
 def test_a_frame_after_the_hold_comes_too_late_even_if_nobody_polled(bench: Bench):
-    bench.open_at([1000, 0], hold_us=2000)
+    bench.open_and_set([1000, 0], hold_us=2000)
     bench.now_us += 2000
     assert reason(bench.drive(APPLY | ANSWER, FAR)) == WATCHDOG
     assert bench.counters.watchdog_trips == 1
@@ -56,7 +56,7 @@ def test_a_frame_after_the_hold_comes_too_late_even_if_nobody_polled(bench: Benc
 
 
 def test_a_cable_that_is_plugged_in_again_moves_nothing(bench: Bench):
-    bench.open_at([1000, 0], hold_us=2000)
+    bench.open_and_set([1000, 0], hold_us=2000)
     bench.run(100_000)
     assert bench.codes == SAFE
     writes = bench.counters.writes
@@ -65,7 +65,7 @@ def test_a_cable_that_is_plugged_in_again_moves_nothing(bench: Bench):
         assert reason(bench.drive(act | ANSWER, FAR, session=6)) == UNKNOWN
         assert reason(bench.drive(act | ANSWER, FAR, sender=OTHER)) == WATCHDOG
     assert bench.counters.writes == writes
-    bench.open_at(FAR, session=6, sender=OTHER)
+    bench.open_and_set(FAR, session=6, sender=OTHER)
 
 
 def test_a_session_that_the_watchdog_ended_is_remembered_after_another_was_parked(bench: Bench):
@@ -78,7 +78,7 @@ def test_a_session_that_the_watchdog_ended_is_remembered_after_another_was_parke
 
 
 def test_a_clock_that_steps_back_neither_trips_nor_moves(bench: Bench):
-    bench.open_at(FAR)
+    bench.open_and_set(FAR)
     bench.now_us -= 500_000
     bench.poll()
     assert reason(bench.drive(APPLY | ANSWER, FAR)) == 0
@@ -89,7 +89,7 @@ def test_a_clock_that_steps_back_neither_trips_nor_moves(bench: Bench):
 
 
 def test_a_ramp_takes_the_steps_that_are_due_and_no_more(bench: Bench):
-    bench.open_at(FAR, hold_us=5000)
+    bench.open_and_set(FAR, hold_us=5000)
     first = bench.counters.writes
     for step_us in itertools.islice(itertools.cycle([1, 137, 500, 999, 1000, 1700, 3001]), 9000):
         bench.poll(step_us)
@@ -107,7 +107,7 @@ def test_a_ramp_takes_the_steps_that_are_due_and_no_more(bench: Bench):
 
 
 def test_a_ramp_that_is_called_on_time_lasts_one_millisecond_a_step(bench: Bench):
-    bench.open_at([100 - 30 * 40, -200])
+    bench.open_and_set([100 - 30 * 40, -200])
     start_us = bench.now_us
     bench.drive(PARK)
     while (due_us := bench.due_us) != 2**64 - 1:
@@ -131,7 +131,7 @@ def test_a_ramp_from_end_to_end_of_the_numbers_does_not_wrap(bench: Bench):
 
 
 def test_a_new_session_during_a_ramp_waits_for_its_end(bench: Bench):
-    bench.open_at([100 + 90, -200])
+    bench.open_and_set([100 + 90, -200])
     bench.drive(PARK)
     bench.poll(1000)
     assert flags(bench.drive(OPEN | ANSWER, session=6, sender=OTHER)) == 0
@@ -142,7 +142,7 @@ def test_a_new_session_during_a_ramp_waits_for_its_end(bench: Bench):
 
 
 def test_the_watchdog_does_not_interrupt_an_opening_ramp(bench: Bench):
-    bench.open_at([100 + 300, -200])
+    bench.open_and_set([100 + 300, -200])
     bench.drive(OPEN, hold_us=2500)
     bench.run(12_000, 500)
     times = [w.time_us for a, w in itertools.pairwise(bench.writes(2)) if a.codes != w.codes]

@@ -1,4 +1,4 @@
-"""Rules 1 to 5 and 9 of docs/node-protocol.md at the library of deploy/node: who drives the node."""
+"""Rules 1 to 5 and 9 of docs/node-protocol.md for the library of deploy/node: sessions of the loops."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def test_a_node_starts_at_its_safe_codes_without_a_session(bench: Bench):
 
 
 def test_a_second_loop_is_refused_and_the_first_goes_on(bench: Bench):
-    bench.open_at([0, 0])
+    bench.open_and_set([0, 0])
     for session, sender in ((6, OTHER), (5, OTHER), (6, LOOP)):
         for act in (OPEN, APPLY, PARK, 0):
             assert reason(bench.drive(act | ANSWER, [50, 50], session, sender)) == BUSY
@@ -54,7 +54,7 @@ def test_a_session_opens_with_any_sequence_and_its_loop_goes_on_from_there(bench
 
 
 def test_a_repeated_open_is_answered_and_does_not_interrupt_the_ramp(bench: Bench):
-    bench.open_at(FAR)
+    bench.open_and_set(FAR)
     first = bench.counters.writes
     bench.drive(OPEN | ANSWER)
     for _ in range(20):
@@ -68,7 +68,7 @@ def test_a_repeated_open_is_answered_and_does_not_interrupt_the_ramp(bench: Benc
 
 
 def test_an_open_that_the_network_delayed_does_not_begin_the_session_anew(bench: Bench):
-    bench.open_at(FAR, digital=3)
+    bench.open_and_set(FAR, digital=3)
     assert bench.drive(OPEN | ANSWER, sequence=1) is None
     assert bench.counters.old == 1
     assert (bench.codes, bench.digital) == (FAR, 3)
@@ -109,7 +109,7 @@ def test_an_old_drive_does_not_feed_the_watchdog(bench: Bench):
 
 
 def test_a_restarted_node_knows_no_session_and_says_its_new_boot(bench: Bench):
-    bench.open_at(FAR)
+    bench.open_and_set(FAR)
     assert bench.start(boot=77)
     assert bench.codes == SAFE
     answer = bench.drive(APPLY | ANSWER, FAR)
@@ -121,7 +121,7 @@ def test_a_restarted_node_knows_no_session_and_says_its_new_boot(bench: Bench):
 
 
 def test_park_ends_the_session_and_is_answered_until_safe(bench: Bench):
-    bench.open_at([100 + 75, -190], digital=6)
+    bench.open_and_set([100 + 75, -190], digital=6)
     assert flags(bench.drive(PARK | ANSWER, FAR, digital=6)) == 0
     assert (bench.codes, bench.digital) == ([175, -190], 0)
     reports = []
@@ -157,7 +157,7 @@ def test_a_session_that_was_opened_again_has_ended_in_its_latest_way(bench: Benc
 
 
 def test_the_nodes_own_park_ends_the_session(bench: Bench):
-    bench.open_at([150, -200], digital=1)
+    bench.open_and_set([150, -200], digital=1)
     bench.park()
     assert (bench.codes, bench.digital) == ([150, -200], 0)
     assert reason(bench.drive(APPLY | ANSWER, FAR)) == UNKNOWN

@@ -1,4 +1,4 @@
-"""The node in C and the simulated node in Python, written apart from one document, answer frames in equal bytes."""
+"""The node in C and the simulated node in Python, written separately from one document, answer with equal bytes."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class StillNode(SimulatedNode):
 
 
 def channels(node: SimulatedNode) -> tuple[list[Channel], list[Channel]]:
-    """Inputs and outputs of the node, as the C library's bench takes them."""
+    """Return inputs and outputs of the node as channels of the C library's bench."""
     inputs, outputs = ([Channel(*scale) for scale in scales] for scales in (node._inputs, node._outputs))
     return inputs, outputs
 
@@ -37,9 +37,9 @@ def test_both_nodes_answer_alike(library: CDLL, seed: int):
     draw = random.Random(seed)
     options = UdpOptions(host="127.0.0.1", digital_inputs=2, digital_outputs=3, safe_v=1.5, park_slew_v_per_s=900.0)
     python = StillNode(options, ["x"], boot=BOOT)
-    python._rig.advance_to = lambda _: None  # Its inputs are still: only the protocol runs.
+    python._rig.advance_to = lambda _: None  # The plant stands still: only the protocol is tested.
     inputs, outputs = channels(python)
-    answered = moved = refused = 0
+    answers = moves = refusals = 0
     with Bench(library) as c:
         assert c.start(inputs, outputs, (2, 3), hold_us=10_000_000)
         sequence = {session: draw.getrandbits(32) for session in (0, 7, 8)}
@@ -65,7 +65,7 @@ def test_both_nodes_answer_alike(library: CDLL, seed: int):
                 frame = frame[:place] + bytes([frame[place] ^ 1 << draw.randrange(8)]) + frame[place + 1 :]
             before = list(python.codes)
             expected, actual = python.receive(frame, sender, c.now_us) or b"", c.send_bytes(frame, sender)
-            if len(actual) > 60:  # The description also says what the board's converters can do.
+            if len(actual) > 60:  # A WELCOME also describes the board's converters.
                 expected, actual = expected[:24] + expected[32:-4], actual[:24] + actual[32:-4]
             else:
                 digital = slice(18, 20)  # The boards' digital inputs differ.
@@ -73,5 +73,5 @@ def test_both_nodes_answer_alike(library: CDLL, seed: int):
                     expected, actual = (b[: digital.start] + b[digital.stop : -4] for b in (expected, actual))
             assert actual == expected, (step, flags, session, sender)
             assert (python.codes, python.digital & 7) == (c.codes, c.digital & 7)
-            answered, moved, refused = answered + bool(actual), moved + (before != python.codes), python.refused
-    assert min(answered, moved, refused) > STEPS // 50
+            answers, moves, refusals = answers + bool(actual), moves + (before != python.codes), python.refused
+    assert min(answers, moves, refusals) > STEPS // 50

@@ -22,6 +22,8 @@ class FileCardOptions(Options):
 
 
 class FileCard(PythonDriver):
+    """A driver that appends each written voltage to its file."""
+
     kind = KIND
     options_model = FileCardOptions
     options: FileCardOptions

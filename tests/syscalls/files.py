@@ -48,6 +48,7 @@ class Recovering(Case):
         self._repair(self.part)
 
     def judge(self, outcome: Outcome) -> list[str]:
+        """Require an intact finished file or the unfinished one, then all flushed ticks after the next repair."""
         problems = [] if outcome.killed or self._is_recovered() or self.part.exists() else ["both files are gone"]
         problems += run_file_problems(self._finished(), set(), complete_ticks=self.flushed)
         for part in find_leftovers(self.folder):
@@ -80,6 +81,7 @@ class Cutting(Case):
         cut(self.recording, self.FIRST, self.END)
 
     def judge(self, outcome: Outcome) -> list[str]:
+        """Require an unchanged recording, a complete cut or none, and a complete cut by the next process."""
         ticks, problems = set(range(self.FIRST, self.END)), []
         if self.recording.read_bytes() != _original(True).read_bytes():
             problems.append("the recording was changed")
@@ -141,6 +143,7 @@ class KeepingQuota(Case):
             self.quota.enforce(budget_s=60.0)
 
     def judge(self, outcome: Outcome) -> list[str]:
+        """Require that only removable recordings are removed, and that the next process removes all of them."""
         problems = self._wrongly_removed()
         Quota(self.folder, "test", 1, 0).enforce(budget_s=60.0)
         problems += self._wrongly_removed()

@@ -90,6 +90,7 @@ class ParkingABoard(Case):
         parking.park_configuration(self.config)
 
     def judge(self, outcome: Outcome) -> list[str]:
+        """Park once more; require 0 V afterwards, and no step above that of the ramp in all writes."""
         problems = []
         if outcome.finished and self._output_v() != 0.0:
             problems.append(f"parking ends without an error; the output is at {self._output_v():.3f} V")
@@ -152,6 +153,7 @@ class Noting(Case):
         write_note(self.path, self.new)
 
     def judge(self, outcome: Outcome) -> list[str]:
+        """Require the old note or the new one, then the new note after a second write."""
         try:
             problems, note = [], read_note(self.path)
         except UnusableNote as error:

@@ -65,6 +65,7 @@ class Recording(Case):
         self._record(1)
 
     def judge(self, outcome: Outcome) -> list[str]:
+        """Record the rest if the recorder died, repair the files, and check files and printed totals."""
         totals = self._printed_totals()
         self.output.unlink(missing_ok=True)
         flushed = ticks_on_disk(self.folder.glob("*.mcap*"))

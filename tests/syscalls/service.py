@@ -77,6 +77,7 @@ class StartingAService(Case):
         serve(self.config, self.log, lambda: begin_here(logs), lambda: (end_here(), terminate()))
 
     def judge(self, outcome: Outcome) -> list[str]:
+        """Park, start another service, and return the problems of board, logs and recordings."""
         problems = [] if outcome.crash else self._tracebacks(self.log)
         flushed = {path.name.removesuffix(".part"): ticks_on_disk([path]) for path in self.recordings.glob("*.mcap*")}
         written_ticks = self._flushed_ticks()
@@ -150,10 +151,12 @@ class StartingAService(Case):
         return f"hung for {timeout_s:g} s"
 
     def _tracebacks(self, log: Path) -> list[str]:
+        """Return a problem if a log holds a traceback."""
         text = log.read_text() if log.exists() else ""
         return ["a traceback"] if "Traceback" in text else []
 
     def _log_tail(self, log: Path) -> list[str]:
+        """Return the name and the end of a log, if the log exists."""
         return [f"{log.name}: {log.read_text()[-LAST:]}"] if log.exists() else []
 
 
@@ -165,6 +168,7 @@ class StoppingAService(StartingAService):
         serve(self.config, self.log, at_stop=lambda: begin_here(logs))
 
     def _terminate_once_up(self) -> None:
+        """Send SIGTERM once the output is up and ticks are in the file."""
         wait_for(lambda: board().seen().last_v > UP_V, "an output that is up", TIMEOUT_S)
         wait_for(lambda: self._flushed_ticks() > 0, "ticks in the file", TIMEOUT_S)
         terminate()
@@ -182,6 +186,7 @@ class ImportingAService(StartingAService):
         os.execv(sys.executable, [sys.executable, "-m", "rtloop", "serve", str(self.config)])
 
     def trace(self, injection: Injection | None, logs: Path) -> Outcome:
+        """Trace the service, send SIGTERM at READY, and keep only the calls before the configuration is read."""
         with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:
             manager.bind(os.environ["NOTIFY_SOCKET"])
             manager.settimeout(POLL_S)

@@ -1,4 +1,4 @@
-"""A laboratory's own card in plain Python: what hangs on it is the simulated rig, which moves once a write."""
+"""A laboratory's card in plain Python, with the simulated rig as its plant: each write moves the rig by one period."""
 
 from __future__ import annotations
 
@@ -11,6 +11,8 @@ from rtloop.hil.rig import advance, build_rig, sample
 
 
 class BenchCard(PythonDriver):
+    """The card's driver: one input, one output, and the plant's true position as an observed signal."""
+
     kind = "bench_card"
     options_model = RigOptions
     example = Wiring("in", "out")
