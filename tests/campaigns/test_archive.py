@@ -39,10 +39,10 @@ from tests.campaigns.bad_recordings import (
 )
 from tests.campaigns.campaign_files import rtloop
 from tests.recording import rewriting
-from tests.recording.forging import bases, pack_file
+from tests.recording.forging import pack_file, record_bases
 from tests.recording.real_loop import record, scheduled
 from tests.recording.tamper import flip_byte
-from tests.recording.test_verdict import without, without_snapshots
+from tests.recording.test_verdict import drop_chunks, drop_snapshots
 from tests.users import ROOT_ONLY, VICTIM, as_user
 
 GOOD = 17
@@ -305,11 +305,11 @@ def test_a_folder_takes_the_verdicts_of_one_process_at_a_time(tmp_path):
 
 
 def test_ticks_without_a_snapshot_are_not_verified_and_a_file_without_an_end_is_damaged(tmp_path):
-    base, path = bases(tmp_path)[0], tmp_path / "run.mcap"
-    path.write_bytes(pack_file(without_snapshots(base, {0, 1})))
+    base, path = record_bases(tmp_path)[0], tmp_path / "run.mcap"
+    path.write_bytes(pack_file(drop_snapshots(base, {0, 1})))
     row = judge(path)
     assert (row["verdict"], "no earlier snapshot" in row["reason"]) == ("not verified", True)
-    path.write_bytes(pack_file(without(base, len(base.chunks) - 1)))
+    path.write_bytes(pack_file(drop_chunks(base, len(base.chunks) - 1)))
     for row in (judge(path), summarise_files([str(path)], __version__)):
         assert (row["verdict"], "no recorded end" in row["reason"]) == ("damaged", True)
 

@@ -19,8 +19,8 @@ TRIP, STEP = 9_027, 113_456
 """Ticks of the trip, and of a change to a reference that saturates."""
 
 
-def text() -> str:
-    """A trip in the first second; ten seconds later another reference, then a mode and back."""
+def configuration_text() -> str:
+    """Return the configuration of a run: the trip of `scheduled`, a reference that saturates for 0.4 s, a new mode."""
     return scheduled() + schedule(
         (STEP, 'reference = { kind = "sine", amplitude = 27.0, frequency_hz = 3.0 }'),
         (STEP + 4_000, 'reference = { kind = "sine", amplitude = 5.0, frequency_hz = 3.0 }'),
@@ -28,28 +28,28 @@ def text() -> str:
     )
 
 
-def around(*on: str, **changes: Any) -> dict[str, Any]:
-    """Settings `around` of a header with the conditions `on`."""
+def around_settings(*on: str, **changes: Any) -> dict[str, Any]:
+    """Return the settings `around` of a header with the conditions `on`; `changes` replace or add settings."""
     return {"before_s": BEFORE_S, "after_s": AFTER_S, "every_s": 1.0, "on": list(on)} | changes
 
 
 class SelectiveRun(RecordedRun):
-    """The run, recorded around events; in virtual time unless it is paced."""
+    """The run of `configuration_text`, recorded around events; in virtual time unless it is paced."""
 
     session_class = SelectiveSession
 
     def __init__(self, path: Path, settings: dict[str, Any], *, paced: bool = False, **options: Any) -> None:
-        super().__init__(path, text(), {"format": 2, "around": settings}, paced=paced, **options)
+        super().__init__(path, configuration_text(), {"format": 2, "around": settings}, paced=paced, **options)
 
 
 def recorded_rows(folder: Path) -> np.ndarray[Any, Any]:
-    """Rows (TICKS, columns) of a recording of every tick."""
-    return rows_of(record(folder / "whole.mcap", text(), TICKS))
+    """Record every tick of the same run. Returns its rows (TICKS, columns)."""
+    return rows_of(record(folder / "whole.mcap", configuration_text(), TICKS))
 
 
 def retained_seconds(
-    hits: np.ndarray[Any, Any], count: int, first: Callable[[int], bool] = lambda k: k == 0
+    hits: np.ndarray[Any, Any], count: int, is_always_retained: Callable[[int], bool] = lambda k: k == 0
 ) -> list[int]:
-    """Which of `count` seconds a recording retains around ticks (n,), by the distance of the second from a tick."""
+    """Return the numbers (below `count`) of the seconds that a recording retains around the ticks `hits` (n,)."""
     low, high = hits - round(BEFORE_S * SECOND), hits + round(AFTER_S * SECOND)
-    return [k for k in range(count) if first(k) or np.any((k * SECOND <= high) & ((k + 1) * SECOND > low))]
+    return [k for k in range(count) if is_always_retained(k) or np.any((k * SECOND <= high) & ((k + 1) * SECOND > low))]

@@ -1,4 +1,4 @@
-"""Fixtures of recordings: the recorder's process beside a loop made by hand, a disk that fails on demand."""
+"""Fixtures of recordings: a recorder process on a hand-made loop, a disk that fails on demand."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from tests.recording.disk import Disk
-from tests.recording.forging import Base, bases
+from tests.recording.forging import Base, record_bases
 from tests.recording.hand_made_loop import HandMadeLoop, RecorderProcess
 from tests.recording.real_loop import record, scheduled
 
@@ -17,8 +17,8 @@ EVENTFUL_TICKS = 25_000
 
 @pytest.fixture(scope="session")
 def base(tmp_path_factory: pytest.TempPathFactory) -> Base:
-    """A good recording taken apart."""
-    return bases(tmp_path_factory.mktemp("base"))[0]
+    """The parts of a good recording of one axis."""
+    return record_bases(tmp_path_factory.mktemp("base"))[0]
 
 
 @pytest.fixture(scope="session")
@@ -29,18 +29,18 @@ def eventful(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def disk(monkeypatch: pytest.MonkeyPatch) -> Disk:
-    """A good disk, until a test changes it."""
+    """A disk that works until a test makes it fail."""
     return Disk(monkeypatch)
 
 
 @pytest.fixture
 def loop() -> HandMadeLoop:
-    """A loop whose rings are empty."""
+    """A hand-made loop whose rings are empty."""
     return HandMadeLoop()
 
 
 @pytest.fixture
 def recorder(loop: HandMadeLoop) -> Iterator[RecorderProcess]:
-    """A recorder that waits for its order."""
+    """A recorder process on `loop` that waits for its order."""
     with RecorderProcess(loop) as recorder:
         yield recorder

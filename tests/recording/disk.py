@@ -31,34 +31,34 @@ class Disk:
             patch.setattr(os, name, getattr(self, name))
 
     def pwrite(self, fd: int, data: Any, offset: int) -> int:
-        """Fail with `error`, and with ENOSPC beyond `longest_write_bytes`."""
+        """Write, or raise OSError: `error` if set, ENOSPC for data longer than `longest_write_bytes`."""
         number = self.error or (errno.ENOSPC if len(data) > self.longest_write_bytes else None)
         if number:
             raise OSError(number, os.strerror(number))
         return self._pwrite(fd, data, offset)
 
     def open(self, path: Any, flags: int, *arguments: Any, **options: Any) -> int:
-        """Refuse to create a file without a free inode."""
+        """Open a file; raise ENOSPC if it is to be created and no inode is free."""
         if flags & os.O_CREAT and not self.inodes:
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         return self._open(path, flags, *arguments, **options)
 
     def fsync(self, fd: int) -> None:
-        """Call `at_fsync` before it."""
+        """Call `at_fsync` once, if set, and then the real fsync."""
         action, self.at_fsync = self.at_fsync, None
         if action is not None:
             action()
         self._fsync(fd)
 
     def statvfs(self, path: Any) -> Any:
-        """Report `free_bytes`; fail if the folder is missing."""
+        """Return a status with `free_bytes` free, or none after ENOSPC; raise OSError if the folder is missing."""
         self._statvfs(path)
         free = 0 if self.error == errno.ENOSPC else self.free_bytes
         return SimpleNamespace(f_bavail=free, f_frsize=1)
 
 
-def missing(ticks: np.ndarray[Any, Any], executed: int) -> list[dict[str, int]]:
-    """The gaps between, before and behind recorded ticks (n,), of `executed` ones."""
+def find_gaps(ticks: np.ndarray[Any, Any], executed: int) -> list[dict[str, int]]:
+    """Return the gaps before, between and behind the recorded ticks (n,) of a run of `executed` ticks."""
     edges = np.concatenate([[-1], ticks, [executed]]).astype(int)
     return [
         {"first_tick": int(edges[i]) + 1, "count": int(edges[i + 1] - edges[i]) - 1}

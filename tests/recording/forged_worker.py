@@ -1,7 +1,8 @@
 """Use forged recordings in a separate process, so that a crash shows its file: `… FOLDER FIRST COUNT [EVERY]`.
 
-It prints a line of JSON before each file (its number) and after it (the outcome of each command). Every use must end
-with an exit code of the command line, within its time and memory. `identical` is compared with the stock reader.
+The process prints a line of JSON before each file (its number) and after it (the outcome of each command). Each command
+must end with an exit code of CODES, within its time and memory. A replay that is `identical` is checked by the stock
+reader.
 """
 
 from __future__ import annotations
@@ -20,15 +21,15 @@ from mcap.reader import NonSeekingReader
 from rtloop import signals
 from rtloop.cli import main
 from rtloop.signals import COMMON_COUNT, MODE, PER_AXIS_COUNT, TICK, axis_column
-from tests.recording.forging import TICKS, Base, Forgery, bases, forge, pack_file
+from tests.recording.forging import TICKS, Base, Forgery, forge, pack_file, record_bases
 
-SECONDS = 30
+TIME_LIMIT_S = 30
 CODES = (0, 1, 66, 73, 78)
 SHORT_TAGS = 15
 COMPUTED = (signals.POSITION, signals.ERROR, signals.COMMAND, signals.DEMAND, signals.DRIVE)
 COMMANDS = {"set_mode": ("value",), "reset_trip": (), "stop": (), "load_law": ("axis", "value")}
 """Kinds of commands that a replay executes, and the fields that the loop uses of each."""
-USES: dict[str, list[str]] = {
+COMMAND_LINES: dict[str, list[str]] = {
     "info": ["info", "run.mcap", "--json"],
     "info, words": ["info", "run.mcap"],
     "replay": ["replay", "run.mcap", "--json"],
@@ -39,10 +40,10 @@ USES: dict[str, list[str]] = {
     "plot": ["plot", "run.mcap"],
     "resimulate": ["replay", "run.mcap", "--resimulate", "--json"],
 }
-SELDOM = ("info, words", "replay, words", "plot", "resimulate")
+SLOW_COMMANDS = ("info, words", "replay, words", "plot", "resimulate")
 
 
-class Executed(NamedTuple):
+class ExecutedData(NamedTuple):
     """Data that a replay executes or compares: the computed bytes of each tick, snapshots of the law, commands."""
 
     ticks: list[bytes]
@@ -54,9 +55,9 @@ class Hang(BaseException):
     """A command takes more than SECONDS."""
 
 
-def read_executed(path: Path, axes: int) -> Executed:
-    """Read a file with the stock reader, without its index."""
-    data = Executed([], [], [])
+def read_executed(path: Path, axes: int) -> ExecutedData:
+    """Read the executed data of a file with the stock reader, without the file's index."""
+    data = ExecutedData([], [], [])
     with path.open("rb") as file:
         for _, channel, message in NonSeekingReader(file).iter_messages(log_time_order=False):
             if channel.topic == "/ticks":
@@ -73,30 +74,32 @@ def read_executed(path: Path, axes: int) -> Executed:
 
 
 def _computed_bytes(data: bytes, axes: int) -> bytes:
-    """Tick, mode and signals that the law computes, from the fields of a message: a tag, then eight bytes."""
+    """Return the bytes of tick, mode and computed signals of a message, whose fields are a tag and eight bytes each."""
     tags = [1 if field < SHORT_TAGS else 2 for field in range(COMMON_COUNT + axes * PER_AXIS_COUNT)]
     starts = [sum(tags[: field + 1]) + 8 * field for field in range(len(tags))]
     computed = [axis_column(axis, signal) for axis in range(axes) for signal in COMPUTED]
     return b"".join(data[starts[field] : starts[field] + 8] for field in (TICK, MODE, *computed))
 
 
-def use(forgery: Forgery, folder: Path, names: list[str], base: Base, original: Executed) -> dict[str, str]:
+def run_commands(
+    forgery: Forgery, folder: Path, names: list[str], base: Base, original: ExecutedData
+) -> dict[str, str]:
     """Run the commands on a forgery. Returns for each its exit code, or its failure as text."""
     outcomes = {}
     for name in names:
         for path in folder.iterdir():
             path.unlink()
         (folder / "run.mcap").write_bytes(forgery.data)
-        arguments = [str(folder / word) if word == "run.mcap" else word for word in USES[name]]
-        outcomes[name] = outcome = _outcome(arguments)
-        if name == "replay" and outcome == "0" and _wrongly_identical(forgery, folder / "run.mcap", base, original):
+        arguments = [str(folder / word) if word == "run.mcap" else word for word in COMMAND_LINES[name]]
+        outcomes[name] = outcome = _run_command(arguments)
+        if name == "replay" and outcome == "0" and _is_wrongly_identical(forgery, folder / "run.mcap", base, original):
             outcomes[name] = "wrongly identical"
     return outcomes
 
 
-def _outcome(arguments: list[str]) -> str:
+def _run_command(arguments: list[str]) -> str:
     """Run a command. Returns its exit code, or its failure as text."""
-    signal.alarm(SECONDS)
+    signal.alarm(TIME_LIMIT_S)
     try:
         result = CliRunner().invoke(main, arguments)
     except Hang:
@@ -116,8 +119,8 @@ def _outcome(arguments: list[str]) -> str:
     return str(result.exit_code)
 
 
-def _wrongly_identical(forgery: Forgery, path: Path, base: Base, original: Executed) -> bool:
-    """Whether the file of an identical replay differs from the original, by the stock reader."""
+def _is_wrongly_identical(forgery: Forgery, path: Path, base: Base, original: ExecutedData) -> bool:
+    """Return whether the file of an identical replay differs from the original, by the stock reader."""
     try:
         data = read_executed(path, len(base.header["axes"]))
     except Exception:  # The stock reader raises many exceptions.
@@ -126,35 +129,37 @@ def _wrongly_identical(forgery: Forgery, path: Path, base: Base, original: Execu
     return not is_subset or (data.ticks, data.commands) != (original.ticks, original.commands)
 
 
-def _hang(*_: object) -> None:
+def _raise_hang(*_: object) -> None:
+    """Raise Hang: the handler of the alarm signal."""
     raise Hang
 
 
 def peak_kib() -> int:
-    """Peak memory of this process in KiB; getrusage may give the peak of its parent."""
+    """Return the peak memory of this process in KiB; getrusage may give the peak of its parent."""
     status = Path("/proc/self/status").read_text()
     return next(int(line.split()[1]) for line in status.splitlines() if line.startswith("VmHWM"))
 
 
 def run(folder: Path, first: int, count: int, every: int) -> None:
-    """Use `count` forgeries from number `first` on; the slow commands on one in `every`."""
-    signal.signal(signal.SIGALRM, _hang)
-    good: list[Base] = bases(folder)
+    """Run the commands on `count` forgeries from number `first` on; the slow commands on one in `every`."""
+    signal.signal(signal.SIGALRM, _raise_hang)
+    recordings: list[Base] = record_bases(folder)
     originals = []
-    for base in good:
+    for base in recordings:
         (folder / "whole.mcap").write_bytes(pack_file(base))
         originals.append(read_executed(folder / "whole.mcap", len(base.header["axes"])))
         assert len(originals[-1].ticks) == TICKS
-    place = folder / "use"
-    place.mkdir()
+    use_folder = folder / "use"
+    use_folder.mkdir()
     for number in range(first, first + count):
-        forgery = forge(good, number)
+        forgery = forge(recordings, number)
         print(json.dumps({"number": number, "what": forgery.change}), flush=True)
-        names = [name for name in USES if name not in SELDOM or number % every == 0]
-        outcomes = use(forgery, place, names, good[number % len(good)], originals[number % len(good)])
+        names = [name for name in COMMAND_LINES if name not in SLOW_COMMANDS or number % every == 0]
+        which = number % len(recordings)
+        outcomes = run_commands(forgery, use_folder, names, recordings[which], originals[which])
         peak_mib = peak_kib() >> 10
         print(json.dumps({"number": number, "outcomes": outcomes, "peak_mib": peak_mib}), flush=True)
-    shutil.rmtree(place)
+    shutil.rmtree(use_folder)
 
 
 if __name__ == "__main__":

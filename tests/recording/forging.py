@@ -24,23 +24,27 @@ from rtloop.recording.file.mcap.container import CHUNK_HEAD, MAGIC, pack_chunk, 
 from rtloop.recording.file.reader import Reader
 from rtloop.recording.file.topics import format
 from rtloop.recording.file.topics.contents import Message, split_messages
-from tests.recording.law_fields import COUNTS, fields_of
+from tests.recording.law_fields import INTEGERS, snapshot_fields
 from tests.recording.real_loop import TWO_AXES, RecordedRun, changed, schedule
 
 Random = np.random.Generator
-DEEP = 100_000
-LATE = 1 << 62
+DEPTH = 100_000
+LAST_LOG_TIME = 1 << 62
 """The last log time that the index gives for each chunk."""
 DIGEST_BYTES = 32
 TICKS, CHUNK_TICKS, SNAPSHOT_TICKS, SWAP_TICK = 600, 100, 150, 200
-NASTY: tuple[Any, ...] = (
+ODD_JSON_VALUES: tuple[Any, ...] = (
     *(None, True, False, 0, 1, -1, 2, 7, 255, 2**31, 2**53, 2**63, -(2**63), 2**64, 10**400),
     *(-0.0, 0.5, 1e-310, 1e308, float("nan"), float("inf"), float("-inf")),
     *("", "x", "off", "99", "1e400", "[/red]", "$x^$", "\0\x1b[2J", "\ud800", "x" * 5_000, "../x"),
     *([], {}, [1, 2], ["x", "x"], [None], {"x": {}}, [[0, 1, 2]]),
 )
-NUMBERS = (0.0, -0.0, 1.0, -1.0, 3.0, 1e-310, 1e9, 1e19, -1e19, 1e308, np.nan, np.inf, -np.inf, 0.5, 4294967296.0)
-JUNK = (b"", b"{", b"null", b"[]", b"\xff\xfe", b'{"tick":1}', b"[" * DEEP, b'{"a":' * DEEP, b"1" * 5_000, b"\0" * 64)
+"""Values of a wrong type, range or text for a field of a JSON document."""
+ODD_NUMBERS = (0.0, -0.0, 1.0, -1.0, 3.0, 1e-310, 1e9, 1e19, -1e19, 1e308, np.nan, np.inf, -np.inf, 0.5, 4294967296.0)
+BAD_PAYLOADS = (
+    *(b"", b"{", b"null", b"[]", b"\xff\xfe", b'{"tick":1}'),
+    *(b"[" * DEPTH, b'{"a":' * DEPTH, b"1" * 5_000, b"\0" * 64),
+)
 
 
 class Forgery(NamedTuple):
@@ -64,48 +68,50 @@ class Chunk(NamedTuple):
 
     @property
     def messages(self) -> list[Message]:
-        """Messages of the slow topics."""
+        """Messages of the chunk; none for a chunk of ticks."""
         return split_messages(self.content) if self.channels else []
 
-    def with_messages(self, messages: list[Message]) -> Chunk:
-        """Return the chunk with other messages."""
+    def replace_messages(self, messages: list[Message]) -> Chunk:
+        """Return the chunk with these messages as its content."""
         return self._replace(content=b"".join(pack_message(*message) for message in messages))
 
 
 class Base(NamedTuple):
-    """A good recording taken apart: header, later chunks and layout of a tick."""
+    """The parts of a good recording: header, all chunks after the first one, and record type of a tick."""
 
     header: dict[str, Any]
     chunks: list[Chunk]
     dtype: np.dtype[Any]
 
-    def with_chunk(self, place: int, chunk: Chunk) -> Base:
+    def replace_chunk(self, place: int, chunk: Chunk) -> Base:
         """Return the recording with one chunk replaced."""
         return self._replace(chunks=[*self.chunks[:place], chunk, *self.chunks[place + 1 :]])
 
     def messages(self, channel: int) -> list[tuple[int, int]]:
-        """Chunk and place in it of every message of a channel."""
+        """Return (chunk, place in the chunk) of every message of a channel."""
         return [
             (i, j) for i, chunk in enumerate(self.chunks) for j, message in enumerate(chunk.messages)
             if message.channel == channel
         ]  # fmt: skip
 
-    def with_payload(self, i: int, j: int, payload: bytes) -> Base:
+    def replace_payload(self, i: int, j: int, payload: bytes) -> Base:
         """Return the recording with the payload of message `j` of chunk `i` replaced."""
         messages = self.chunks[i].messages
         messages[j] = messages[j]._replace(payload=payload)
-        return self.with_chunk(i, self.chunks[i].with_messages(messages))
+        return self.replace_chunk(i, self.chunks[i].replace_messages(messages))
 
-    def with_snapshot_number(self, i: int, j: int, start: int, number: np.ndarray[Any, Any], length: int = 0) -> Base:
+    def replace_snapshot_number(
+        self, i: int, j: int, start: int, number: np.ndarray[Any, Any], length: int = 0
+    ) -> Base:
         """Return the recording with a number in a snapshot replaced, and `length` bytes cut off its end."""
         data = bytearray(self.chunks[i].messages[j].payload[DIGEST_BYTES:])
         data[start : start + number.itemsize] = number.tobytes()
         data = data[: len(data) - length]
-        return self.with_payload(i, j, hashlib.sha256(data).digest() + data)
+        return self.replace_payload(i, j, hashlib.sha256(data).digest() + data)
 
 
-def bases(folder: Path) -> list[Base]:
-    """Two good recordings: one axis with a pre-filter, commands and a trip; two axes."""
+def record_bases(folder: Path) -> list[Base]:
+    """Record two good runs and return their parts: one axis with a pre-filter, commands and a trip; two axes."""
     one_axis = changed(("# taps = [", "taps = ["), ("# [axis.prefilter]", "[axis.prefilter]"))
     entries = ((100, 'mode = "feedforward"'), (180, 'mode = "closed_loop"'),
                (300, 'reference = { kind = "sine", amplitude = 20.0, frequency_hz = 50.0 }'),
@@ -134,7 +140,7 @@ def _record(path: Path, text: str) -> Path:
 
 
 def take_apart(path: Path) -> Base:
-    """Take a good recording apart."""
+    """Return the parts of a good recording."""
     with Reader(path) as reader:
         entries = [(entry, entry.index) for entry in reader.entries[1:] if entry.index]
         assert len(entries) == len(reader.entries) - 1
@@ -150,10 +156,10 @@ def pack_file(
     compressor, index = zstandard.ZstdCompressor(level=1), []
     data = MAGIC + pack_records([Header(format.PROFILE, format.LIBRARY)])
     for content, channels in (Chunk(start, (format.CONFIGURATION,)), *base.chunks):
-        chunk = pack_chunk(content, 0, LATE, compressor)
+        chunk = pack_chunk(content, 0, LAST_LOG_TIME, compressor)
         places = dict.fromkeys(channels, len(data))
         size = len(chunk) - CHUNK_HEAD.size
-        index.append(ChunkIndex(len(chunk), len(data), "zstd", size, LATE, 0, places, 0, len(content)))
+        index.append(ChunkIndex(len(chunk), len(data), "zstd", size, LAST_LOG_TIME, 0, places, 0, len(content)))
         data += chunk
     forge(index)
     repeated = [*format.schemas(base.header["columns"]), *format.channels()]
@@ -161,11 +167,13 @@ def pack_file(
     return data + pack_end(0, len(data), repeated, statistics, pack_records(index))
 
 
-def with_snapshot(base: Base, field: str, value: float, which: int = 0) -> bytes:
-    """Pack the file with one number of a snapshot replaced."""
-    dtype, start = next((dtype.base, start) for name, dtype, start in fields_of(base.header["axes"]) if name == field)
+def pack_changed_snapshot(base: Base, field: str, value: float, which: int = 0) -> bytes:
+    """Pack the file with one number of snapshot number `which` replaced."""
+    dtype, start = next(
+        (dtype.base, start) for name, dtype, start in snapshot_fields(base.header["axes"]) if name == field
+    )
     place = base.messages(format.LAW)[which]
-    return pack_file(base.with_snapshot_number(*place, start, np.array([value]).astype(dtype)))
+    return pack_file(base.replace_snapshot_number(*place, start, np.array([value]).astype(dtype)))
 
 
 def first_chunk(header: dict[str, Any] | bytes, columns: Any) -> bytes:
@@ -176,6 +184,7 @@ def first_chunk(header: dict[str, Any] | bytes, columns: Any) -> bytes:
 
 
 def _choose(choices: Sequence[Any], random: Random) -> Any:
+    """Return one of the choices, drawn at random."""
     return choices[int(random.integers(len(choices)))]
 
 
@@ -183,7 +192,7 @@ def forge_header(base: Base, random: Random) -> Forgery:
     """Change a field of the header, at any depth."""
     header = copy.deepcopy(base.header)
     if random.random() < 0.05:
-        junk = _choose(JUNK, random)
+        junk = _choose(BAD_PAYLOADS, random)
         return Forgery(f"header: {junk[:20]!r}", pack_file(base, first_chunk(junk, base.header["columns"])))
     change = _forge_json(header, random)
     if isinstance(header.get("configuration"), str) and random.random() < 0.9:
@@ -209,7 +218,7 @@ def _forge_json(document: Any, random: Random) -> str:
     if random.random() < 0.15:
         del node[key]
         return f"{'.'.join(path)}: deleted"
-    node[key] = value = _choose(NASTY, random)
+    node[key] = value = _choose(ODD_JSON_VALUES, random)
     return f"{'.'.join(path)}: {str(value)[:30]!r}"
 
 
@@ -220,27 +229,27 @@ def forge_event(base: Base, random: Random) -> Forgery:
     kind, choice = event["kind"], random.random()
     if choice < 0.4 and "values" in event["what"]:
         place = int(random.integers(3))
-        event["what"]["values"][place] = _choose(NUMBERS, random)
+        event["what"]["values"][place] = _choose(ODD_NUMBERS, random)
         change = f"values.{place}: {event['what']['values'][place]}"
     else:
         change = _forge_json(event, random)
     payload = json.dumps(event).encode()
     if choice > 0.9:
-        payload = _choose(JUNK, random)
+        payload = _choose(BAD_PAYLOADS, random)
         change = f"{payload[:20]!r}"
-    return Forgery(f"event {kind} {change}", pack_file(base.with_payload(i, j, payload)))
+    return Forgery(f"event {kind} {change}", pack_file(base.replace_payload(i, j, payload)))
 
 
 def forge_snapshot(base: Base, random: Random) -> Forgery:
     """Change a number in a snapshot (or the same in all of them), its length, or its tick."""
     places = base.messages(format.LAW)
     chosen = places if random.random() < 0.2 else [_choose(places, random)]
-    name, dtype, offset = _choose(fields_of(base.header["axes"]), random)
+    name, dtype, offset = _choose(snapshot_fields(base.header["axes"]), random)
     start = offset + int(random.integers(max(int(np.prod(dtype.shape)), 1))) * dtype.base.itemsize
-    value = np.array(_choose(NUMBERS if dtype.base.kind == "f" else COUNTS, random))
+    value = np.array(_choose(ODD_NUMBERS if dtype.base.kind == "f" else INTEGERS, random))
     shorter = random.random() < 0.03
     for i, j in chosen:
-        base = base.with_snapshot_number(i, j, start, value.astype(dtype.base), 8 if shorter else 0)
+        base = base.replace_snapshot_number(i, j, start, value.astype(dtype.base), 8 if shorter else 0)
     place = "all" if len(chosen) > 1 else places.index(chosen[0])
     change = f"snapshot {place} {name} at {start}: {'shorter' if shorter else value}"
     return Forgery(change, pack_file(base), places[0] in chosen)
@@ -252,13 +261,13 @@ def forge_ticks(base: Base, random: Random) -> Forgery:
     records = np.frombuffer(base.chunks[i].content, base.dtype).copy()
     name, row = _choose(base.dtype.names or (), random), int(random.integers(len(records)))
     if base.dtype[name].kind == "f":
-        value = _choose(NUMBERS, random)
+        value = _choose(ODD_NUMBERS, random)
         if random.random() < 0.2:  # The next double.
             value = (records[name][row : row + 1].view(np.uint64) + np.uint64(1)).view(np.float64)[0]
     else:
-        value = np.array(_choose(COUNTS, random)).astype(base.dtype[name])
+        value = np.array(_choose(INTEGERS, random)).astype(base.dtype[name])
     records[name][row] = value
-    return Forgery(f"tick {name} of row {row}: {value}", pack_file(base.with_chunk(i, Chunk(records.tobytes()))))
+    return Forgery(f"tick {name} of row {row}: {value}", pack_file(base.replace_chunk(i, Chunk(records.tobytes()))))
 
 
 def forge_bytes(base: Base, random: Random) -> Forgery:
@@ -271,7 +280,7 @@ def forge_bytes(base: Base, random: Random) -> Forgery:
     change = f"chunk {i + 1}: {('bytes', 'more bytes', 'fewer bytes')[kind]} at {place}"
     if i < 0:
         return Forgery(change, pack_file(base, content))
-    return Forgery(change, pack_file(base.with_chunk(i, base.chunks[i]._replace(content=content))))
+    return Forgery(change, pack_file(base.replace_chunk(i, base.chunks[i]._replace(content=content))))
 
 
 def forge_order(base: Base, random: Random) -> Forgery:
@@ -293,7 +302,7 @@ def forge_index(base: Base, random: Random) -> Forgery:
     place, kind = int(random.integers(len(base.chunks) + 1)), int(random.integers(3))
     names = {field.name for field in fields(ChunkIndex)} - {"compression", "message_index_offsets"}
     name = _choose(sorted(names), random)
-    value = int(_choose([count for count in COUNTS if count >= 0], random))
+    value = int(_choose([count for count in INTEGERS if count >= 0], random))
 
     def forge_entry(index: list[ChunkIndex]) -> None:
         if kind == 0:
@@ -305,7 +314,7 @@ def forge_index(base: Base, random: Random) -> Forgery:
     return Forgery(f"index {place} {change}", pack_file(base, forge=forge_entry))
 
 
-def damage(base: Base, random: Random) -> Forgery:
+def forge_damage(base: Base, random: Random) -> Forgery:
     """Flip a byte of the file, or cut the file off."""
     data = bytearray(pack_file(base))
     place = int(random.integers(8, len(data)))
@@ -315,15 +324,15 @@ def damage(base: Base, random: Random) -> Forgery:
     return Forgery(f"byte {place} flipped", bytes(data), renewed=False)
 
 
-KINDS: tuple[tuple[Callable[[Base, Random], Forgery], float], ...] = (
+FORGERS: tuple[tuple[Callable[[Base, Random], Forgery], float], ...] = (
     *((forge_header, 0.2), (forge_event, 0.2), (forge_snapshot, 0.25), (forge_ticks, 0.15)),
-    *((forge_bytes, 0.1), (forge_order, 0.03), (forge_index, 0.03), (damage, 0.04)),
+    *((forge_bytes, 0.1), (forge_order, 0.03), (forge_index, 0.03), (forge_damage, 0.04)),
 )
 
 
 def forge(bases: list[Base], number: int) -> Forgery:
-    """Make forgery number `number`, the same one for each call."""
+    """Return the forgery of a number; equal numbers give equal forgeries."""
     random = np.random.default_rng([7, number])
     base = bases[number % len(bases)]
-    kinds, shares = zip(*KINDS, strict=True)
-    return kinds[int(random.choice(len(kinds), p=shares))](base, random)
+    forgers, shares = zip(*FORGERS, strict=True)
+    return forgers[int(random.choice(len(forgers), p=shares))](base, random)

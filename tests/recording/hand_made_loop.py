@@ -46,7 +46,7 @@ SLACK = 20_000
 
 
 def make_rows(count: int, *, first: int = 0, paced: bool = True, seed: int = 1) -> np.ndarray[Any, Any]:
-    """Rows (count, columns) that look like a closed loop on a noisy stage."""
+    """Return rows (count, columns) that look like a closed loop on a noisy stage."""
     random = np.random.default_rng(seed)
     rows = np.zeros((count, len(COLUMNS)))
     tick = np.arange(first, first + count)
@@ -68,7 +68,7 @@ def make_rows(count: int, *, first: int = 0, paced: bool = True, seed: int = 1) 
 
 
 def make_header(**changes: Any) -> dict[str, Any]:
-    """A recording's header as the supervisor gives it."""
+    """Return a recording's header as the supervisor writes it, with `changes`."""
     return {
         "format": 1,
         "name": "test",
@@ -90,14 +90,14 @@ def make_header(**changes: Any) -> dict[str, Any]:
 
 
 def snapshot(tick: int) -> np.ndarray[Any, Any]:
-    """A snapshot of a law: the tick, then bytes that depend on it."""
+    """Return a snapshot of SNAPSHOT_BYTES: the tick, then random bytes that depend on the tick."""
     data = np.random.default_rng(tick).integers(0, 256, SNAPSHOT_BYTES, dtype=np.uint8)
     data[:8] = np.frombuffer(tick.to_bytes(8, "little"), np.uint8)
     return data
 
 
 def write_recording(path: Path, rows: np.ndarray[Any, Any], **header: Any) -> Path:
-    """A finished recording made with the Writer alone: a snapshot and an event in front of each chunk of ticks."""
+    """Write a recording with the Writer alone: a snapshot and an event before each chunk of ticks. Returns `path`."""
     header = make_header(**header)
     writer = Writer(path, header, header["created_unix_ns"])
     writer.start_unix_ns = START_UNIX_NS
@@ -117,7 +117,7 @@ def write_recording(path: Path, rows: np.ndarray[Any, Any], **header: Any) -> Pa
 
 
 def final_message(executed: int, logged: int) -> Message:
-    """The event that ends a recording of so many ticks."""
+    """Return the event that ends a recording of `logged` of `executed` ticks."""
     totals = {"ticks_executed": executed, "ticks_logged": logged, "ticks_lost": executed - logged, "events_lost": 0}
     details = {**totals, "result": "finished", "complete": executed == logged}
     return event_message(recorder_event("finished", executed, 0, details), START_UNIX_NS)
@@ -133,14 +133,14 @@ class HandMadeLoop:
         self.block.store(Word.LOOP_STATE, ProcessState.RUNNING)
 
     def put(self, ring_name: str, payload: Any) -> None:
-        """Publish one slot."""
+        """Publish `payload` in the next slot of a ring."""
         ring = self.block.ring(ring_name)
         position = np.uint64(ring.head[0])
         ring.slots[claim(ring, position)] = payload
         publish(ring, position)
 
     def run(self, rows: np.ndarray[Any, Any], *, snapshot_every: int = 10_000, slack: int | None = None) -> None:
-        """Publish rows as ticks, with a snapshot in front of each multiple; `slack`: never lap the recorder by more."""
+        """Publish rows as ticks, with snapshots between them; wait while the recorder is over `slack` ticks behind."""
         for row in rows:
             tick = int(row[0])
             if tick % snapshot_every == 0:
@@ -155,21 +155,21 @@ class HandMadeLoop:
         return self.block.load(Word.RECORDER_CURSOR)
 
     def command(self, tick: int, mode: Mode) -> None:
-        """The event of a change of mode."""
+        """Publish the event of a change of mode."""
         self.put("events", message(Kind.SET_MODE, tick=tick, origin=Origin.SCHEDULE, values=[mode])[0])
 
     def trip(self, tick: int) -> None:
-        """The event of a trip."""
+        """Publish the event of a trip."""
         causes = Flag.TRIP_POSITION | Flag.TRIP_STALE
         self.put("events", message(Kind.TRIPPED, tick=tick, axis=0, origin=Origin.LOOP, values=[causes, 1.5])[0])
 
     def end(self, state: ProcessState = ProcessState.FINISHED) -> None:
-        """Mark the loop as ended."""
+        """Store the final state of the loop."""
         self.block.store(Word.LOOP_STATE, state)
 
 
 class RecorderProcess:
-    """The real recorder on a hand-made loop."""
+    """The real recorder in a separate process, on the shared block of a hand-made loop."""
 
     def __init__(self, loop: HandMadeLoop, *, prefix: tuple[str, ...] = ()) -> None:
         self.loop = loop
@@ -187,14 +187,14 @@ class RecorderProcess:
         self.process.communicate()
 
     def start(self, path: Path, header: dict[str, Any] | None = None, **options: Any) -> None:
-        """Give the recorder its file."""
+        """Give the recorder its order: path, header and options of the recording."""
         order = {"path": str(path), "header": header or make_header(), "options": {"min_free_bytes": 0, **options}}
         assert self.process.stdin
         self.process.stdin.write(json.dumps(order).encode() + b"\n")
         self.process.stdin.flush()
 
     def wait_until(self, condition: Callable[[], bool]) -> None:
-        """Wait for `condition`; the end of the recorder is a failure."""
+        """Wait for `condition`; raise AssertionError if the recorder ends or TIMEOUT_S pass."""
         deadline_s = time.monotonic() + TIMEOUT_S
         while not condition():
             assert self.process.poll() is None, self.process.communicate()
@@ -210,7 +210,7 @@ class RecorderProcess:
         self.wait_until(lambda: self.loop.block.load(Word.RECORDER_CURSOR) == count)
 
     def record(self, path: Path, rows: np.ndarray[Any, Any], **options: Any) -> tuple[int, dict[str, Any]]:
-        """Record `rows` of a whole run in virtual time. Returns (exit code, totals); `options` are those of `start`."""
+        """Record `rows` of a whole run in virtual time, with options for `start`. Returns (exit code, totals)."""
         self.start(path, make_header(paced=False), **options)
         self.loop.run(rows, slack=SLACK)
         return self.end()

@@ -15,16 +15,16 @@ from rtloop.recording.replay.replay import replay
 from tests.service.test_run import PAPER, TIMEOUT_S, children, start
 
 
-class Killed(NamedTuple):
-    """Unfinished file of a killed run, and its numbers of ticks: executed, and taken by the recorder."""
+class KilledRun(NamedTuple):
+    """A killed run: unfinished file, number of executed ticks, number of ticks taken by the recorder."""
 
     part: Path
     executed: int
     taken: int
 
 
-def kill_a_run(folder: Path, after_s: float, *options: str) -> Killed:
-    """Run the paper's loop until `after_s` after its file was opened, then kill supervisor, recorder and loop."""
+def kill_a_run(folder: Path, after_s: float, *options: str) -> KilledRun:
+    """Run the paper's loop, and kill supervisor, recorder and loop `after_s` after the file was opened."""
     process = start("run", PAPER, "--out", folder, *options)
     pids = children(process)
     deadline = time.monotonic() + TIMEOUT_S
@@ -32,18 +32,18 @@ def kill_a_run(folder: Path, after_s: float, *options: str) -> Killed:
         assert process.poll() is None, process.communicate()
         assert time.monotonic() < deadline
         time.sleep(0.002)
-    block = block_of(pids["capture.recorder"])
+    block = open_shared_block(pids["capture.recorder"])
     time.sleep(after_s)
     for pid in (process.pid, pids["capture.recorder"], pids["engine.process"]):
         os.kill(pid, signal.SIGKILL)
     process.communicate()
-    while any(_alive(pid) for pid in pids.values()):
+    while any(_is_alive(pid) for pid in pids.values()):
         time.sleep(0.002)
-    return Killed(parts[0], int(block["ticks_head"][0]), block.load(Word.RECORDER_CURSOR))
+    return KilledRun(parts[0], int(block["ticks_head"][0]), block.load(Word.RECORDER_CURSOR))
 
 
-def recovered_ticks(killed: Killed) -> int:
-    """Recover the file and replay it. Returns its number of ticks; 0 if it was killed before the first write."""
+def recovered_ticks(killed: KilledRun) -> int:
+    """Recover the file and replay it. Returns its number of ticks; 0 if the run was killed before the first write."""
     report = recover(killed.part)
     assert report["gaps"] == []
     if report["ticks"]:
@@ -53,16 +53,16 @@ def recovered_ticks(killed: Killed) -> int:
     return report["ticks"]
 
 
-def block_of(pid: int) -> SharedBlock:
-    """Open the shared block of a process, so that it outlives the process."""
+def open_shared_block(pid: int) -> SharedBlock:
+    """Open the shared block of a process, so that the block outlives the process."""
     for link in Path(f"/proc/{pid}/fd").iterdir():
         if "memfd:rtloop" in os.readlink(link):
             return SharedBlock(os.open(link, os.O_RDWR))
     raise AssertionError("the recorder has no shared block")
 
 
-def _alive(pid: int) -> bool:
-    """Whether a process runs and is no zombie."""
+def _is_alive(pid: int) -> bool:
+    """Return whether a process runs and is no zombie."""
     try:
         return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
     except OSError:

@@ -27,12 +27,12 @@ NO_CHANGES: Mapping[str, Any] = MappingProxyType({})
 
 
 def schedule(*entries: tuple[int, str]) -> str:
-    """Configuration text of scheduled changes (tick, change)."""
+    """Return the configuration text of scheduled changes (tick, change)."""
     return "".join(f"\n[[schedule]]\nat_tick = {tick}\n{change}\n" for tick, change in entries)
 
 
 def scheduled() -> str:
-    """The paper's loop with saturation, slew limits, changes of mode, a trip, its reset and another reference."""
+    """Return the paper's configuration with limits that act, changes of mode, a trip, its reset, a new reference."""
     entries = [
         (3_000, 'mode = "feedforward"'),
         (5_000, 'mode = "closed_loop"'),
@@ -52,7 +52,7 @@ def scheduled() -> str:
 
 
 def changed(*changes: tuple[str, str]) -> str:
-    """The paper's configuration with some text replaced."""
+    """Return the paper's configuration with some text replaced; each old text must occur once."""
     text = PAPER
     for old, new in changes:
         assert text.count(old) == 1, old
@@ -83,11 +83,11 @@ class RealLoop:
         return int(self._assembly.loop.tick)
 
     def take_snapshots_every(self, ticks: int) -> None:
-        """Set the number of ticks between snapshots, by default those of a second."""
+        """Set the number of ticks between snapshots (default: one second of ticks)."""
         self._assembly.loop.snapshot_ticks = ticks
 
     def run(self, ticks: int) -> None:
-        """Execute `ticks` more."""
+        """Execute `ticks` more ticks."""
         self._assembly.run(self.tick + ticks)
 
     def end(self) -> None:
@@ -96,7 +96,7 @@ class RealLoop:
 
 
 class RecordedRun:
-    """Run of a real law, recorded in the test's own process, as a paced one by default; `header` changes its header."""
+    """A run of a real law, recorded in the test's process, as a paced run by default; `header` changes the header."""
 
     session_class = Session
 
@@ -109,7 +109,7 @@ class RecordedRun:
         self.begin(**options)
 
     def begin(self, **options: Any) -> None:
-        """Begin a session; a later one replaces a recorder that died."""
+        """Begin a session; a later session replaces a recorder that died."""
         options = {"min_free_bytes": 0, **options}
         self.session = self.session_class(self.loop.block, self.path, self.header, Options(**options))
 
@@ -120,7 +120,7 @@ class RecordedRun:
             self.drain()
 
     def drain(self) -> None:
-        """Drain all executed ticks and write what is due."""
+        """Drain all executed ticks into the session, and write the data that is due."""
         while self.session.cursor < self.loop.tick:
             self.session.drain()
             self.session.write_due()
@@ -145,7 +145,7 @@ def record(path: Path, text: str, ticks: int, **options: float) -> list[Path]:
 
 
 def rows_of(paths: list[Path]) -> np.ndarray:
-    """All rows (ticks, columns) of a recording."""
+    """Return all rows (ticks, columns) of a recording's files."""
     from rtloop.recording.load import load
 
     return np.concatenate(list(load(paths).blocks()))

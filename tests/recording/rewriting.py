@@ -33,7 +33,7 @@ class FileMessage(NamedTuple):
 
 
 def messages(path: Path, file: int = 0, *, in_order_of_time: bool = False) -> list[FileMessage]:
-    """All messages of a file, in the order of the file or of the log times."""
+    """Return all messages of a file, in the order of the file or of the log times."""
     with path.open("rb") as stream:
         return [
             FileMessage(message.log_time, channel.topic, message.data, channel.message_encoding,
@@ -43,7 +43,7 @@ def messages(path: Path, file: int = 0, *, in_order_of_time: bool = False) -> li
 
 
 def merge(paths: Sequence[Path]) -> list[FileMessage]:
-    """Merge files as `mcap merge` does: all messages by their log times, with separate channels for each file."""
+    """Return the messages of all files by log time, with separate channels for each file, as `mcap merge` does."""
     parts = (messages(path, file, in_order_of_time=True) for file, path in enumerate(paths))
     return list(heapq.merge(*parts, key=lambda message: message.log_time))
 
@@ -65,7 +65,7 @@ def write(
     `ticks`, one of ENCODINGS, is the encoding of the ticks; the first `spare` numbers of channels and schemas are
     skipped; `foreign` adds metadata, an attachment and a topic of another program.
     """
-    encode = Encoding(ticks)
+    encode = TickEncoder(ticks)
     with path.open("wb") as stream:
         writer = Writer(stream, chunk_size=chunk_size, compression=compression, **options)
         writer.start(*(header or ()))
@@ -90,14 +90,14 @@ def write(
     return path
 
 
-class Encoding:
-    """Encoder of the ticks, by their schema; other messages are unchanged."""
+class TickEncoder:
+    """Encoder of ticks, which are decoded by their schema; other messages stay unchanged."""
 
     def __init__(self, ticks: str) -> None:
         assert ticks in ENCODINGS
         self._ticks = ticks
         self._decode: Callable[[bytes], Any] | None = None
-        self._kind: Any = None
+        self._type: Any = None
 
     def __call__(self, original: FileMessage) -> tuple[str, tuple[str, str, bytes] | None, bytes]:
         """Return encoding, schema and bytes of a message."""
@@ -111,15 +111,15 @@ class Encoding:
         message = self._decode(original.data)
         if self._ticks == "json":
             return "json", None, json.dumps({field.name: value for field, value in message.ListFields()}).encode()
-        if self._kind is None:
-            self._kind = reversed_fields([field.name for field in message.DESCRIPTOR.fields])
-        encoded = self._kind(**{field.name: value for field, value in message.ListFields()})
-        descriptors = build_file_descriptor_set(self._kind).SerializeToString()
-        return "protobuf", (self._kind.DESCRIPTOR.full_name, "protobuf", descriptors), encoded.SerializeToString()
+        if self._type is None:
+            self._type = reversed_fields([field.name for field in message.DESCRIPTOR.fields])
+        encoded = self._type(**{field.name: value for field, value in message.ListFields()})
+        descriptors = build_file_descriptor_set(self._type).SerializeToString()
+        return "protobuf", (self._type.DESCRIPTOR.full_name, "protobuf", descriptors), encoded.SerializeToString()
 
 
 def reversed_fields(names: Sequence[str]) -> Any:
-    """Make a message type (proto3, which omits zeros) of the same fields with their numbers reversed."""
+    """Return a message class (proto3, which omits zeros) of the same fields with their numbers reversed."""
     file = FileDescriptorProto(name="another/tick.proto", package="another", syntax="proto3")
     message = file.message_type.add(name="Sample")
     for place, name in enumerate(names):
@@ -131,7 +131,7 @@ def reversed_fields(names: Sequence[str]) -> Any:
 
 
 def cut_off_end(path: Path) -> Path:
-    """Cut a file off before its data end, as a killed tool leaves it. Returns its path."""
+    """Cut a file off before its data end, as a killed tool leaves the file. Returns its path."""
     data = path.read_bytes()
     (summary,) = struct.unpack_from("<Q", data, len(data) - 8 - 20)
     path.write_bytes(data[: summary - 13])

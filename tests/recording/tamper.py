@@ -41,30 +41,31 @@ def rewrite(
         header = {key: value for key, value in reader.header.items() if key != "configuration_sha256"}
         writer = Writer(target, header, header["created_unix_ns"])
         writer.start_unix_ns = reader.start_unix_ns
-        last: list[Message] = []
+        final_messages: list[Message] = []
         for block, messages in reader.chunks():
             if block is not None:
                 block = np.ascontiguousarray(block)
                 rows(block)
                 writer.write_ticks(block)
-            kept = []
+            changed_messages = []
             for message in messages:
                 if message.channel == EVENTS and json.loads(message.payload)["kind"] in FINAL:
-                    last.append(message)
+                    final_messages.append(message)
                 elif message.channel != CONFIGURATION:
-                    kept.append(_changed(message, law, event))
-            writer.write_messages(kept)
-        writer.finish(lambda _: last[-1])
+                    changed_messages.append(_change(message, law, event))
+            writer.write_messages(changed_messages)
+        writer.finish(lambda _: final_messages[-1])
     return target
 
 
-def _changed(message: Message, law: Callable[[bytearray], Any], event: Callable[[dict[str, Any]], Any]) -> Message:
+def _change(message: Message, law: Callable[[bytearray], Any], event: Callable[[dict[str, Any]], Any]) -> Message:
+    """Return a message with the change for its topic applied, and with the right digest of a snapshot."""
     if message.channel == LAW:
         data = bytearray(message.payload[DIGEST_BYTES:])
         law(data)
         return message._replace(payload=hashlib.sha256(data).digest() + data)
     if message.channel == EVENTS:
-        changed = json.loads(message.payload)
-        event(changed)
-        return message._replace(payload=json.dumps(changed).encode())
+        content = json.loads(message.payload)
+        event(content)
+        return message._replace(payload=json.dumps(content).encode())
     return message

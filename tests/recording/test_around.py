@@ -24,60 +24,78 @@ from rtloop.recording.replay.replay import replay
 from rtloop.recording.views.bands import read_bands
 from rtloop.recording.views.summary import summarise
 from tests.recording import rewriting
-from tests.recording.around import SECOND, STEP, TICKS, TRIP, SelectiveRun, around, recorded_rows, retained_seconds
+from tests.recording.around import (
+    SECOND,
+    STEP,
+    TICKS,
+    TRIP,
+    SelectiveRun,
+    around_settings,
+    recorded_rows,
+    retained_seconds,
+)
 from tests.recording.tamper import flip_byte
 
-ON = ("trip", "abs(x_drive_v) >= 6.5")
+CONDITIONS = ("trip", "abs(x_drive_v) >= 6.5")
 Rows = np.ndarray[Any, Any]
 
 
 @pytest.fixture(scope="module")
-def whole(tmp_path_factory: pytest.TempPathFactory) -> Rows:
+def full_rows(tmp_path_factory: pytest.TempPathFactory) -> Rows:
+    """Rows (TICKS, columns) of the run, with every tick."""
     return recorded_rows(tmp_path_factory.mktemp("whole"))
 
 
 @pytest.fixture(scope="module")
-def selected(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    run = SelectiveRun(tmp_path_factory.mktemp("selected") / "run.mcap", around(*ON))
+def selective_path(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A recording of the same run around the events of CONDITIONS."""
+    run = SelectiveRun(tmp_path_factory.mktemp("selected") / "run.mcap", around_settings(*CONDITIONS))
     totals = run.end(TICKS)
     assert (totals["ticks_lost"], totals["complete"], totals["error"]) == (0, True, None)
     return run.path
 
 
 @pytest.fixture(scope="module")
-def expected(whole: Rows, selected: Path) -> list[int]:
-    """The seconds to retain, by the recording of every tick alone."""
-    hits = whole[np.abs(whole[:, load(selected).columns.index("x_drive_v")]) >= 6.5, 0]
+def expected_seconds(full_rows: Rows, selective_path: Path) -> list[int]:
+    """Numbers of the seconds to retain, computed from the rows of every tick."""
+    hits = full_rows[np.abs(full_rows[:, load(selective_path).columns.index("x_drive_v")]) >= 6.5, 0]
     assert np.any((hits > STEP) & (hits < STEP + SECOND))  # There are at least two spans.
     seconds = retained_seconds(np.append(hits, TRIP), TICKS // SECOND)
     assert 5 < len(seconds) < 15
     return seconds
 
 
-def seconds_of(recording: Recording) -> list[int]:
+def recorded_seconds(recording: Recording) -> list[int]:
+    """Return the numbers of the seconds of which a recording holds ticks."""
     return np.unique(recording["tick"] // SECOND).astype(int).tolist()
 
 
-def test_ticks_around_events_are_recorded_bit_for_bit(whole: Rows, selected: Path, expected: list[int]):
-    recording = load(selected)
+def test_ticks_around_events_are_recorded_bit_for_bit(
+    full_rows: Rows, selective_path: Path, expected_seconds: list[int]
+):
+    recording = load(selective_path)
     rows = np.concatenate(list(recording.blocks()))
-    assert (seconds_of(recording), len(rows), recording.problems) == (expected, len(expected) * SECOND, [])
-    assert rows.tobytes() == np.ascontiguousarray(whole[rows[:, 0].astype(int)]).tobytes()
-    begun = [(event["tick"], event["what"]["on"]) for event in recording.events if event["kind"] == "kept"]
-    drive = np.abs(whole[:, recording.columns.index("x_drive_v")]) >= 6.5
-    firsts = [int(np.flatnonzero(drive)[0]), int(np.flatnonzero(drive[STEP:])[0]) + STEP]
-    assert begun == [(tick, ON[1]) for tick in firsts]
-    assert firsts[0] < TRIP  # The trip therefore begins no span.
+    assert (recorded_seconds(recording), len(rows), recording.problems) == (
+        expected_seconds,
+        len(expected_seconds) * SECOND,
+        [],
+    )
+    assert rows.tobytes() == np.ascontiguousarray(full_rows[rows[:, 0].astype(int)]).tobytes()
+    span_begins = [(event["tick"], event["what"]["on"]) for event in recording.events if event["kind"] == "kept"]
+    drive = np.abs(full_rows[:, recording.columns.index("x_drive_v")]) >= 6.5
+    first_hits = [int(np.flatnonzero(drive)[0]), int(np.flatnonzero(drive[STEP:])[0]) + STEP]
+    assert span_begins == [(tick, CONDITIONS[1]) for tick in first_hits]
+    assert first_hits[0] < TRIP  # The trip therefore begins no span.
 
 
-def test_the_overview_covers_every_omitted_second(whole: Rows, selected: Path, expected: list[int]):
-    omitted = [k for k in range(TICKS // SECOND) if k not in expected]
-    overview = load(selected).overview
+def test_the_overview_covers_every_omitted_second(full_rows: Rows, selective_path: Path, expected_seconds: list[int]):
+    omitted = [k for k in range(TICKS // SECOND) if k not in expected_seconds]
+    overview = load(selective_path).overview
     assert ((overview.tick // SECOND).tolist(), set(overview.ticks)) == (omitted, {SECOND})
     for name in ("x_position_um", "x_drive_v", "tick", "lateness_us", "flags"):
-        column = load(selected).columns.index(name)
+        column = load(selective_path).columns.index(name)
         for index, k in enumerate(omitted):
-            values = whole[k * SECOND : (k + 1) * SECOND, column]
+            values = full_rows[k * SECOND : (k + 1) * SECOND, column]
             figures = [part[index] for part in overview[name]]
             is_measured = not np.isnan(values).all()
             mean = pytest.approx(values.mean(), rel=1e-12, abs=1e-12, nan_ok=True)
@@ -87,50 +105,50 @@ def test_the_overview_covers_every_omitted_second(whole: Rows, selected: Path, e
         overview["y"]
 
 
-def test_stock_tools_read_the_overview(selected: Path, expected: list[int]):
-    with selected.open("rb") as file:
+def test_stock_tools_read_the_overview(selective_path: Path, expected_seconds: list[int]):
+    with selective_path.open("rb") as file:
         reader = make_reader(file, decoder_factories=[DecoderFactory()])
         messages = [row.decoded_message for row in reader.iter_decoded_messages(topics=["/overview"])]
         file.seek(0)
         times = [message.log_time for _, _, message in make_reader(file).iter_messages(topics=["/events"])]
-    overview = load(selected).overview
-    assert (times, len(messages)) == (sorted(times), TICKS // SECOND - len(expected))
+    overview = load(selective_path).overview
+    assert (times, len(messages)) == (sorted(times), TICKS // SECOND - len(expected_seconds))
     assert [message.tick_min for message in messages] == overview.tick.tolist()
     assert [message.x_error_um_max for message in messages] == overview["x_error_um"].most.tolist()
 
 
-def test_every_span_replays_identical(selected: Path, expected: list[int]):
-    report, summary = replay(load(selected)), summarise(selected)
-    spans = 1 + np.count_nonzero(np.diff(expected) > 1)
+def test_every_span_replays_identical(selective_path: Path, expected_seconds: list[int]):
+    report, summary = replay(load(selective_path)), summarise(selective_path)
+    spans = 1 + np.count_nonzero(np.diff(expected_seconds) > 1)
     assert (report.identical, report.gaps, report.not_verified) == (True, [], [])
-    assert (report.ticks, report.stretches) == (len(expected) * SECOND, spans)
+    assert (report.ticks, report.stretches) == (len(expected_seconds) * SECOND, spans)
     assert report.skipped == TICKS - report.ticks
     assert (summary.stretches, summary.ticks_skipped, summary.ticks_lost) == (spans, report.skipped, 0)
     assert (summary.complete, summary.duration_s) == (True, pytest.approx(TICKS / SECOND))
 
 
-def test_every_span_can_be_cut_out_and_replays_alone(selected: Path, tmp_path: Path):
-    recording = load(selected)
+def test_every_span_can_be_cut_out_and_replays_alone(selective_path: Path, tmp_path: Path):
+    recording = load(selective_path)
     for number, (first, count) in enumerate(uncovered_ranges(0, TICKS, recording.skipped)):
-        piece = cut(selected, first + 5, first + count, tmp_path / f"{number}.mcap")
-        report = replay(load(piece["output"]))
-        assert (piece["complete"], report.identical, report.ticks, report.stretches) == (True, True, count, 1)
+        span_cut = cut(selective_path, first + 5, first + count, tmp_path / f"{number}.mcap")
+        report = replay(load(span_cut["output"]))
+        assert (span_cut["complete"], report.identical, report.ticks, report.stretches) == (True, True, count, 1)
     first, count = recording.skipped[0]
-    across = cut(selected, first - SECOND, first + count + SECOND, tmp_path / "across.mcap")
-    report = replay(load(across["output"]))
-    assert (across["complete"], report.identical, report.ticks, report.skipped) == (True, True, 2 * SECOND, count)
-    assert summarise(across["output"]).complete
-    begun = cut(selected, first + 5, first + count + 5, tmp_path / "begun.mcap")
-    assert (begun["begin"], begun["ticks"], begun["gaps"]) == (first + count, 5, [])
+    cut_across = cut(selective_path, first - SECOND, first + count + SECOND, tmp_path / "across.mcap")
+    report = replay(load(cut_across["output"]))
+    assert (cut_across["complete"], report.identical, report.ticks, report.skipped) == (True, True, 2 * SECOND, count)
+    assert summarise(cut_across["output"]).complete
+    late_cut = cut(selective_path, first + 5, first + count + 5, tmp_path / "begun.mcap")
+    assert (late_cut["begin"], late_cut["ticks"], late_cut["gaps"]) == (first + count, 5, [])
     with pytest.raises(RecordingError, match="the requested ticks were omitted"):
-        cut(selected, first + 5, first + 500, tmp_path / "none.mcap")
+        cut(selective_path, first + 5, first + 500, tmp_path / "none.mcap")
 
 
-def test_a_picture_shows_the_extremes_of_omitted_ticks(whole: Rows, selected: Path):
-    recording = load(selected)
+def test_a_picture_shows_the_extremes_of_omitted_ticks(full_rows: Rows, selective_path: Path):
+    recording = load(selective_path)
     band = read_bands(recording, ["x_position_um"], 0.0, np.inf, 20_000)["x_position_um"]
     assert np.all(np.diff(band.time_s) >= 0)
-    column = whole[:, recording.columns.index("x_position_um")]
+    column = full_rows[:, recording.columns.index("x_position_um")]
     for first, count in recording.skipped:
         inside = (band.time_s >= first / SECOND) & (band.time_s < (first + count) / SECOND)
         values = column[first : first + count]
@@ -138,27 +156,29 @@ def test_a_picture_shows_the_extremes_of_omitted_ticks(whole: Rows, selected: Pa
 
 
 @pytest.mark.parametrize("rule", [{"rotate_s": 6.0}, {"rotate_bytes": 1_500_000}])
-def test_rotated_files_begin_at_snapshots_and_hold_all_ticks(tmp_path: Path, expected: list[int], rule: dict[str, Any]):
-    totals = SelectiveRun(tmp_path / "run.mcap", around(*ON), **rule).end(TICKS)
+def test_rotated_files_begin_at_snapshots_and_hold_all_ticks(
+    tmp_path: Path, expected_seconds: list[int], rule: dict[str, Any]
+):
+    totals = SelectiveRun(tmp_path / "run.mcap", around_settings(*CONDITIONS), **rule).end(TICKS)
     assert (totals["complete"], len(totals["paths"]) > 2) == (True, True)
     recording, summary = load(totals["paths"]), summarise(totals["paths"])
-    assert set(seconds_of(recording)) >= set(expected)
+    assert set(recorded_seconds(recording)) >= set(expected_seconds)
     report = replay(recording)
     assert (report.identical, report.gaps, report.ticks + report.skipped) == (True, [], TICKS)
     assert (summary.complete, summary.ticks_lost, summary.problems) == (True, 0, [])
     for path in totals["paths"]:
         part = load(path)
-        assert part["tick"][0] == part.extents[0].first_tick  # It begins with a retained second.
+        assert part["tick"][0] == part.extents[0].first_tick  # The file begins with a retained second.
         assert (replay(part).identical, summarise(path).complete) == (True, True)
 
 
-def test_the_file_of_a_killed_recorder_is_recovered(tmp_path: Path, expected: list[int]):
-    run = SelectiveRun(tmp_path / "run.mcap", around(*ON))
+def test_the_file_of_a_killed_recorder_is_recovered(tmp_path: Path, expected_seconds: list[int]):
+    run = SelectiveRun(tmp_path / "run.mcap", around_settings(*CONDITIONS))
     run.run_to(STEP + 2 * SECOND)
     output = tmp_path / "recovered.mcap"
     assert recover(run.copy_part("left.mcap.part"), output)["gaps"] == []
     recording, summary = load(output), summarise(output)
-    assert seconds_of(recording)[:6] == [k for k in expected if k <= STEP // SECOND + 1]
+    assert recorded_seconds(recording)[:6] == [k for k in expected_seconds if k <= STEP // SECOND + 1]
     report = replay(recording)
     assert (report.identical, report.stretches) == (True, 2)
     assert (summary.result, summary.ticks_lost) == ("recovered", 0)
@@ -167,11 +187,16 @@ def test_the_file_of_a_killed_recorder_is_recovered(tmp_path: Path, expected: li
 
 @pytest.mark.parametrize(
     ("killed_at", "on"),
-    [(5_500, ON), (STEP - 2_000, ON), (STEP + 8_000, ON), (15 * SECOND + 500, ("trip",))],  # Last: after an overview.
+    [
+        *((tick, CONDITIONS) for tick in (5_500, STEP - 2_000, STEP + 8_000)),
+        (15 * SECOND + 500, ("trip",)),  # after an overview
+    ],
 )
-def test_a_replacement_recorder_loses_no_data(tmp_path: Path, expected: list[int], killed_at: int, on: tuple[str, ...]):
-    """It finds in the ring what the buffer of the dead recorder held."""
-    run = SelectiveRun(tmp_path / "run.mcap", around(*on), paced=True)
+def test_a_replacement_recorder_loses_no_data(
+    tmp_path: Path, expected_seconds: list[int], killed_at: int, on: tuple[str, ...]
+):
+    """The ring still holds the ticks that were in the buffer of the dead recorder."""
+    run = SelectiveRun(tmp_path / "run.mcap", around_settings(*on), paced=True)
     run.run_to(killed_at)
     run.begin(sequence=2)
     totals = run.end(TICKS)
@@ -179,38 +204,38 @@ def test_a_replacement_recorder_loses_no_data(tmp_path: Path, expected: list[int
     recover(run.copy_part("left.mcap.part"))
     files = [tmp_path / "left.mcap", tmp_path / "run-0002.mcap"]
     recording, report = load(files), replay(load(files))
-    assert on != ON or set(seconds_of(recording)) >= set(expected)
+    assert on != CONDITIONS or set(recorded_seconds(recording)) >= set(expected_seconds)
     assert (report.identical, report.gaps, report.ticks + report.skipped) == (True, [], TICKS)
     assert (replay(load(files[1])).identical, summarise(files).ticks_lost) == (True, 0)
     assert sum(event["kind"] == "tripped" for event in recording.events) == 1
 
 
 def test_the_last_seconds_of_a_failed_loop_are_recorded(tmp_path: Path):
-    run = SelectiveRun(tmp_path / "run.mcap", around("trip"))
+    run = SelectiveRun(tmp_path / "run.mcap", around_settings("trip"))
     run.run_to(12 * SECOND + 77)
     run.session.finish("failed")
     recording = load(tmp_path / "run.mcap")
-    assert (recording["tick"][-1], seconds_of(recording)[-3:]) == (12 * SECOND + 76, [10, 11, 12])
+    assert (recording["tick"][-1], recorded_seconds(recording)[-3:]) == (12 * SECOND + 76, [10, 11, 12])
 
 
-def test_a_recording_around_events_is_read_without_conversion(selected: Path, monkeypatch: pytest.MonkeyPatch):
+def test_a_recording_around_events_is_read_without_conversion(selective_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(layout, "open_converted_copy", None)
-    assert replay(load(selected)).identical
+    assert replay(load(selective_path)).identical
 
 
-def test_a_recording_around_events_can_be_rewritten_by_another_tool(selected: Path, tmp_path: Path):
-    path = rewriting.write(tmp_path / "rewritten.mcap", rewriting.messages(selected), chunk_size=20_000)
-    rewritten, original = load(path), load(selected)
+def test_a_recording_around_events_can_be_rewritten_by_another_tool(selective_path: Path, tmp_path: Path):
+    path = rewriting.write(tmp_path / "rewritten.mcap", rewriting.messages(selective_path), chunk_size=20_000)
+    rewritten, original = load(path), load(selective_path)
     assert (rewritten.skipped, len(rewritten)) == (original.skipped, len(original))
     np.testing.assert_array_equal(rewritten.overview["x_drive_v"].most, original.overview["x_drive_v"].most)
     report = replay(rewritten)
     assert (report.identical, report.gaps) == (True, [])
 
 
-def test_a_damaged_overview_counts_as_a_loss(selected: Path, tmp_path: Path):
-    with Reader(selected) as reader:
+def test_a_damaged_overview_counts_as_a_loss(selective_path: Path, tmp_path: Path):
+    with Reader(selective_path) as reader:
         entry = next(entry for entry in reader.entries if entry.index and 5 in entry.index.channels)
-    damaged = flip_byte(selected, entry.offset + entry.length - 20, tmp_path / "damaged.mcap")
+    damaged = flip_byte(selective_path, entry.offset + entry.length - 20, tmp_path / "damaged.mcap")
     summary, report = summarise(damaged), replay(load(damaged))
     assert (summary.complete, len(summary.problems), summary.ticks_lost > 0) == (False, 1, True)
     assert (report.identical, report.first_difference) == (False, None)
@@ -266,13 +291,13 @@ def test_an_unknown_signal_of_a_condition_is_named():
 
 def test_a_replacement_recorder_retains_as_many_ticks_as_after_an_event(tmp_path: Path):
     """The dead recorder may have been retaining ticks."""
-    run = SelectiveRun(tmp_path / "run.mcap", around("x_drive_v > 100", before_s=0.5, after_s=3.0), paced=True)
+    run = SelectiveRun(tmp_path / "run.mcap", around_settings("x_drive_v > 100", before_s=0.5, after_s=3.0), paced=True)
     run.run_to(25_000)
     flushed = run.loop.block.load(Word.FLUSHED_TICKS)
     run.begin(sequence=2)
     run.end(9 * SECOND)
     recording = load(tmp_path / "run-0002.mcap")
-    assert seconds_of(recording) == list(range(flushed // SECOND, (flushed + 3 * SECOND) // SECOND + 1))
+    assert recorded_seconds(recording) == list(range(flushed // SECOND, (flushed + 3 * SECOND) // SECOND + 1))
     assert replay(recording).identical
 
 

@@ -1,4 +1,4 @@
-"""Memory of the recorder between loop and file: ticks, their statistics, waiting messages and segments, by hand."""
+"""The recorder's buffers of ticks, their statistics, waiting messages and segments, filled with hand-made rows."""
 
 from __future__ import annotations
 
@@ -22,28 +22,30 @@ from tests.recording.hand_made_loop import COLUMNS, RATE_HZ, make_rows
 PERIOD_NS = 100_000
 
 
-class Rows:
-    """A ring from which everything is taken at once."""
+class FullRing:
+    """Stand-in for a RingReader that gives all its rows at once."""
 
     def __init__(self, rows: np.ndarray) -> None:
         self._rows = rows
 
     def take_into(self, out: np.ndarray) -> tuple[int, int]:
+        """Copy all rows to the front of `out`. Returns (count, 0 lost)."""
         out[: len(self._rows)] = self._rows
         return len(self._rows), 0
 
 
-def buffer_of(rows: np.ndarray) -> TickBuffer:
+def make_buffer(rows: np.ndarray) -> TickBuffer:
+    """Return a buffer that holds the rows."""
     buffer = TickBuffer(list(COLUMNS), RATE_HZ)
-    assert buffer.take_from(cast(RingReader, Rows(rows))) == len(rows)
+    assert buffer.take_from(cast(RingReader, FullRing(rows))) == len(rows)
     return buffer
 
 
 def test_ticks_behind_dropped_rows_are_due_by_the_last_of_these() -> None:
-    """The clock was set on between the two: a deadline that follows from the first would be 7 ms early."""
+    """The clock was set forward between the two rows: a deadline computed from the first row would be 7 ms early."""
     rows = make_rows(2, first=40)
     rows[:, DEADLINE] = 4_000_000, 11_100_000
-    buffer = buffer_of(rows)
+    buffer = make_buffer(rows)
     assert (len(buffer), buffer.end, buffer.count_before(41)) == (2, 42, 1)
     assert buffer.tick_time(40).time_ns == 4_000_000
     assert buffer.tick_time(44) == (44, 11_100_000 + 3 * PERIOD_NS)
@@ -67,12 +69,12 @@ def test_a_missing_tick_ends_an_interval_and_no_other_does() -> None:
         np.testing.assert_allclose(interval[:, 2], part.mean(axis=0), rtol=1e-12, atol=1e-12)
 
 
-def intervals_of(*ranges: tuple[float, float], column: int = TICK) -> np.ndarray:
-    """Three columns of plausible statistics, `column` of them as told."""
+def make_intervals(*ranges: tuple[float, float], column: int = TICK) -> np.ndarray:
+    """Return plausible statistics (ranges, columns, 3), with `ranges` as the extremes of `column`."""
     intervals = np.zeros((len(ranges), len(COLUMNS), 3))
-    for other in (TICK, DEADLINE):
-        intervals[:, other, 0] = 100 * np.arange(len(ranges))
-        intervals[:, other, 1] = intervals[:, other, 0] + 99
+    for growing_column in (TICK, DEADLINE):
+        intervals[:, growing_column, 0] = 100 * np.arange(len(ranges))
+        intervals[:, growing_column, 1] = intervals[:, growing_column, 0] + 99
     intervals[:, column, :2] = ranges
     return intervals
 
@@ -90,10 +92,11 @@ def intervals_of(*ranges: tuple[float, float], column: int = TICK) -> np.ndarray
     ],
 )
 def test_intervals_must_have_whole_ticks_and_times_in_order(ranges, plausible, column: int) -> None:
-    assert tuple(are_plausible(intervals_of(*ranges, column=column))) == plausible
+    assert tuple(are_plausible(make_intervals(*ranges, column=column))) == plausible
 
 
 def entry(channel: int, *, tick: int = 0, from_loop: bool = False) -> PendingEntry:
+    """Return a pending message of a channel, at a tick."""
     return PendingEntry(tick, Message(channel, tick * PERIOD_NS, b"{}"), from_loop)
 
 
@@ -104,7 +107,7 @@ def test_events_of_the_recorder_are_not_counted_as_waiting_and_snapshots_are() -
 
 
 def test_rows_put_back_into_an_empty_buffer_are_followed_by_the_next_ones_of_their_segment() -> None:
-    """Everything was taken and could not be written. A snapshot for the next tick begins no segment of its own."""
+    """A batch of all rows could not be written. A snapshot for the next tick then begins no separate segment."""
     rows = make_rows(300)
     buffer = SegmentBuffer(EventWindow(0.0, 0.0, ("trip",), 0.01), list(COLUMNS), RATE_HZ, 0, -1)
     buffer.add([], rows[:100])
@@ -115,8 +118,8 @@ def test_rows_put_back_into_an_empty_buffer_are_followed_by_the_next_ones_of_the
     assert buffer.first_waiting_tick == 0
     buffer.begin_segment(100)
     buffer.add([], rows[100:200])
-    kept = []
+    taken_rows = []
     while (batch := buffer.next_batch(lambda tick: False, decide_all=True)) is not None:
         assert not len(batch.intervals)
-        kept.append(batch.rows)
-    assert np.concatenate(kept).tobytes() == rows[:200].tobytes()
+        taken_rows.append(batch.rows)
+    assert np.concatenate(taken_rows).tobytes() == rows[:200].tobytes()

@@ -1,4 +1,4 @@
-"""The commands on recordings as a user meets them: their output, their files and their exit codes."""
+"""The commands on recordings: their output, their files and their exit codes."""
 
 from __future__ import annotations
 
@@ -30,11 +30,13 @@ TICKS = 21_000
 
 @pytest.fixture(scope="module")
 def parts(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+    """Files of a rotated run of TICKS ticks, one second each."""
     return record(tmp_path_factory.mktemp("parts") / "run.mcap", PAPER, TICKS, rotate_s=1.0)
 
 
 @pytest.fixture
 def copy(eventful: Path, tmp_path: Path) -> Path:
+    """A copy of the eventful recording in the test's folder."""
     return Path(shutil.copy(eventful, tmp_path))
 
 
@@ -185,12 +187,13 @@ def test_a_page_shows_any_name_unchanged(eventful: Path, tmp_path: Path):
 
 
 def page_data(page: Path) -> dict[str, Any]:
+    """Return the JSON data that a page embeds."""
     text = page.read_text()
     return json.loads(text[text.index('"application/json">') + 19 : text.index("</script>")])
 
 
 def check_page(page: Path, ticks: int) -> None:
-    """Require a self-contained page with the recorded numbers."""
+    """Require a self-contained page with the numbers of `run.mcap` beside it."""
     assert not any(word in page.read_text() for word in ("http", "src="))
     data, recording = page_data(page), load(page.parent / "run.mcap")
     assert len(np.frombuffer(base64.b64decode(data["time_s"]))) == ticks

@@ -42,25 +42,25 @@ TEXT = PAPER + schedule(
 )
 
 
-class Run(NamedTuple):
-    """A recording by rtloop, and its messages in the order of the file."""
+class Original(NamedTuple):
+    """A recording written by rtloop, and its messages in the order of the file."""
 
     path: Path
     messages: list[FileMessage]
 
     @property
     def rows(self) -> np.ndarray:
-        """All ticks, by the stock library: doubles, each after its tag."""
+        """Rows (ticks, columns), decoded from the messages without rtloop: doubles, each after its tag."""
         count = len(load(self.path).columns)
         fields = [field for number in range(count) for field in (
             (f"tag{number}", "u1" if number < 15 else "u2"), (str(number), "<f8"))]  # fmt: skip
-        records = np.frombuffer(b"".join(message.data for message in self.of_topic("/ticks")), fields)
+        records = np.frombuffer(b"".join(message.data for message in self.topic_messages("/ticks")), fields)
         return np.column_stack([records[str(number)] for number in range(count)])
 
-    def of_topic(self, topic: str) -> list[FileMessage]:
+    def topic_messages(self, topic: str) -> list[FileMessage]:
         return [message for message in self.messages if message.topic == topic]
 
-    def without(self, topic: str) -> list[FileMessage]:
+    def drop_topic(self, topic: str) -> list[FileMessage]:
         return [message for message in self.messages if message.topic != topic]
 
 
@@ -76,14 +76,15 @@ def record_chunks(path: Path, **options: float) -> list[Path]:
 
 
 @pytest.fixture(scope="module")
-def run(tmp_path_factory: pytest.TempPathFactory) -> Run:
+def run(tmp_path_factory: pytest.TempPathFactory) -> Original:
+    """A recording of TICKS ticks in one file, written by rtloop."""
     [path] = record_chunks(tmp_path_factory.mktemp("own") / "run.mcap")
-    return Run(path, messages(path))
+    return Original(path, messages(path))
 
 
 @pytest.fixture(scope="module")
 def parts(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
-    """The same in three files."""
+    """Three files of the same run, rotated."""
     paths = record_chunks(tmp_path_factory.mktemp("parts") / "run.mcap", rotate_s=2 * SNAPSHOT_TICKS / 10_000)
     assert len(paths) == 3
     return paths
@@ -91,17 +92,19 @@ def parts(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
 
 @pytest.fixture
 def path(tmp_path: Path) -> Path:
+    """Path for the file that another tool writes."""
     return tmp_path / "rewritten.mcap"
 
 
-def bits(rows: Any) -> bytes:
+def row_bytes(rows: Any) -> bytes:
+    """Return the bytes of rows, to compare doubles bit for bit."""
     return np.ascontiguousarray(rows).tobytes()
 
 
-def require_same(path: Path, run: Run) -> None:
+def require_equal(path: Path, run: Original) -> None:
     """Require that `path` holds the whole recording in the same bits, and that a replay verifies it."""
     recording, original, summary = load(path), load(run.path), summarise(path)
-    assert bits(np.concatenate(list(recording.blocks()))) == bits(run.rows)
+    assert row_bytes(np.concatenate(list(recording.blocks()))) == row_bytes(run.rows)
     assert (recording.events, recording.header) == (original.events, original.header)
     assert [*recording.snapshots()] == [*original.snapshots()]
     report = replay(recording)
@@ -111,8 +114,8 @@ def require_same(path: Path, run: Run) -> None:
 
 @pytest.mark.parametrize("ticks", ["unchanged", "json"])
 @pytest.mark.parametrize("compression", CompressionType)
-def test_a_file_of_the_stock_writer_is_read(run: Run, path: Path, ticks: str, compression: CompressionType):
-    require_same(write(path, run.messages, ticks=ticks, compression=compression, chunk_size=90_000), run)
+def test_a_file_of_the_stock_writer_is_read(run: Original, path: Path, ticks: str, compression: CompressionType):
+    require_equal(write(path, run.messages, ticks=ticks, compression=compression, chunk_size=90_000), run)
 
 
 NO_SUMMARY = {"index_types": NO_INDEX, "repeat_channels": False, "repeat_schemas": False, "use_statistics": False}
@@ -128,45 +131,47 @@ LAYOUTS: dict[str, dict[str, Any]] = {
 
 
 @pytest.mark.parametrize("name", LAYOUTS)
-def test_any_layout_is_read(run: Run, path: Path, name: str):
-    require_same(write(path, run.messages, **LAYOUTS[name]), run)
+def test_any_layout_is_read(run: Original, path: Path, name: str):
+    require_equal(write(path, run.messages, **LAYOUTS[name]), run)
 
 
-def test_messages_in_the_order_of_time_are_read_and_cut(run: Run, path: Path, tmp_path: Path):
+def test_messages_in_the_order_of_time_are_read_and_cut(run: Original, path: Path, tmp_path: Path):
     write(path, sorted(run.messages, key=lambda message: message.log_time), chunk_size=20_000)
-    require_same(path, run)
+    require_equal(path, run)
     original, copy = (
         Path(cut(source, 500, 800, tmp_path / f"{i}.mcap")["output"]) for i, source in enumerate((run.path, path))
     )
     for topic in ("/ticks", "/law"):
-        assert [message.data for message in Run(original, messages(original)).of_topic(topic)] == [
-            message.data for message in Run(copy, messages(copy)).of_topic(topic)
+        assert [message.data for message in Original(original, messages(original)).topic_messages(topic)] == [
+            message.data for message in Original(copy, messages(copy)).topic_messages(topic)
         ]
     assert replay(load(copy)).identical
 
 
 def test_a_file_is_converted_once_with_a_warning(
-    run: Run, path: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+    run: Original, path: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ):
     temporary = tmp_path / "temporary"
     temporary.mkdir()
     monkeypatch.setattr(tempfile, "tempdir", str(temporary))
-    require_same(write(path, run.messages), run)
+    require_equal(write(path, run.messages), run)
     [warning] = [record.getMessage() for record in caplog.records]
     assert warning.startswith(f"{path}: another tool wrote this recording; rtloop converts it")
     assert [*temporary.iterdir()] == []
-    require_same(write(path, run.messages, chunk_size=9_000), run)
+    require_equal(write(path, run.messages, chunk_size=9_000), run)
     assert len(caplog.records) == 2
 
 
-def test_the_warning_is_on_standard_error(run: Run, path: Path):
+def test_the_warning_is_on_standard_error(run: Original, path: Path):
     command = [sys.executable, "-m", "rtloop", "info", write(path, run.messages), "--json"]
     result = subprocess.run(command, capture_output=True, text=True)
     assert (result.returncode, json.loads(result.stdout)["ticks_logged"]) == (0, TICKS)
     assert result.stderr.startswith(f"{path}: another tool wrote this recording")
 
 
-def test_a_full_temporary_folder_is_an_error_with_the_remedy(run: Run, path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_a_full_temporary_folder_is_an_error_with_the_remedy(
+    run: Original, path: Path, monkeypatch: pytest.MonkeyPatch
+):
     def refuse(*_: object, **__: object) -> None:
         raise OutputError("copy.mcap.part: No space left on device", 28)
 
@@ -178,7 +183,7 @@ def test_a_full_temporary_folder_is_an_error_with_the_remedy(run: Run, path: Pat
 
 
 def test_a_temporary_folder_that_does_not_exist_is_an_error_with_the_remedy(
-    run: Run, path: Path, monkeypatch: pytest.MonkeyPatch
+    run: Original, path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     monkeypatch.setattr(tempfile, "tempdir", str(path.with_name("absent")))
     with pytest.raises(RecordingError, match=r"rewritten\.mcap: no room to convert the file .*set TMPDIR to another"):
@@ -186,7 +191,7 @@ def test_a_temporary_folder_that_does_not_exist_is_an_error_with_the_remedy(
 
 
 def test_a_copy_that_is_damaged_on_the_way_is_an_error_with_a_sentence(
-    run: Run, path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    run: Original, path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     convert, damaged = layout.open_converted_copy, tmp_path / "copy.mcap"
 
@@ -202,12 +207,14 @@ def test_a_copy_that_is_damaged_on_the_way_is_an_error_with_a_sentence(
         load(write(path, run.messages))
 
 
-def test_a_recovered_copy_needs_no_conversion(run: Run, path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_a_recovered_copy_needs_no_conversion(
+    run: Original, path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
     output = tmp_path / "recovered.mcap"
     assert recover(write(path, run.messages, ticks="json", chunk_size=1 << 30), output)["complete"]
     monkeypatch.setattr(layout, "open_converted_copy", None)
     for own_file in (output, run.path):
-        require_same(own_file, run)
+        require_equal(own_file, run)
 
 
 TOPICS = {
@@ -218,8 +225,8 @@ TOPICS = {
 
 
 @pytest.mark.parametrize("topic", TOPICS)
-def test_a_missing_topic_is_named(run: Run, path: Path, topic: str):
-    write(path, run.without(topic))
+def test_a_missing_topic_is_named(run: Original, path: Path, topic: str):
+    write(path, run.drop_topic(topic))
     ticks, reason = TOPICS[topic]
     assert (summarise(path).ticks_logged, export(path, "npz")["ticks"]) == (ticks, ticks)
     try:
@@ -229,11 +236,11 @@ def test_a_missing_topic_is_named(run: Run, path: Path, topic: str):
     assert reason in verdict
 
 
-def test_a_missing_time_span_is_not_verified(run: Run, path: Path):
-    """`mcap filter --start --end` with the header."""
+def test_a_missing_time_span_is_not_verified(run: Original, path: Path):
+    """The file is as `mcap filter --start --end` writes it, with the header."""
     span = [m for m in run.messages if m.topic == "/configuration" or 25_000_000 <= m.log_time < 75_000_000]
     recording = load(write(path, span, compression=CompressionType.LZ4))
-    assert bits(np.concatenate(list(recording.blocks()))) == bits(run.rows[250:750])
+    assert row_bytes(np.concatenate(list(recording.blocks()))) == row_bytes(run.rows[250:750])
     report = replay(recording)
     assert (report.first_difference, report.ticks) == (None, 450)  # The first snapshot of the span is at tick 300.
     assert [entry["first_tick"] for entry in report.not_verified] == [0, 250, 750]
@@ -249,7 +256,7 @@ def test_a_file_of_another_program_is_named_as_such(path: Path):
     assert ("damaged" in message, len(message) < 700, "\x1b" in message) == (False, True, False)
 
 
-def test_merged_recordings_are_refused(run: Run, parts: list[Path], path: Path):
+def test_merged_recordings_are_refused(run: Original, parts: list[Path], path: Path):
     for paths in (parts, [run.path, parts[0]], [run.path, run.path]):
         with pytest.raises(
             RecordingError, match=r"holds several recordings, or several files of one run; .*files that were merged"
@@ -257,19 +264,20 @@ def test_merged_recordings_are_refused(run: Run, parts: list[Path], path: Path):
             load(write(path, merge(paths)))
 
 
-def swap_blocks(run: Run) -> list[FileMessage]:
-    """Swap the halves of the ticks around an event that is later than all ticks, which ends a block of ticks."""
-    ticks, event = run.of_topic("/ticks"), run.of_topic("/events")[0]
+def swap_blocks(run: Original) -> list[FileMessage]:
+    """Return the ticks with their halves swapped, around an event that is later than all ticks and ends a block."""
+    ticks, event = run.topic_messages("/ticks"), run.topic_messages("/events")[0]
     event, half = event._replace(log_time=ticks[-1].log_time + 1), len(ticks) // 2
     return [run.messages[0], *ticks[half:], event, *ticks[:half]]
 
 
-def encode_as_cbor(run: Run) -> list[FileMessage]:
+def encode_as_cbor(run: Original) -> list[FileMessage]:
+    """Return the messages with ticks that claim to be CBOR without a schema."""
     return [m._replace(encoding="cbor", schema=None) if m.topic == "/ticks" else m for m in run.messages]
 
 
-UNREADABLE: list[tuple[Callable[[Run], list[FileMessage]], dict[str, Any], str]] = [
-    (lambda run: run.without("/configuration"), {}, "the topic /configuration, .* has no message before /ticks"),
+UNREADABLE: list[tuple[Callable[[Original], list[FileMessage]], dict[str, Any], str]] = [
+    (lambda run: run.drop_topic("/configuration"), {}, "the topic /configuration, .* has no message before /ticks"),
     (lambda run: [run.messages[0], *run.messages[:0:-1]], {}, "out of order: tick .*`mcap sort` sorts the messages"),
     (swap_blocks, {}, rf"out of order: tick 0 after tick {TICKS - 1}; .*`mcap sort` sorts"),
     (encode_as_cbor, {}, "/ticks are encoded as cbor, and their schema is not rtloop's; allowed: json, or protobuf"),
@@ -279,21 +287,21 @@ UNREADABLE: list[tuple[Callable[[Run], list[FileMessage]], dict[str, Any], str]]
 
 @pytest.mark.parametrize(("change", "options", "message"), UNREADABLE)
 def test_an_unreadable_file_is_refused_with_the_remedy(
-    run: Run, path: Path, change: Callable[[Run], list[FileMessage]], options: dict[str, Any], message: str
+    run: Original, path: Path, change: Callable[[Original], list[FileMessage]], options: dict[str, Any], message: str
 ):
     with pytest.raises(RecordingError, match=message):
         load(write(path, change(run), **options))
 
 
-def test_a_cut_off_file_is_refused_with_the_remedy(run: Run, path: Path):
+def test_a_cut_off_file_is_refused_with_the_remedy(run: Original, path: Path):
     with pytest.raises(
         RecordingError, match=r"rewritten\.mcap: the file ends in the middle of a record; `mcap recover` keeps"
     ):
         load(cut_off_end(write(path, run.messages, chunk_size=20_000)))
 
 
-def change_tick(run: Run, change: Callable[[dict[str, Any]], Any]) -> list[FileMessage]:
-    """Encode the ticks as JSON and change the fortieth."""
+def change_tick(run: Original, change: Callable[[dict[str, Any]], Any]) -> list[FileMessage]:
+    """Return the messages with ticks as JSON, of which `change` changes number 40."""
     columns, rows, numbers = load(run.path).columns, run.rows, iter(range(TICKS))
 
     def encode(message: FileMessage) -> FileMessage:
@@ -322,13 +330,13 @@ INVALID_TICKS: list[tuple[Callable[[dict[str, Any]], Any], str]] = [
 
 
 @pytest.mark.parametrize(("change", "message"), INVALID_TICKS)
-def test_an_invalid_tick_in_json_is_refused_by_name(run: Run, path: Path, change: Any, message: str):
+def test_an_invalid_tick_in_json_is_refused_by_name(run: Original, path: Path, change: Any, message: str):
     with pytest.raises(RecordingError, match=message):
         load(write(path, change_tick(run, change)))
 
 
-def records_of(data: bytes) -> list[tuple[int, int]]:
-    """Place and opcode of all records of a file up to its data end."""
+def find_records(data: bytes) -> list[tuple[int, int]]:
+    """Return (place, opcode) of all records of a file up to its data end."""
     records, position = [], 8
     while not records or records[-1][1] != 0x0F:
         opcode, length = struct.unpack_from("<BQ", data, position)
@@ -337,19 +345,19 @@ def records_of(data: bytes) -> list[tuple[int, int]]:
     return records
 
 
-def test_a_damaged_file_gives_an_error_or_recorded_ticks(run: Run, tmp_path: Path):
-    """Records of every kind are cut off, lengthened and flipped."""
-    random, rows = np.random.default_rng(7), {bits(row) for row in run.rows}
+def test_a_damaged_file_gives_an_error_or_recorded_ticks(run: Original, tmp_path: Path):
+    """Bits near the beginnings of records, and anywhere, are flipped; some files are cut off."""
+    random, rows = np.random.default_rng(7), {row_bytes(row) for row in run.rows}
     path, outcomes = tmp_path / "rewritten.mcap", {"refused": 0, "read": 0}
     sample = [message for place, message in enumerate(run.messages) if message.topic != "/ticks" or place % 3 == 0]
     for options in ({}, {"ticks": "json", "compression": CompressionType.LZ4}, {"spare": 1}):
-        good = write(path, sample, chunk_size=20_000, **options).read_bytes()
-        starts = [position for position, _ in records_of(good)]
+        valid = write(path, sample, chunk_size=20_000, **options).read_bytes()
+        starts = [position for position, _ in find_records(valid)]
         for _ in range(18):
-            data = bytearray(good)
+            data = bytearray(valid)
             for _ in range(int(random.integers(1, 4))):
                 near = int(random.choice(starts)) + int(random.integers(60))
-                place = near if random.random() < 0.7 else int(random.integers(8, len(good)))
+                place = near if random.random() < 0.7 else int(random.integers(8, len(valid)))
                 data[min(place, len(data) - 1)] ^= 1 << int(random.integers(8))
             path.write_bytes(data[: len(data) if random.random() < 0.7 else int(random.integers(8, len(data)))])
             try:
@@ -359,12 +367,12 @@ def test_a_damaged_file_gives_an_error_or_recorded_ticks(run: Run, tmp_path: Pat
             except RtloopError as error:
                 outcomes["refused"] += str(path) in str(error)
                 continue
-            assert all(bits(row) in rows for block in blocks for row in block)
+            assert all(row_bytes(row) in rows for block in blocks for row in block)
             outcomes["read"] += 1
     assert min(outcomes.values()) > 3, outcomes
 
 
-def chunk(content: bytes, name: str, *, size: int | None = None, data: bytes | None = None) -> bytes:
+def chunk_record(content: bytes, name: str, *, size: int | None = None, data: bytes | None = None) -> bytes:
     """Pack a chunk record without a checksum; `size` and `data` may contradict its content."""
     data = content if data is None else data
     size = len(content) if size is None else size
@@ -372,28 +380,28 @@ def chunk(content: bytes, name: str, *, size: int | None = None, data: bytes | N
     return b"\x06" + struct.pack("<Q", len(body)) + body
 
 
-def bombs(good: bytes) -> dict[str, bytes]:
-    """Files with one more record before the data end, which asks for much memory."""
-    end, zeros = records_of(good)[-1][0], bytes(1 << 28)
+def oversized_files(valid: bytes) -> dict[str, bytes]:
+    """Return files by name, each with an additional record whose lengths claim much memory."""
+    end, zeros = find_records(valid)[-1][0], bytes(1 << 28)
     records = {
-        "zstd that grows": chunk(b"", "zstd", size=1 << 20, data=zstandard.ZstdCompressor().compress(zeros)),
-        "lz4 that grows": chunk(b"", "lz4", size=1 << 20, data=lz4.frame.compress(zeros)),
-        "a size of 2^62": chunk(b"", "zstd", size=1 << 62, data=zstandard.ZstdCompressor().compress(b"x")),
-        "a size of 1 GiB": chunk(b"", "", size=1 << 30),
-        "another compression": chunk(b"x", "brotli"),
+        "zstd that grows": chunk_record(b"", "zstd", size=1 << 20, data=zstandard.ZstdCompressor().compress(zeros)),
+        "lz4 that grows": chunk_record(b"", "lz4", size=1 << 20, data=lz4.frame.compress(zeros)),
+        "a size of 2^62": chunk_record(b"", "zstd", size=1 << 62, data=zstandard.ZstdCompressor().compress(b"x")),
+        "a size of 1 GiB": chunk_record(b"", "", size=1 << 30),
+        "another compression": chunk_record(b"x", "brotli"),
         "a message of 2^60 bytes": b"\x05" + struct.pack("<Q", 1 << 60),
         "a name of 4 GiB": b"\x06" + struct.pack("<QQQQII", 60, 0, 0, 9, 0, (1 << 32) - 1) + bytes(60 - 32),
         "a channel of 4 GiB": b"\x04" + struct.pack("<QHHI", 30, 7, 0, (1 << 32) - 1) + bytes(22),
         "an attachment of 2 GiB": b"\x09" + struct.pack("<Q", 2 << 30),
         "a message of no channel": b"\x05" + struct.pack("<QHIQQ", 22 + 200_000, 99, 0, 0, 0) + b"[" * 200_000,
     }
-    return {name: good[:end] + record + good[end:] for name, record in records.items()}
+    return {name: valid[:end] + record + valid[end:] for name, record in records.items()}
 
 
-def test_a_length_in_a_file_does_not_allocate_memory(run: Run, tmp_path: Path):
+def test_a_length_in_a_file_does_not_allocate_memory(run: Original, tmp_path: Path):
     path = tmp_path / "rewritten.mcap"
-    good = write(path, run.messages, chunk_size=50_000).read_bytes()
-    for name, data in bombs(good).items():
+    valid = write(path, run.messages, chunk_size=50_000).read_bytes()
+    for name, data in oversized_files(valid).items():
         path.write_bytes(data)
         tracemalloc.start()
         try:

@@ -1,6 +1,6 @@
 """A range cut out of a recording: bit for bit the recorded data, and it replays alone.
 
-It is compared by the public MCAP reader, which has no notion of ticks, snapshots and gaps.
+The public MCAP reader, which knows no ticks, snapshots and gaps, reads both files for the comparison.
 """
 
 from __future__ import annotations
@@ -38,8 +38,8 @@ LAWS_AT = {4_000: ("gain = 0.016", "gain = 0.011"), 8_000: (CONTROLLER, PID), 14
 SNAPSHOT_TICKS = 1_700
 
 
-def run(path: Path, **options: Any) -> list[Path]:
-    """Record modes, trips, references and changes of laws; copy the unfinished file on the way."""
+def record_run(path: Path, **options: Any) -> list[Path]:
+    """Record modes, trips, references and new laws; copy the unfinished file at tick 12,000. Returns the files."""
     recorded = RecordedRun(path, TEXT, paced=False, **options)
     loop, session = recorded.loop, recorded.session
     loop.take_snapshots_every(SNAPSHOT_TICKS)
@@ -61,8 +61,9 @@ def run(path: Path, **options: Any) -> list[Path]:
 
 
 @pytest.fixture(scope="module")
-def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    path = run(tmp_path_factory.mktemp("whole") / "run.mcap")[0]
+def run_path(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A recording of the run in one file."""
+    path = record_run(tmp_path_factory.mktemp("whole") / "run.mcap")[0]
     kinds = [event["kind"] for event in load(path).events]
     assert kinds.count("load_law") == 3
     assert {"set_mode", "tripped", "reset_trip", "set_reference"} <= set(kinds)
@@ -71,71 +72,72 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def parts(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
-    return run(tmp_path_factory.mktemp("parts") / "run.mcap", rotate_s=0.3)
+    """Files of the same run, rotated every 0.3 s."""
+    return record_run(tmp_path_factory.mktemp("parts") / "run.mcap", rotate_s=0.3)
 
 
-def messages(path: Path, topic: str) -> list[tuple[int, bytes]]:
-    """(log time, payload) of each message of a topic, by the public reader."""
+def topic_messages(path: Path, topic: str) -> list[tuple[int, bytes]]:
+    """Return (log time, payload) of each message of a topic, by the public reader."""
     with path.open("rb") as file:
         rows = make_reader(file, validate_crcs=True).iter_messages([topic], log_time_order=False)
         return [(row.log_time, row.data) for _, _, row in rows]
 
 
 def tick_payloads(path: Path) -> list[bytes]:
-    return [data for _, data in messages(path, "/ticks")]
+    return [data for _, data in topic_messages(path, "/ticks")]
 
 
 @pytest.fixture(scope="module")
-def payloads(whole: Path) -> list[bytes]:
-    """The message of each tick."""
-    return tick_payloads(whole)
+def payloads(run_path: Path) -> list[bytes]:
+    """The payload of each tick's message."""
+    return tick_payloads(run_path)
 
 
-def snapshots(path: Path) -> list[int]:
-    """Ticks of the recorded snapshots."""
-    return [int.from_bytes(data[32:40], "little") for _, data in messages(path, "/law")]
+def snapshot_ticks(path: Path) -> list[int]:
+    """Return the ticks of the recorded snapshots."""
+    return [int.from_bytes(data[32:40], "little") for _, data in topic_messages(path, "/law")]
 
 
 def is_identical(path: Path, ticks: int) -> bool:
-    """Whether a cut replays completely and accounts for each of its ticks."""
+    """Return whether a cut replays identically, with `ticks` ticks and no gap or problem."""
     report = replay(load(path))
     return report.identical and (report.ticks, report.gaps, report.problems) == (ticks, [], [])
 
 
-def test_a_cut_begins_at_the_newest_snapshot_and_replays(whole: Path, payloads: list[bytes], tmp_path: Path):
-    """The ranges lie about each snapshot, and at random."""
-    known, chance = snapshots(whole), random.Random(7)
-    assert set(LAWS_AT) < set(known)
-    begins = [tick + offset for tick in known for offset in (-1, 0, 1)]
+def test_a_cut_begins_at_the_newest_snapshot_and_replays(run_path: Path, payloads: list[bytes], tmp_path: Path):
+    """The ranges begin at and around each snapshot, and at random ticks."""
+    snapshots, random_numbers = snapshot_ticks(run_path), random.Random(7)
+    assert set(LAWS_AT) < set(snapshots)
+    begins = [tick + offset for tick in snapshots for offset in (-1, 0, 1)]
     ranges = [(first, first + ticks) for first in begins for ticks in (1, 2) if 0 <= first <= TICKS - ticks]
-    ranges += [tuple(sorted(chance.sample(range(TICKS + 1), 2))) for _ in range(12)] + [(0, TICKS)]
+    ranges += [tuple(sorted(random_numbers.sample(range(TICKS + 1), 2))) for _ in range(12)] + [(0, TICKS)]
     for number, (first, end) in enumerate(ranges):
         out = tmp_path / f"{number}.mcap"
-        report = cut(whole, first, end, out)
-        begin = max(tick for tick in known if tick <= first)
+        report = cut(run_path, first, end, out)
+        begin = max(tick for tick in snapshots if tick <= first)
         assert (report["begin"], report["ticks"], report["gaps"]) == (begin, end - begin, []), (first, end)
         assert (report["complete"], report["problems"]) == (True, [])
         assert tick_payloads(out) == payloads[begin:end]
-        assert snapshots(out) == [tick for tick in known if begin <= tick < end]
+        assert snapshot_ticks(out) == [tick for tick in snapshots if begin <= tick < end]
         assert is_identical(out, end - begin), (first, end)
         out.unlink()
 
 
-def test_a_cut_has_the_recorded_times_events_and_header(whole: Path, tmp_path: Path):
+def test_a_cut_has_the_recorded_times_events_and_header(run_path: Path, tmp_path: Path):
     first_cut, second_cut, direct_cut = (tmp_path / f"{name}.mcap" for name in ("cut", "again", "once"))
-    cut(whole, 3_500, 12_345, first_cut)
-    begin, copy, original = 3_400, load(first_cut), load(whole)
+    cut(run_path, 3_500, 12_345, first_cut)
+    begin, copy, original = 3_400, load(first_cut), load(run_path)
     for topic in ("/ticks", "/law", "/events"):
-        assert set(messages(first_cut, topic)[:-1]) <= set(messages(whole, topic))
+        assert set(topic_messages(first_cut, topic)[:-1]) <= set(topic_messages(run_path, topic))
     *events, last = copy.events
     assert events == [event for event in original.events if begin <= event["tick"] < 12_345]
     assert (last["kind"], last["what"]["ticks_executed"]) == ("cut", 12_345)
     origin = {"first": 3_500, "end": 12_345, "files": ["run.mcap"]}
     assert copy.header == original.header | {"first_tick": begin, "ticks_expected": 12_345 - begin, "cut": origin}
     cut(first_cut, 5_000, 6_000, second_cut)
-    cut(whole, 5_000, 6_000, direct_cut)
+    cut(run_path, 5_000, 6_000, direct_cut)
     assert load(second_cut).header["cut"]["files"] == ["cut.mcap"]
-    assert messages(second_cut, "/ticks") == messages(direct_cut, "/ticks")
+    assert topic_messages(second_cut, "/ticks") == topic_messages(direct_cut, "/ticks")
 
 
 @pytest.mark.parametrize(
@@ -156,10 +158,10 @@ def test_a_rotated_run_is_cut_across_its_files(
 
 @pytest.mark.parametrize("missing", [0, 1, 5_000])
 def test_an_unfinished_file_is_cut_up_to_its_last_tick(
-    whole: Path, payloads: list[bytes], tmp_path: Path, missing: int
+    run_path: Path, payloads: list[bytes], tmp_path: Path, missing: int
 ):
     part = tmp_path / "run.mcap.part"
-    data = (whole.parent / "growing-run.mcap.part").read_bytes()
+    data = (run_path.parent / "growing-run.mcap.part").read_bytes()
     part.write_bytes(data[: len(data) - missing])
     end = len(load(part))
     report = cut(part, end - 100, end)
@@ -183,29 +185,29 @@ def test_an_unfinished_file_is_cut_up_to_its_last_tick(
     ],
 )
 def test_a_range_that_is_not_in_the_recording_is_refused(
-    whole: Path, tmp_path: Path, limits: dict[str, Any], words: str
+    run_path: Path, tmp_path: Path, limits: dict[str, Any], words: str
 ):
     with pytest.raises(RecordingError, match=words):
-        cut(whole, **limits, output=tmp_path / "out.mcap")
+        cut(run_path, **limits, output=tmp_path / "out.mcap")
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_cut_overwrites_no_file(whole: Path, tmp_path: Path):
+def test_a_cut_overwrites_no_file(run_path: Path, tmp_path: Path):
     out = tmp_path / "out.mcap"
     out.write_bytes(b"mine")
     with pytest.raises(OutputError, match="exists already; a recording is never overwritten"):
-        cut(whole, 0, 10, out)
+        cut(run_path, 0, 10, out)
     assert [path.read_bytes() for path in tmp_path.iterdir()] == [b"mine"]
     with pytest.raises(OutputError, match="No such file"):
-        cut(whole, 0, 10, tmp_path / "absent" / "out.mcap")
+        cut(run_path, 0, 10, tmp_path / "absent" / "out.mcap")
 
 
 def test_a_run_without_its_oldest_files_is_cut(parts: list[Path], tmp_path: Path):
     report = cut(parts[1:], 3_400, 5_000, tmp_path / "out.mcap")
     assert (report["complete"], report["problems"]) == (True, [])
     assert is_identical(tmp_path / "out.mcap", 1_600)
-    lost, later = (load(part)["tick"].astype(int).tolist() for part in parts[1:3])
-    report = cut([parts[0], parts[2]], lost[0] - 5, later[0] + 5, tmp_path / "hole.mcap")
+    lost, following = (load(part)["tick"].astype(int).tolist() for part in parts[1:3])
+    report = cut([parts[0], parts[2]], lost[0] - 5, following[0] + 5, tmp_path / "hole.mcap")
     problem = f"{len(lost)} recorded ticks are missing: they are damaged, or in a file of the run that was not given"
     assert (report["gaps"], report["problems"]) == ([(lost[0], len(lost))], [problem])
     path = write_recording(tmp_path / "late.mcap", make_rows(3_000, first=500), first_tick=500)
@@ -249,19 +251,19 @@ def test_damaged_ticks_are_a_gap_and_named(tmp_path: Path):
     assert cut(path, 3_500, 3_600)["complete"]
 
 
-def test_the_command_cuts_by_time_and_by_tick(whole: Path, tmp_path: Path):
+def test_the_command_cuts_by_time_and_by_tick(run_path: Path, tmp_path: Path):
     first, second = tmp_path / "a.mcap", tmp_path / "b.mcap"
-    result = command("cut", whole, "--from", 0.35, "--until", 0.5, "--out", first)
+    result = command("cut", run_path, "--from", 0.35, "--until", 0.5, "--out", first)
     assert result.exit_code == 0
     assert "3500 to 4999, preceded by ticks 3400 to 3499" in " ".join(result.output.split())
-    assert answer("cut", whole, "--from-tick", 3_500, "--until-tick", 5_000, "--out", second)["ticks"] == 1_600
+    assert answer("cut", run_path, "--from-tick", 3_500, "--until-tick", 5_000, "--out", second)["ticks"] == 1_600
     assert first.read_bytes() == second.read_bytes()
     for code, arguments in (
         (73, ("--from-tick", 5, "--out", first)),
         (66, ("--from", 77, "--out", tmp_path / "c.mcap")),
         (2, ("--from", 1, "--from-tick", 5)),
     ):
-        assert command("cut", whole, *arguments).exit_code == code
+        assert command("cut", run_path, *arguments).exit_code == code
     report = answer("info", first)
     figures = (report["complete"], report["ticks_logged"], report["ticks_lost"], report["cut"]["first"])
     assert figures == (True, 1_600, 0, 3_500)

@@ -39,12 +39,13 @@ ROWS = make_rows(COUNT)
 
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory: pytest.TempPathFactory) -> bytes:
+    """Bytes of a finished file with ROWS."""
     return write_recording(tmp_path_factory.mktemp("damage") / "run.mcap", ROWS).read_bytes()
 
 
 @pytest.fixture(scope="module")
 def unfinished(finished: bytes) -> bytes:
-    """The file before its end was written."""
+    """Bytes of the same file before its end was written."""
     (start,) = struct.unpack_from("<Q", finished, len(finished) - 8 - 20)
     return finished[: start - DATA_END_BYTES]
 
@@ -54,8 +55,8 @@ def path(tmp_path: Path) -> Path:
     return tmp_path / "run.mcap"
 
 
-def check(path: Path) -> int:
-    """Require that all readable data is right, and that a message names the fault. Returns the number of ticks."""
+def require_right_data(path: Path) -> int:
+    """Require that all readable data is right, and that a message names the fault. Returns the number of read ticks."""
     try:
         with Reader(path, tolerant=True) as reader:
             blocks, snapshots = list(reader.blocks()), list(reader.snapshots())
@@ -79,30 +80,30 @@ def test_a_file_that_is_cut_off_anywhere(finished: bytes, path: Path):
     counts = []
     for place in sorted([*places, *range(len(finished) - 60, len(finished))]):
         path.write_bytes(finished[:place])
-        counts.append(check(path))
+        counts.append(require_right_data(path))
     assert (counts, counts[-1]) == (sorted(counts), COUNT)
 
 
 @pytest.mark.parametrize("kind", ["finished", "unfinished"])
 def test_a_file_with_damaged_bytes_anywhere(kind: str, request: pytest.FixtureRequest, path: Path):
-    whole, random = request.getfixturevalue(kind), np.random.default_rng(2)
+    original, random = request.getfixturevalue(kind), np.random.default_rng(2)
     for _ in range(COPIES):
-        data = bytearray(whole)
+        data = bytearray(original)
         for position in random.integers(0, len(data), random.integers(1, 3)):
             data[position] ^= int(random.integers(1, 256))
         path.write_bytes(data)
-        check(path)
+        require_right_data(path)
 
 
 def test_each_damaged_byte_of_a_header_and_a_footer(unfinished: bytes, finished: bytes, path: Path):
-    """The bytes of the file's header, of a chunk's header and of the footer, one after the other."""
-    second = unfinished.index(b"\x04\0\0\0zstd", 200) - 37
-    for whole, places in ((unfinished, [*range(60), *range(second, second + 60)]), (finished, range(-60, 0))):
+    """Each byte is damaged alone: of the file's header, of a chunk's header, of the footer."""
+    start = unfinished.index(b"\x04\0\0\0zstd", 200) - 37
+    for original, places in ((unfinished, [*range(60), *range(start, start + 60)]), (finished, range(-60, 0))):
         for place in places:
-            data = bytearray(whole)
+            data = bytearray(original)
             data[place] ^= 0x10
             path.write_bytes(data)
-            check(path)
+            require_right_data(path)
 
 
 @pytest.fixture
@@ -154,6 +155,7 @@ def test_a_file_without_its_index_is_recovered_completely(unfinished: bytes, tmp
 
 
 def write_stock_file(path: Path) -> None:
+    """Write an MCAP file of another program."""
     with path.open("wb") as file:
         writer = StockWriter(file)
         writer.start()
@@ -219,6 +221,7 @@ def test_a_chunk_that_cannot_be_dropped_stays(path: Path, monkeypatch: pytest.Mo
 
 
 def refuse_to_truncate(*_: object) -> None:
+    """Raise the OSError EIO, in place of os.ftruncate."""
     raise OSError(errno.EIO, os.strerror(errno.EIO))
 
 
@@ -236,11 +239,11 @@ def test_a_missing_folder_is_an_error(tmp_path: Path):
 
 @pytest.mark.parametrize("place", [2, -2])
 def test_a_recovered_file_without_a_chunk_of_events_and_snapshots_is_not_complete(path: Path, place: int):
-    """All ticks are there; only the chunk shows the loss."""
+    """No tick is lost; only the damaged chunk shows the loss of events or snapshots."""
     write_recording(path, ROWS)
     with Reader(path) as reader:
-        slow = [entry for entry in reader.entries if entry.index and format.LAW in entry.index.channels]
-    entry = slow[place]
+        law_chunks = [entry for entry in reader.entries if entry.index and format.LAW in entry.index.channels]
+    entry = law_chunks[place]
     report = recover(flip_byte(path, entry.offset + entry.length - 1))
     assert (report["ticks"], report["gaps"], report["complete"]) == (COUNT, [], False)
     (problem,) = report["problems"]
@@ -251,17 +254,17 @@ def test_a_recovered_file_without_a_chunk_of_events_and_snapshots_is_not_complet
 
 
 def test_a_scan_goes_on_at_the_next_whole_chunk(tmp_path: Path):
-    """A damaged head costs its own chunk and no other, wherever it lies in an unfinished file."""
+    """A damaged head of a chunk loses that chunk and no other, wherever it lies in an unfinished file."""
     path = write_recording(tmp_path / "run.mcap", make_rows(30_000))
     source = McapSource(path)
-    whole, problems = scan_chunks(source)
-    assert (len(whole) > 4, problems) == (True, [])
-    assert [chunk.offset for chunk in whole] == [chunk.offset for chunk in read_chunk_index(source)]
-    for number in range(len(whole) - 1):
+    chunks, problems = scan_chunks(source)
+    assert (len(chunks) > 4, problems) == (True, [])
+    assert [chunk.offset for chunk in chunks] == [chunk.offset for chunk in read_chunk_index(source)]
+    for number in range(len(chunks) - 1):
         damaged = tmp_path / f"{number}.mcap"
         data = bytearray(path.read_bytes())
-        data[whole[number].offset + 1 : whole[number].offset + 9] = b"\xff" * 8  # the length of the record
+        data[chunks[number].offset + 1 : chunks[number].offset + 9] = b"\xff" * 8  # the length of the record
         damaged.write_bytes(data)
-        found, told = scan_chunks(McapSource(damaged))
-        assert [chunk.offset for chunk in found] == [chunk.offset for k, chunk in enumerate(whole) if k != number]
-        assert told == [f"bytes {whole[number].offset} to {whole[number + 1].offset} are damaged"]
+        remaining, messages = scan_chunks(McapSource(damaged))
+        assert [chunk.offset for chunk in remaining] == [chunk.offset for k, chunk in enumerate(chunks) if k != number]
+        assert messages == [f"bytes {chunks[number].offset} to {chunks[number + 1].offset} are damaged"]

@@ -24,7 +24,7 @@ from rtloop.recording.replay.replay import replay
 from rtloop.recording.views.summary import summarise
 from rtloop.signals import Mode
 from rtloop.supervision.recording_state import recording_state
-from tests.recording.disk import PLENTY_BYTES, Disk, missing
+from tests.recording.disk import PLENTY_BYTES, Disk, find_gaps
 from tests.recording.hand_made_loop import START_UNIX_NS, HandMadeLoop, RecorderProcess, make_header, make_rows
 from tests.recording.real_loop import RecordedRun, rows_of
 
@@ -37,35 +37,41 @@ COMMANDS = Counter([3_000, 5_000, 7_000, 7_400, 9_000, 14_000, 14_001, 14_001])
 
 @pytest.fixture
 def run(disk: Disk, tmp_path: Path) -> RecordedRun:
+    """A recorded run on a disk that works until a test makes it fail."""
     return RecordedRun(tmp_path / "run.mcap")
 
 
-def details_of(events: list[dict[str, Any]], kind: str) -> list[dict[str, Any]]:
+def event_details(events: list[dict[str, Any]], kind: str) -> list[dict[str, Any]]:
+    """Return the details (`what`) of all events of a kind."""
     return [event["what"] for event in events if event["kind"] == kind]
 
 
 def scheduled_ticks(events: list[dict[str, Any]]) -> Counter[int]:
+    """Return the ticks of the events of the schedule, with their counts."""
     return Counter(event["tick"] for event in events if event["who"] == "schedule")
 
 
-def names(totals: dict[str, Any]) -> list[str]:
+def file_names(totals: dict[str, Any]) -> list[str]:
+    """Return the names of the finished files."""
     return [Path(path).name for path in totals["paths"]]
 
 
-def fail(run: RecordedRun, disk: Disk, number: int, first: int, end: int) -> None:
-    """Run to tick `first`, then to `end` with a disk whose writes fail with an errno."""
+def run_with_failing_disk(run: RecordedRun, disk: Disk, number: int, first: int, end: int) -> None:
+    """Run to tick `first`, then to tick `end` with a disk whose writes fail with the errno `number`."""
     run.run_to(first)
     disk.error = number
     run.run_to(end)
     disk.error = None
 
 
-def check(totals: dict[str, Any], executed: int, *, gaps: int = 1, replayed: bool = True) -> list[dict[str, Any]]:
+def require_every_tick_accounted(
+    totals: dict[str, Any], executed: int, *, gaps: int = 1, replayed: bool = True
+) -> list[dict[str, Any]]:
     """Require that each tick is in a file or in a gap event, and that each file replays alone. Returns the gaps."""
     recording, summary = load(totals["paths"]), summarise(totals["paths"])
     ticks = recording["tick"]
-    lost = missing(ticks, executed)
-    assert (details_of(recording.events, "gap"), len(lost)) == (lost, gaps)
+    lost = find_gaps(ticks, executed)
+    assert (event_details(recording.events, "gap"), len(lost)) == (lost, gaps)
     count = sum(gap["count"] for gap in lost)
     assert (totals["ticks_logged"], totals["ticks_lost"], totals["complete"]) == (len(ticks), count, False)
     assert (count, summary.ticks_lost, summary.complete) == (executed - len(ticks), count, False)
@@ -79,21 +85,21 @@ def check(totals: dict[str, Any], executed: int, *, gaps: int = 1, replayed: boo
         if replayed:
             part = load(path)
             verdict = replay(part)
-            expected = (True, 0, details_of(part.events, "gap"))
+            expected = (True, 0, event_details(part.events, "gap"))
             assert (verdict.identical, verdict.unverified, verdict.gaps) == expected
     return lost
 
 
 @pytest.mark.parametrize("number", [errno.ENOSPC, errno.EIO, errno.EROFS])
 def test_recording_resumes_in_a_new_file_at_the_next_snapshot(disk: Disk, run: RecordedRun, number: int):
-    fail(run, disk, number, 6_000, 13_000)  # The disk still fails at the snapshot of tick 10,000.
+    run_with_failing_disk(run, disk, number, 6_000, 13_000)  # The disk still fails at the snapshot of tick 10,000.
     totals = run.end(35_000)
-    assert names(totals) == ["run.mcap", "run-0002.mcap"]
-    (gap,) = check(totals, 35_000)
+    assert file_names(totals) == ["run.mcap", "run-0002.mcap"]
+    (gap,) = require_every_tick_accounted(totals, 35_000)
     assert 0 < gap["first_tick"] < 13_000
     assert gap["first_tick"] + gap["count"] == 2 * SECOND
     events = load(totals["paths"]).events
-    (failed,), resumed = details_of(events, "recording_failed"), details_of(events, "recording_resumed")
+    (failed,), resumed = event_details(events, "recording_failed"), event_details(events, "recording_resumed")
     assert all(os.strerror(number) in text for text in (totals["error"], failed["error"]))
     assert (resumed, totals["events_lost"], scheduled_ticks(events)) == ([gap], 0, COMMANDS)
     verdict = replay(load(totals["paths"]))
@@ -103,9 +109,9 @@ def test_recording_resumes_in_a_new_file_at_the_next_snapshot(disk: Disk, run: R
 def test_recording_resumes_after_each_of_several_failures(disk: Disk, tmp_path: Path):
     run = RecordedRun(tmp_path / "run.mcap", rotate_s=3.0)
     for tick in range(15_000, 120_000, 30_000):
-        fail(run, disk, errno.ENOSPC, tick, tick + 8_000)
+        run_with_failing_disk(run, disk, errno.ENOSPC, tick, tick + 8_000)
     totals = run.end(140_000)
-    check(totals, 140_000, gaps=4)
+    require_every_tick_accounted(totals, 140_000, gaps=4)
     assert load(totals["paths"]).problems == []
 
 
@@ -123,7 +129,7 @@ def test_a_removed_folder_costs_its_ticks_until_it_is_restored(disk: Disk, tmp_p
         return
     folder.mkdir()
     totals = run.end(55_000)
-    assert check(totals, 55_000) == [{"first_tick": 0, "count": 4 * SECOND}]
+    assert require_every_tick_accounted(totals, 55_000) == [{"first_tick": 0, "count": 4 * SECOND}]
     assert ("removed" in totals["error"], os.listdir(folder)) == (True, ["run-0002.mcap"])
 
 
@@ -136,7 +142,7 @@ def test_a_removed_unfinished_file_is_closed_and_frees_its_space(disk: Disk, run
     open_files = [os.readlink(link) for link in Path("/proc/self/fd").iterdir() if link.is_symlink()]
     assert not [name for name in open_files if name.startswith(str(tmp_path / "run.mcap.part"))]
     disk.error = None
-    assert check(run.end(55_000), 55_000) == [{"first_tick": 0, "count": 4 * SECOND}]
+    assert require_every_tick_accounted(run.end(55_000), 55_000) == [{"first_tick": 0, "count": 4 * SECOND}]
 
 
 def test_recording_resumes_once_more_than_the_minimum_is_free(disk: Disk, tmp_path: Path):
@@ -149,7 +155,7 @@ def test_recording_resumes_once_more_than_the_minimum_is_free(disk: Disk, tmp_pa
     assert "1.25 times recording.min_free_mib plus 1 MiB are free" in reason  # The minimum itself is free.
     disk.free_bytes = 128 * MIB
     totals = run.end(45_000)
-    (gap,) = check(totals, 45_000)
+    (gap,) = require_every_tick_accounted(totals, 45_000)
     assert (gap["first_tick"] + gap["count"], "must stay free" in totals["error"]) == (3 * SECOND, True)
 
 
@@ -159,7 +165,7 @@ def test_a_file_without_ticks_is_removed(disk: Disk, run: RecordedRun, tmp_path:
     run.run_to(45_000)
     disk.longest_write_bytes = PLENTY_BYTES
     totals = run.end(65_000)
-    check(totals, 65_000)
+    require_every_tick_accounted(totals, 65_000)
     assert sorted(os.listdir(tmp_path)) == ["run-0002.mcap", "run.mcap"]
     assert scheduled_ticks(load(totals["paths"]).events) == COMMANDS
 
@@ -195,16 +201,16 @@ def test_recording_resumes_after_a_rotation_without_a_free_inode(disk: Disk, tmp
     run.run_to(25_000)
     disk.inodes = True
     totals = run.end(45_000)
-    assert check(totals, 45_000) == [{"first_tick": SECOND, "count": 2 * SECOND}]
+    assert require_every_tick_accounted(totals, 45_000) == [{"first_tick": SECOND, "count": 2 * SECOND}]
     assert load(totals["paths"]).problems == []
 
 
 def test_an_unpaced_run_is_not_resumed(disk: Disk, tmp_path: Path):
     run = RecordedRun(tmp_path / "run.mcap", paced=False)
-    fail(run, disk, errno.ENOSPC, 36_000, 75_000)
+    run_with_failing_disk(run, disk, errno.ENOSPC, 36_000, 75_000)
     totals = run.end(110_000)
     assert totals["ticks_lost"] == 110_000 - totals["ticks_logged"] > 70_000
-    assert (names(totals), "No space left" in totals["error"]) == (["run.mcap"], True)
+    assert (file_names(totals), "No space left" in totals["error"]) == (["run.mcap"], True)
 
 
 def test_a_replacement_recorder_waits_for_room(disk: Disk, run: RecordedRun):
@@ -215,10 +221,10 @@ def test_a_replacement_recorder_waits_for_room(disk: Disk, run: RecordedRun):
     run.run_to(25_000)
     disk.error = None
     totals = run.end(45_000)
-    assert (names(totals), totals["ticks_logged"] + totals["ticks_lost"]) == (["run-0002.mcap"], 45_000)
+    assert (file_names(totals), totals["ticks_logged"] + totals["ticks_lost"]) == (["run-0002.mcap"], 45_000)
     second, written = load(totals["paths"]), chunk_rows(run.header["columns"])  # The dead recorder wrote one chunk.
     assert totals["ticks_logged"] == len(second) + written
-    assert details_of(second.events, "gap") == [{"first_tick": written, "count": 3 * SECOND - written}]
+    assert event_details(second.events, "gap") == [{"first_tick": written, "count": 3 * SECOND - written}]
 
 
 def test_ticks_written_before_a_lasting_failure_are_counted(disk: Disk, run: RecordedRun, tmp_path: Path):
@@ -243,7 +249,7 @@ def refuse_fsync() -> None:
 
 
 def test_a_file_that_may_not_be_on_the_disk_is_not_counted_and_named(disk: Disk, tmp_path: Path):
-    """The system reports it once, and may have dropped the data."""
+    """The system reports a failed fsync once, and may have dropped the data."""
     run, part = RecordedRun(tmp_path / "run.mcap", rotate_s=1.0), tmp_path / "run-0002.mcap.part"
     run.run_to(15_000)
     disk.at_fsync = refuse_fsync
@@ -253,13 +259,13 @@ def test_a_file_that_may_not_be_on_the_disk_is_not_counted_and_named(disk: Disk,
         failures.append(run.loop.block.load(Word.RECORDER_FAILURE))
     totals = run.end()
     assert (totals["ticks_logged"], totals["ticks_lost"], totals["complete"]) == (15_000, SECOND, False)
-    assert names(totals) == ["run-0001.mcap", "run-0003.mcap"]
+    assert file_names(totals) == ["run-0001.mcap", "run-0003.mcap"]
     assert (errno.EIO in failures, failures[0], failures[-1]) == (True, 0, 0)
     assert run.loop.block.load(Word.LOST_TICKS) == SECOND
-    (failed,) = details_of(load(totals["paths"][-1]).events, "recording_failed")
+    (failed,) = event_details(load(totals["paths"][-1]).events, "recording_failed")
     assert all(str(part) in text for text in (totals["error"], failed["error"]))
-    found = load([totals["paths"][0], recover(part)["output"], totals["paths"][1]])  # Here the data is still there.
-    assert (replay(found).identical, len(found)) == (True, 25_000)
+    recording = load([totals["paths"][0], recover(part)["output"], totals["paths"][1]])  # Here the data is still there.
+    assert (replay(recording).identical, len(recording)) == (True, 25_000)
 
 
 def test_a_last_file_that_may_not_be_on_the_disk_is_not_counted(disk: Disk, run: RecordedRun, tmp_path: Path):
@@ -281,7 +287,7 @@ def test_a_disk_that_stalls_at_a_rotation_loses_only_what_the_ring_cannot_hold(
     executed = run.loop.tick + 2 * SECOND
     totals = run.end(executed)
     recording = load(totals["paths"])
-    assert missing(recording["tick"], executed) == details_of(recording.events, "gap")
+    assert find_gaps(recording["tick"], executed) == event_details(recording.events, "gap")
     assert (totals["ticks_lost"] > 0, totals["complete"]) == (lost, not lost)
     assert totals["ticks_logged"] + totals["ticks_lost"] == executed
     assert replay(recording).first_difference is None
@@ -305,7 +311,7 @@ def test_rotation_is_at_the_right_tick_however_far_the_loop_is_ahead(loop: HandM
 
 
 def test_the_recorder_process_resumes_on_a_disk_that_was_enlarged(loop: HandMadeLoop, tmp_path: Path):
-    """Its state shows the failure, and its totals name it."""
+    """The recorder's state shows the failure, and its totals name the cause."""
     small, rows = tmp_path / "disk", make_rows(45_000)
     small.mkdir()
     if subprocess.run(["mount", "-t", "tmpfs", "-o", "size=1m", "none", small], capture_output=True).returncode:
@@ -321,7 +327,7 @@ def test_the_recorder_process_resumes_on_a_disk_that_was_enlarged(loop: HandMade
             loop.run(rows[35_000:], slack=20_000, snapshot_every=5_000)
             code, totals = recorder.end()
         assert (code, "No space left" in totals["error"]) == (1, True)
-        check(totals, len(rows), replayed=False)
+        require_every_tick_accounted(totals, len(rows), replayed=False)
         logged = rows_of(totals["paths"])
         assert logged.tobytes() == rows[logged[:, 0].astype(int)].tobytes()
     finally:

@@ -42,6 +42,7 @@ SPECIAL = (
 
 @pytest.fixture(scope="module")
 def rows() -> np.ndarray:
+    """Rows with signed zeros, NaN, infinities, and the smallest and largest doubles."""
     rows = make_rows(COUNT)
     rows[: len(SPECIAL), 12:] = np.array(SPECIAL)[:, None]
     return rows
@@ -49,17 +50,20 @@ def rows() -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def path(tmp_path_factory: pytest.TempPathFactory, rows: np.ndarray) -> Path:
+    """A recording that holds `rows`."""
     return write_recording(tmp_path_factory.mktemp("file") / "run.mcap", rows)
 
 
 def stock_rows(path: Path, names: tuple[str, ...] = COLUMNS) -> np.ndarray:
+    """Return the rows (ticks, columns) of a recording, by the public libraries."""
     with path.open("rb") as file:
         reader = make_reader(file, validate_crcs=True, decoder_factories=[DecoderFactory()])
         decoded = [row.decoded_message for row in reader.iter_decoded_messages(topics=["/ticks"])]
     return np.array([[getattr(message, name) for name in names] for message in decoded])
 
 
-def own_rows(path: Path) -> np.ndarray:
+def read_rows(path: Path) -> np.ndarray:
+    """Return the rows (ticks, columns) of a recording, by rtloop's reader."""
     with Reader(path) as reader:
         return np.concatenate(list(reader.blocks()))
 
@@ -73,7 +77,7 @@ def test_every_field_is_present_even_where_it_is_zero(path: Path):
 
 
 def test_both_readers_give_the_written_numbers(path: Path, rows: np.ndarray):
-    assert stock_rows(path).tobytes() == own_rows(path).tobytes() == rows.tobytes()
+    assert stock_rows(path).tobytes() == read_rows(path).tobytes() == rows.tobytes()
     with Reader(path) as reader:
         selection = np.concatenate(list(reader.blocks(["x_drive_v", "tick"])))
     assert selection.tobytes() == rows[:, [COLUMNS.index("x_drive_v"), 0]].tobytes()
@@ -87,7 +91,7 @@ def test_any_double_survives(values: np.ndarray, tmp_path: Path):
     rows = np.column_stack([np.arange(5.0), np.arange(5) * 1e5, values])
     rows[:, [PERIODS_MISSED, FLAGS, MODE, DRIVER_STATUS]] = 1.0  # A reader requires whole numbers.
     write_recording(path, rows)
-    assert stock_rows(path).tobytes() == own_rows(path).tobytes() == rows.tobytes()
+    assert stock_rows(path).tobytes() == read_rows(path).tobytes() == rows.tobytes()
 
 
 def test_messages_have_the_written_times_contents_and_checksums(path: Path, rows: np.ndarray):
@@ -163,7 +167,7 @@ def test_the_message_index_has_the_time_and_place_of_every_tick(tmp_path: Path):
     assert times == [START_UNIX_NS + int(row[1]) for row in rows]
     offsets = [offset for _, offset in indexes[0].records]
     assert offsets == [k * tick_dtype(COLUMNS).itemsize for k in range(1_000)]
-    assert stock_rows(path).tobytes() == own_rows(path).tobytes() == rows.tobytes()
+    assert stock_rows(path).tobytes() == read_rows(path).tobytes() == rows.tobytes()
 
 
 def test_the_file_is_finished_well_at_the_minimum_of_free_space(tmp_path: Path, rows: np.ndarray, monkeypatch):
@@ -176,7 +180,7 @@ def test_the_file_is_finished_well_at_the_minimum_of_free_space(tmp_path: Path, 
     with pytest.raises(OutputError, match="9 MiB are free; at least 9 MiB must stay free"):
         writer.write_ticks(rows[2000:])
     writer.finish(lambda logged: final_message(len(rows), logged))
-    assert own_rows(tmp_path / "run.mcap").tobytes() == rows[:2000].tobytes()
+    assert read_rows(tmp_path / "run.mcap").tobytes() == rows[:2000].tobytes()
     with Reader(tmp_path / "run.mcap") as reader:
         assert reader.totals
         assert (reader.totals["ticks_executed"], reader.totals["ticks_logged"]) == (len(rows), 2000)
@@ -191,7 +195,7 @@ def test_a_new_file_says_what_room_it_needs(tmp_path: Path, monkeypatch: pytest.
 
 
 def test_a_growing_file_needs_little_memory_for_each_chunk(tmp_path: Path):
-    """A day without rotation is 350 000 chunks."""
+    """A day without rotation has 350 000 chunks."""
     chunks = 400
     rows = make_rows(chunks)
     writer = Writer(tmp_path / "run.mcap", make_header(), START_UNIX_NS, message_index=True)

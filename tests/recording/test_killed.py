@@ -16,7 +16,7 @@ from rtloop.recording.file.topics.format import chunk_rows
 from rtloop.recording.load import load
 from rtloop.recording.replay.replay import replay
 from tests.recording.hand_made_loop import COLUMNS
-from tests.recording.killing import block_of, kill_a_run, recovered_ticks
+from tests.recording.killing import kill_a_run, open_shared_block, recovered_ticks
 from tests.service.test_run import PAPER, children, finish, run, start, wait_for_ticks
 
 
@@ -43,20 +43,20 @@ def test_the_next_run_recovers_the_file_of_a_killed_one(tmp_path: Path):
 
 
 def test_a_loop_in_virtual_time_waits_for_its_recorder_at_half_the_ring(tmp_path: Path):
-    """The supervisor stands still as well, so that it replaces no recorder meanwhile."""
+    """The supervisor is stopped as well, so that it does not replace the recorder."""
     process = start("run", PAPER, "--unpaced", "--duration", "600", "--out", tmp_path, "--json")
     recorder = children(process)["capture.recorder"]
     wait_for_ticks(tmp_path)
-    block = block_of(recorder)
+    block = open_shared_block(recorder)
     for pid in (process.pid, recorder):
         os.kill(pid, signal.SIGSTOP)
     executed = -1
     while executed != (executed := int(block["ticks_head"][0])):
         time.sleep(1.0)
-    ahead = executed - block.load(Word.RECORDER_CURSOR)
+    lead_ticks = executed - block.load(Word.RECORDER_CURSOR)
     for pid in (recorder, process.pid):
         os.kill(pid, signal.SIGCONT)
     process.send_signal(signal.SIGINT)
     code, summary, _ = finish(process)
-    assert ahead == block.ring("ticks").marks.size // 2 + 1  # the tick that finds half the ring unread is the last
+    assert lead_ticks == block.ring("ticks").marks.size // 2 + 1  # the tick that finds half the ring unread is the last
     assert (code, summary["ticks_lost"]) == (0, 0)

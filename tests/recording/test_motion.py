@@ -1,4 +1,4 @@
-"""Whether a position fell as its drive rose: on motions made here, and on loops that trip."""
+"""A position that fell as its drive rose is recognised: on computed motions, and on loops that trip."""
 
 from __future__ import annotations
 
@@ -19,7 +19,8 @@ DRIVES = {"runaway": RUNAWAY_V, "downwards": -RUNAWAY_V, "oscillation": OSCILLAT
 SENSOR = "[driver.plant.sensor]\num_per_v = 10.0"
 
 
-def opposed(drive_v: np.ndarray, position_um: np.ndarray, blocks: int = 1) -> bool:
+def is_opposed(drive_v: np.ndarray, position_um: np.ndarray, blocks: int = 1) -> bool:
+    """Return whether Motion, fed with the samples in `blocks` parts, finds that drive and position ran away opposed."""
     motion = Motion()
     for drive, position in zip(np.array_split(drive_v, blocks), np.array_split(position_um, blocks), strict=True):
         motion.add(drive, position)
@@ -27,16 +28,16 @@ def opposed(drive_v: np.ndarray, position_um: np.ndarray, blocks: int = 1) -> bo
 
 
 @pytest.mark.parametrize("blocks", [1, 7])
-@pytest.mark.parametrize(("name", "um_per_v", "answer"), [
+@pytest.mark.parametrize(("name", "um_per_v", "expected"), [
     ("runaway", -4.3, True), ("downwards", -4.3, True), ("runaway", 4.3, False), ("downwards", 4.3, False),
     ("oscillation", -4.3, False), ("oscillation", 4.3, False),
 ])  # fmt: skip
-def test_only_a_drive_that_runs_away_against_its_position_is_opposed(name, um_per_v, answer, blocks):
-    """Far from 0 as well: positions of 1 m and drives about 5 V lose no digit that matters."""
+def test_only_a_drive_that_runs_away_against_its_position_is_opposed(name, um_per_v, expected, blocks):
+    """Offsets of 1 m and 5 V do not change the answer."""
     noise_um = np.random.default_rng(3).normal(0.0, 0.02, TICKS)
     position_um = um_per_v * DRIVES[name] + noise_um
-    assert opposed(DRIVES[name], position_um, blocks) is answer
-    assert opposed(5.0 + DRIVES[name], 1e6 + position_um, blocks) is answer
+    assert is_opposed(DRIVES[name], position_um, blocks) is expected
+    assert is_opposed(5.0 + DRIVES[name], 1e6 + position_um, blocks) is expected
 
 
 @pytest.mark.parametrize("share", [0.3, 0.7])
@@ -49,26 +50,26 @@ def test_the_correlation_must_be_below_minus_a_half(share):
     wave = np.sqrt(2.0) * np.sin(2.0 * np.pi * np.arange(TICKS) / 5.0)
     position_um = -np.sqrt(share) * centred + np.sqrt(1.0 - share) * wave
     assert np.corrcoef(RUNAWAY_V, position_um)[0, 1] < -0.5
-    assert opposed(RUNAWAY_V, position_um)
-    assert not opposed(RUNAWAY_V, -np.sqrt(0.2) * centred + np.sqrt(0.8) * wave)
+    assert is_opposed(RUNAWAY_V, position_um)
+    assert not is_opposed(RUNAWAY_V, -np.sqrt(0.2) * centred + np.sqrt(0.8) * wave)
 
 
 @pytest.mark.parametrize("position_um", [np.zeros(TICKS), np.full(TICKS, np.nan), np.full(TICKS, np.inf)])
 def test_a_position_that_is_constant_or_not_finite_is_not_opposed(position_um):
-    assert not opposed(RUNAWAY_V, position_um)
+    assert not is_opposed(RUNAWAY_V, position_um)
     assert not Motion().ran_away_opposed()
 
 
-@pytest.mark.parametrize(("old", "new", "named"), [
+@pytest.mark.parametrize(("old", "new", "is_named"), [
     (SENSOR, SENSOR.replace("10.0", "-10.0"), True),
     ("gain = 0.016", "gain = 0.1\nallow_unstable = true", False),
 ], ids=["wrong sign", "right sign, oscillates"])  # fmt: skip
-def test_the_summary_of_a_trip_names_a_wrong_sign_and_blames_no_right_one(old, new, named, tmp_path: Path):
+def test_the_summary_of_a_trip_names_a_wrong_sign_and_blames_no_right_one(old, new, is_named, tmp_path: Path):
     assert TEXT.count(old) == 1
     (tmp_path / "loop.toml").write_text(TEXT.replace(old, new).replace('specification = "paper-spec.toml"', ""))
     command = ["run", str(tmp_path / "loop.toml"), "--duration", "0.5", "--unpaced", "--out", str(tmp_path)]
     result = CliRunner().invoke(main, command)
     assert result.exit_code == 1, result.output
     assert "trip" in result.stdout
-    said = "the position of axis x fell as its drive rose. Check the sign of its um_per_v"
-    assert (said in " ".join(result.stdout.split())) is named
+    sentence = "the position of axis x fell as its drive rose. Check the sign of its um_per_v"
+    assert (sentence in " ".join(result.stdout.split())) is is_named

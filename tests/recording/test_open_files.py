@@ -65,10 +65,10 @@ def test_a_reader_continues_after_a_quota_removed_its_file(tmp_path: Path):
 def test_an_export_does_not_change_a_file_that_another_program_has_open(tmp_path: Path, form: str):
     recording = write_recording(tmp_path / "run.mcap", make_rows(100))
     output = tmp_path / f"run.{form}"
-    with output.open("w+b") as other:
-        other.write(b"of another program")
-        other.flush()
-        fcntl.flock(other, fcntl.LOCK_EX)
+    with output.open("w+b") as open_file:
+        open_file.write(b"of another program")
+        open_file.flush()
+        fcntl.flock(open_file, fcntl.LOCK_EX)
         result = run("export", recording, "--to", form, "--out", output)
         assert (result.exit_code, "exists" in result.output) == (73, True), result.output
     assert output.read_bytes() == b"of another program"
@@ -78,8 +78,8 @@ def test_a_file_that_another_program_is_writing_is_refused_with_a_reason(tmp_pat
     path = tmp_path / "measured.h5"
     with h5py.File(path, "w") as file:
         file["a"] = np.arange(10.0)
-    with path.open("rb") as other:
-        fcntl.flock(other, fcntl.LOCK_EX)
+    with path.open("rb") as locked_file:
+        fcntl.flock(locked_file, fcntl.LOCK_EX)
         result = run("import", path)
     assert (result.exit_code, str(path) in result.output.replace("\n", "")) == (1, True), result.output
 
@@ -97,21 +97,21 @@ def test_a_recording_that_another_process_begins_is_refused_and_no_file_stays_op
 def test_a_process_that_is_a_moment_quicker_to_lock_the_new_file_has_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    """Between the file's creation and its lock, which no system call makes one."""
-    others = []
+    """The other process locks the file between its creation and its lock; no system call joins these two steps."""
+    locked_fds = []
 
-    def replace_and_lose(path: Path, mode: int) -> int:
+    def replace_and_lock_first(path: Path, mode: int) -> int:
         fd = replace_file(path, mode)
-        others.append(os.open(path, os.O_RDONLY))
-        fcntl.flock(others[-1], fcntl.LOCK_EX)
+        locked_fds.append(os.open(path, os.O_RDONLY))
+        fcntl.flock(locked_fds[-1], fcntl.LOCK_EX)
         return fd
 
-    monkeypatch.setattr(chunkfile, "replace_file", replace_and_lose)
+    monkeypatch.setattr(chunkfile, "replace_file", replace_and_lock_first)
     before = len(os.listdir("/proc/self/fd"))
     with pytest.raises(OutputError, match="another process writes the same recording"):
         ChunkFile(tmp_path / "run.mcap", Header("", "test"), [])
     assert len(os.listdir("/proc/self/fd")) == before + 1
-    os.close(others[0])
+    os.close(locked_fds[0])
 
 
 def test_a_reader_of_some_seconds_leaves_the_other_chunks_alone(tmp_path: Path):
@@ -129,7 +129,7 @@ def test_a_reader_of_some_seconds_leaves_the_other_chunks_alone(tmp_path: Path):
 def test_a_file_that_is_closed_twice_closes_no_other_one(tmp_path: Path):
     reader = Reader(write_recording(tmp_path / "run.mcap", make_rows(100)))
     reader.close()
-    other = os.open(tmp_path / "other", os.O_CREAT | os.O_RDWR)  # The system gives it the number that is free now.
+    other_fd = os.open(tmp_path / "other", os.O_CREAT | os.O_RDWR)  # The descriptor gets the number of the closed file.
     reader.close()
-    os.fstat(other)
-    os.close(other)
+    os.fstat(other_fd)
+    os.close(other_fd)

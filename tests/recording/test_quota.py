@@ -31,23 +31,23 @@ from rtloop.supervision.quota import SPARE_BYTES, Quota
 from rtloop.supervision.recorder_keeper import RecorderKeeper
 from tests.recording.hand_made_loop import AXES, START_UNIX_NS, HandMadeLoop, final_message, make_header, make_rows
 
-PART = 5_000
+PART_TICKS = 5_000
 """Number of ticks that a file accounts for: half a second."""
 AROUND = {"before_s": 0.1, "after_s": 0.2, "every_s": 1.0, "on": ["trip"]}
 
 
-def write(
+def write_file(
     folder: Path, stem: str, number: int = 1, trip: int | None = None, kind: Kind = Kind.TRIPPED, **header: object
 ) -> Path:
     """Write file `number` of a run, with an event of `kind` at the tick `trip`. Returns its path."""
-    first = (number - 1) * PART
+    first = (number - 1) * PART_TICKS
     header = make_header(sequence=number, first_tick=first, format=2, around=AROUND, **header)
     writer = Writer(folder / f"{stem}.mcap", header, START_UNIX_NS)
     if trip is not None:
         record = message(kind, tick=trip, axis=0, values=[Flag.TRIP_POSITION])[0]
         writer.write_messages([event_message(event_from_message(record, AXES, 0), START_UNIX_NS)])
     writer.write_ticks(make_rows(1_000, first=first))
-    writer.finish(lambda logged: final_message(first + PART, logged))
+    writer.finish(lambda logged: final_message(first + PART_TICKS, logged))
     return writer.path
 
 
@@ -55,10 +55,10 @@ def write_run(
     folder: Path, stamp: str, files: int, trip: int | None = None, name: str = "test", kind: Kind = Kind.TRIPPED
 ) -> list[Path]:
     """Write the files of one run, with an event of `kind` at the tick `trip`. Returns their paths."""
-    trips = {} if trip is None else {trip // PART + 1: trip}
+    trips = {} if trip is None else {trip // PART_TICKS + 1: trip}
     created = START_UNIX_NS + int(stamp[-1]) * 10**9
     return [
-        write(
+        write_file(
             folder, f"{name}-{stamp}-{number:04d}", number, trips.get(number), kind, created_unix_ns=created, name=name
         )
         for number in range(1, files + 1)
@@ -66,7 +66,7 @@ def write_run(
 
 
 def apply_quota(folder: Path, files: int) -> Quota:
-    """Apply a quota of the size of `files` files. Returns it."""
+    """Apply a quota of the size of `files` files three times. Returns the quota."""
     size = max(path.stat().st_size for path in folder.glob("test-*.mcap"))
     quota = Quota(folder, "test", files * size, 0)
     for _ in range(3):
@@ -76,7 +76,7 @@ def apply_quota(folder: Path, files: int) -> Quota:
 
 @pytest.fixture(autouse=True)
 def disk_status(monkeypatch: pytest.MonkeyPatch) -> SimpleNamespace:
-    """Status of a disk with a TiB free."""
+    """The status of the disk, which has a TiB free until a test changes it."""
     status = SimpleNamespace(f_bavail=1 << 40, f_frsize=1)
     monkeypatch.setattr(os, "statvfs", lambda _: status)
     return status
@@ -98,32 +98,31 @@ def test_the_oldest_files_are_removed_first(tmp_path: Path):
 
 @pytest.mark.parametrize("kind", [Kind.TRIPPED, Kind.DRIVER_FAILED])
 def test_no_file_around_a_trip_is_removed_whatever_the_quota(tmp_path: Path, kind: Kind):
-    """Neither its neighbour with ticks around the trip, nor the newest file."""
-    files = write_run(
-        tmp_path, "20260101T000001", 7, trip=2 * PART + 500, kind=kind
-    )  # before_s reaches into the second.
-    late = write_run(tmp_path, "20260102T000002", 6, trip=2 * PART - 500, kind=kind)  # after_s reaches into the third.
+    """The neighbour with ticks around the trip is not removed either, nor is the newest file."""
+    # before_s reaches into the second file here, and after_s into the third file of the later run.
+    files = write_run(tmp_path, "20260101T000001", 7, trip=2 * PART_TICKS + 500, kind=kind)
+    later_files = write_run(tmp_path, "20260102T000002", 6, trip=2 * PART_TICKS - 500, kind=kind)
     apply_quota(tmp_path, 1)
-    require_files(tmp_path, *files[1:3], *late[1:3], late[-1])
+    require_files(tmp_path, *files[1:3], *later_files[1:3], later_files[-1])
 
 
 def test_other_files_are_not_removed(tmp_path: Path):
-    own = write_run(tmp_path, "20260101T000001", 4)
-    others = [
-        write(tmp_path, "test-20260101T000001.cut-5"),
-        write(tmp_path, "test-mine"),
-        write(tmp_path, "other-20260101T000001", name="other"),
-        write(tmp_path, "test-20250101T000001", name="other"),
-        write(tmp_path, "test-20250101T000002", cut={"first": 0, "end": 9, "files": []}),
+    run_files = write_run(tmp_path, "20260101T000001", 4)
+    foreign_files = [
+        write_file(tmp_path, "test-20260101T000001.cut-5"),
+        write_file(tmp_path, "test-mine"),
+        write_file(tmp_path, "other-20260101T000001", name="other"),
+        write_file(tmp_path, "test-20250101T000001", name="other"),
+        write_file(tmp_path, "test-20250101T000002", cut={"first": 0, "end": 9, "files": []}),
     ]
     damaged, unfinished, link = (
         tmp_path / f"test-20250101T00000{name}" for name in ("3.mcap", "4.mcap.part", "5.mcap")
     )
     for path in (damaged, unfinished):
-        path.write_bytes(own[0].read_bytes()[:-3000])
-    link.symlink_to(others[0])
+        path.write_bytes(run_files[0].read_bytes()[:-3000])
+    link.symlink_to(foreign_files[0])
     apply_quota(tmp_path, 1)
-    require_files(tmp_path, own[-1], *others, damaged, unfinished, link)
+    require_files(tmp_path, run_files[-1], *foreign_files, damaged, unfinished, link)
 
 
 def test_files_are_removed_when_the_disk_is_nearly_full(tmp_path: Path, disk_status: SimpleNamespace):
@@ -147,7 +146,7 @@ def test_an_unread_file_is_not_removed(tmp_path: Path):
 
 def test_no_file_is_removed_while_one_of_the_folder_has_no_status(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """The file may hold a trip whose first ticks are in an earlier file."""
-    files, lstat = write_run(tmp_path, "20260101T000001", 4, trip=PART + 1), os.lstat
+    files, lstat = write_run(tmp_path, "20260101T000001", 4, trip=PART_TICKS + 1), os.lstat
 
     def refuse(path: Any, *arguments: Any, **options: Any) -> os.stat_result:
         if Path(path) == files[1]:
@@ -166,8 +165,8 @@ def test_a_missing_folder_is_a_failure(tmp_path: Path):
     assert quota.failure == f"{tmp_path / 'gone'}: No such file or directory"
 
 
-class Listener:
-    """A recorder that only receives lines."""
+class StubRecorder:
+    """Stand-in for a recorder process, which only receives lines."""
 
     def __init__(self) -> None:
         self.exit_code, self.lines = None, queue.SimpleQueue[bytes]()
@@ -182,7 +181,7 @@ class Listener:
 
 def test_the_recorder_receives_removals_and_a_failure_is_listed_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(recorder_keeper, "QUOTA_S", 0.0)
-    folder, loop, child = tmp_path / "there", HandMadeLoop(), Listener()
+    folder, loop, child = tmp_path / "there", HandMadeLoop(), StubRecorder()
     folder.mkdir()
     files = write_run(folder, "20260101T000001", 3)
     loop.block.store(Word.RECORDER_STATE, ProcessState.RUNNING)
@@ -200,7 +199,7 @@ def test_the_recorder_receives_removals_and_a_failure_is_listed_once(tmp_path: P
     while len(keeper.removals) < 3:
         time.sleep(0.001)
     keeper.finish()
-    while keeper.totals is None:  # It applies the quota once more.
+    while keeper.totals is None:  # The keeper applies the quota once more.
         time.sleep(0.001)
     assert keeper.removals[2:] == [f"{folder}: No such file or directory"]
 
@@ -212,7 +211,7 @@ def test_the_files_written_here_can_be_read(tmp_path: Path):
 
 def test_no_file_of_a_run_is_removed_before_all_were_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """A trip in an unread file protects the file before it."""
-    files = write_run(tmp_path, "20260101T000001", 5, trip=2 * PART + 500)
+    files = write_run(tmp_path, "20260101T000001", 5, trip=2 * PART_TICKS + 500)
     seconds = count()
     monkeypatch.setattr(quota_module, "time", SimpleNamespace(monotonic=lambda: float(next(seconds))))
     quota = Quota(tmp_path, "test", 1, 0)
@@ -227,7 +226,7 @@ def test_a_run_with_an_unreadable_file_is_not_removed_as_it_may_hold_a_trip(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     write_run(tmp_path, "20260101T000001", 2)
-    tripped = write_run(tmp_path, "20260102T000002", 2, trip=PART + 1)
+    tripped = write_run(tmp_path, "20260102T000002", 2, trip=PART_TICKS + 1)
     write_run(tmp_path, "20260103T000003", 1)
     enter = quota_module.Reader.__init__
 

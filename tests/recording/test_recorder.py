@@ -41,12 +41,14 @@ def path(tmp_path: Path) -> Path:
     return tmp_path / "run.mcap"
 
 
-def rows_of(path: Path) -> np.ndarray:
+def read_rows(path: Path) -> np.ndarray:
+    """Return all readable rows (ticks, columns) of a file."""
     with Reader(path, tolerant=True) as reader:
         return np.concatenate([*reader.blocks(), np.empty((0, len(reader.columns)))])
 
 
-def last_result(path: Path) -> str:
+def stored_result(path: Path) -> str:
+    """Return the result that the recording's final event holds."""
     return load(path).events[-1]["what"]["result"]
 
 
@@ -61,7 +63,7 @@ def test_all_ticks_events_and_snapshots_are_recorded_in_order(
     code, totals = recorder.end()
     assert (code, totals["complete"], totals["error"]) == (0, True, None)
     assert (totals["ticks_logged"], totals["ticks_lost"], totals["events_lost"]) == (len(rows), 0, 0)
-    assert rows_of(path).tobytes() == rows.tobytes()
+    assert read_rows(path).tobytes() == rows.tobytes()
     with Reader(path) as reader:
         assert (reader.problems, reader.start_unix_ns) == ([], 0)  # Virtual time begins at 0.
         assert [event["kind"] for event in reader.events] == ["set_mode", "tripped", "finished"]
@@ -108,7 +110,7 @@ def test_a_lapped_recorder_counts_lost_ticks(loop, recorder, path):
     lost = totals["ticks_lost"]
     assert (code, totals["complete"]) == (0, False)
     assert lost == len(rows) - totals["ticks_logged"] >= 5_000
-    assert rows_of(path).tobytes() == rows[lost:].tobytes()
+    assert read_rows(path).tobytes() == rows[lost:].tobytes()
     gaps = [event["what"] for event in load(path).events if event["kind"] == "gap"]
     assert gaps == [{"first_tick": 0, "count": lost}]
 
@@ -121,7 +123,7 @@ def test_signals_do_not_stop_the_recorder_and_it_ends_with_the_loop(loop, record
     recorder.wait_for_ticks(100)
     loop.run(make_rows(100, first=100))
     code, totals = recorder.end(ProcessState.FAILED)
-    assert (code, totals["ticks_logged"], totals["complete"], last_result(path)) == (0, 200, False, "failed")
+    assert (code, totals["ticks_logged"], totals["complete"], stored_result(path)) == (0, 200, False, "failed")
 
 
 def test_removed_files_are_recorded(loop, recorder, path):
@@ -147,7 +149,7 @@ def test_the_recorder_ends_when_service_and_loop_are_gone(loop, recorder, path):
     recorder.wait_for_ticks(100)
     recorder.close_orders()
     code, totals = recorder.result()
-    assert (code, totals["ticks_logged"], totals["complete"], last_result(path)) == (0, 100, False, "abandoned")
+    assert (code, totals["ticks_logged"], totals["complete"], stored_result(path)) == (0, 100, False, "abandoned")
 
 
 def test_a_file_is_never_overwritten(recorder, path):
@@ -173,7 +175,7 @@ def test_a_killed_recorder_in_virtual_time_loses_no_more_than_the_chunks_that_wa
     report = recover(part)
     assert (report["complete"], report["gaps"], part.exists()) == (False, [], True)
     assert report["ticks"] >= len(rows) - 8 * 4_700 > 20_000
-    assert rows_of(path).tobytes() == rows[: report["ticks"]].tobytes()
+    assert read_rows(path).tobytes() == rows[: report["ticks"]].tobytes()
 
 
 def test_a_growing_file_is_not_recovered(recorder, path):
@@ -186,11 +188,12 @@ def test_a_growing_file_is_not_recovered(recorder, path):
 
 
 def check_full_disk(recorder: RecorderProcess, path: Path) -> None:
+    """Record more than fits. Require a finished file of the first ticks, and a loop that was drained to its end."""
     rows = make_rows(80_000)
     code, totals = recorder.record(path, rows)
-    assert (code, totals["complete"], recorder.loop.cursor) == (1, False, len(rows))  # It continued to drain.
+    assert (code, totals["complete"], recorder.loop.cursor) == (1, False, len(rows))  # The recorder continued to drain.
     assert "No space left" in totals["error"] or "File too large" in totals["error"]
-    logged = rows_of(path)
+    logged = read_rows(path)
     assert 0 < len(logged) == totals["ticks_logged"] == len(rows) - totals["ticks_lost"]
     assert logged.tobytes() == rows[: len(logged)].tobytes()
     with Reader(path) as reader:  # The file is finished, with its index.
@@ -236,8 +239,8 @@ def test_rotation_at_a_snapshot_loses_no_tick(loop, recorder, path, rule):
             assert next(reader.blocks())[0, 0] == reader.header["first_tick"] == next(reader.snapshots()).tick
             assert (reader.totals["complete"], reader.totals["ticks_lost"]) == (True, 0)
     pattern = path.with_name("run-*.mcap")
-    whole = load(pattern)
-    assert (np.concatenate(list(whole.blocks())).tobytes(), whole.problems) == (rows.tobytes(), [])
+    recording = load(pattern)
+    assert (np.concatenate(list(recording.blocks())).tobytes(), recording.problems) == (rows.tobytes(), [])
     os.remove(totals["paths"][1])
     assert load(pattern).problems == ["file 2 of the run is missing"]
 
@@ -257,20 +260,20 @@ def test_event_times_follow_the_deadlines_after_missed_periods(loop, recorder, p
 
 
 POLLS = 100
-"""Polls of a recorder whose clock stands still; any time limit of the recorder takes more."""
+"""Polls of a recorder whose clock stands still; a wait for any time limit would need more polls."""
 
 
 class EndOfOrders:
-    """Orders of a service that is gone."""
+    """The stream of orders of a service that is gone."""
 
     is_closed = True
 
     def next(self) -> None:
-        """Return no order."""
+        """Return None: no order arrives any more."""
 
 
 class EmptyRings:
-    """A session whose rings hold no data; raises StillPolling after POLLS drains."""
+    """A session whose rings hold no data. Drain number POLLS + 1 raises StillPolling."""
 
     free_rows, cursor, failure, polls = 1, 0, None, 0
 
@@ -281,7 +284,7 @@ class EmptyRings:
         return 0
 
     def write_due(self) -> None:
-        """Write no data."""
+        """Write no data: the rings are empty."""
 
 
 class StillPolling(Exception):

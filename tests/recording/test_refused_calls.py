@@ -40,15 +40,17 @@ def part(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def keeper() -> RecorderKeeper:
+    """Stand-in for a RecorderKeeper: the notes that its methods write."""
     return cast(RecorderKeeper, SimpleNamespace(notes=[]))
 
 
 def refuse(*_: object, **__: object) -> Any:
+    """Raise the OSError EIO, in place of a system call."""
     raise OSError(errno.EIO, os.strerror(errno.EIO))
 
 
 def refuse_the_end_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let the first write of an index fail on a full disk."""
+    """Make the first write of an index fail as on a full disk."""
     write_end, refusals = ChunkFile.write_end, [True]
 
     def full_once(file: ChunkFile) -> None:
@@ -60,14 +62,14 @@ def refuse_the_end_once(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(ChunkFile, "write_end", full_once)
 
 
-@pytest.mark.parametrize("copy", [recover, lambda path: cut(path, 1_000, TICKS)], ids=["recover", "cut"])
+@pytest.mark.parametrize("make_copy", [recover, lambda path: cut(path, 1_000, TICKS)], ids=["recover", "cut"])
 def test_a_copy_drops_no_tick_for_its_index(
-    part: Path, copy: Callable[[Path], object], monkeypatch: pytest.MonkeyPatch
+    part: Path, make_copy: Callable[[Path], object], monkeypatch: pytest.MonkeyPatch
 ):
     before = sorted(part.parent.iterdir())
     refuse_the_end_once(monkeypatch)
     with pytest.raises(OutputError, match="full"):
-        copy(part)
+        make_copy(part)
     assert sorted(part.parent.iterdir()) == before
 
 
@@ -104,27 +106,29 @@ def test_a_file_whose_lock_cannot_be_tested_is_not_recovered(part: Path, monkeyp
     assert find_leftovers(part.parent) == []
 
 
-@pytest.mark.parametrize("kind", [recover, cut], ids=["recover", "cut"])
+@pytest.mark.parametrize("make_copy", [recover, cut], ids=["recover", "cut"])
 def test_an_old_copy_that_cannot_be_removed_refuses_a_new_one(
-    part: Path, kind: Callable[[Path], object], monkeypatch: pytest.MonkeyPatch
+    part: Path, make_copy: Callable[[Path], object], monkeypatch: pytest.MonkeyPatch
 ):
     for path in part.with_name("killed.mcap.recovering"), cut_path(part, 0).with_name("killed.cut-0.mcap.cutting"):
         path.touch()
     monkeypatch.setattr(Path, "unlink", refuse)
     with pytest.raises(OutputError, match=os.strerror(errno.EIO)):
-        kind(part)
+        make_copy(part)
 
 
-@pytest.mark.parametrize("kind", [recover, cut], ids=["recover", "cut"])
-def test_a_second_copy_at_the_same_time_is_refused_and_the_first_one_is_whole(part: Path, kind: Callable[..., Any]):
+@pytest.mark.parametrize("make_copy", [recover, cut], ids=["recover", "cut"])
+def test_a_second_copy_at_the_same_time_is_refused_and_the_first_one_is_whole(
+    part: Path, make_copy: Callable[..., Any]
+):
     refusals: list[str] = []
 
     def start_again(_: int) -> None:
-        with pytest.raises(OutputError) as refused:
-            kind(part)
-        refusals.append(str(refused.value))
+        with pytest.raises(OutputError) as error:
+            make_copy(part)
+        refusals.append(str(error.value))
 
-    report = kind(part, progress=start_again)
+    report = make_copy(part, progress=start_again)
     assert report["ticks"] == len(load(report["output"])) == TICKS
     assert refusals
     assert {refusal.partition(": ")[2] for refusal in refusals} == {"another process writes the same recording"}

@@ -28,7 +28,7 @@ from tests.recording.real_loop import RecordedRun
 
 TICKS, STEP, SNAPSHOT_TICKS, COMMAND_TICKS = 1_200, 400, 250, 100
 ROTATE_S = 0.05
-LEAST_INSTANTS = 50
+MIN_INSTANTS = 50
 KILLED, END, SNAPSHOT = 15_722, 22_000, 10_000
 """End of the ticks that a recorder wrote before its death, end of the run, last snapshot before the death."""
 
@@ -42,19 +42,19 @@ class Contents(NamedTuple):
     problems: list[str]
 
     def differences(self, expected: Contents) -> list[str]:
-        """Names of the fields that differ from `expected`."""
+        """Return the names of the fields that differ from `expected`."""
         return [name for name in self._fields if getattr(self, name) != getattr(expected, name)]
 
 
-def contents(files: list[Path]) -> Contents:
-    """Contents of the files of a run."""
+def read_contents(files: list[Path]) -> Contents:
+    """Return the contents of the files of a run."""
     recording = load(files)
     events = [event for event in recording.events if event["who"] != RECORDER]
     return Contents(recording["tick"].tolist(), events, list(recording.snapshots()), recording.problems)
 
 
-class Run:
-    """A loop and its recording by successive recorders."""
+class HandMadeRun:
+    """A hand-made loop, and its recording by one recorder after another."""
 
     def __init__(self, folder: Path) -> None:
         folder.mkdir()
@@ -72,33 +72,36 @@ class Run:
         return True
 
     def session(self) -> Session:
-        """Session of the next recorder, which numbers its files after the existing ones."""
+        """Return the session of the next recorder, which numbers its files after the existing ones."""
         files = [path for path in self.folder.iterdir() if path.suffix in (".mcap", ".part")]
         options = Options(min_free_bytes=0, rotate_s=ROTATE_S, sequence=1 + len(files))
         return Session(self.loop.block, self.folder / "run.mcap", make_header(), options)
 
     def contents(self) -> Contents:
-        """Contents of the recording, after recovery of the files that a killed recorder left."""
+        """Recover the files that a killed recorder left. Returns the contents of the recording."""
         for part in self.folder.glob("*.part"):
             recover(part)
-        return contents(list(self.folder.glob("*.mcap")))
+        return read_contents(list(self.folder.glob("*.mcap")))
 
     def first_ticks(self) -> list[int]:
-        """First tick of each finished file, by its header."""
+        """Return the first tick of each finished file, by its header."""
         return [load(path).extents[0].first_tick for path in self.folder.glob("*.mcap")]
 
 
-def step(session: Session) -> None:
-    """Drain the rings and write all data."""
+def drain_and_write(session: Session) -> None:
+    """Drain the rings of a session and write all data."""
     while session.drain():
         session.write_due()
     session._write_all()
 
 
 class MortalRecorder:
-    """A recorder in its own process, killed in a write, or before it stores a word or renames a file."""
+    """A recorder in a child process that kills itself at instant number `instant`.
 
-    def __init__(self, run: Run, instant: int) -> None:
+    An instant is the middle of a write, or the moment before a word is stored or a file is renamed.
+    """
+
+    def __init__(self, run: HandMadeRun, instant: int) -> None:
         self._instant = instant
         self._status: int | None = None
         (orders, self._orders), (self._answers, answers) = os.pipe(), os.pipe()
@@ -116,8 +119,8 @@ class MortalRecorder:
         os.close(answers)
 
     def step(self) -> bool:
-        """Let it drain and write. Returns whether it lives."""
-        with suppress(BrokenPipeError):  # It was killed before it read the order.
+        """Order the recorder to drain and write. Returns whether the recorder is alive afterwards."""
+        with suppress(BrokenPipeError):  # The recorder was killed before it read the order.
             os.write(self._orders, b".")
         if os.read(self._answers, 1):
             return True
@@ -125,7 +128,7 @@ class MortalRecorder:
         return False
 
     def end(self) -> bool:
-        """Let it finish its file. Returns False if it was killed."""
+        """Order the recorder to finish its file. Returns False if it was killed."""
         os.close(self._orders)
         os.close(self._answers)
         if self._status is None:
@@ -134,62 +137,64 @@ class MortalRecorder:
         return self._status == 0
 
     def _record(self, session: Session, orders: int, answers: int) -> None:
+        """Drain and write at each order until the pipe `orders` is closed, then finish the file."""
         store, pwrite, rename = SharedBlock.store, os.pwrite, os.rename
 
         def mortal_store(block: SharedBlock, word: Word, value: int) -> None:
-            self._live_on()
+            self._count_instant()
             store(block, word, value)
 
         def mortal_pwrite(fd: int, data: bytes, offset: int) -> int:
             half = len(data) // 2
             pwrite(fd, data[:half], offset)
-            self._live_on()
+            self._count_instant()
             return half + pwrite(fd, data[half:], offset + half)
 
         def mortal_rename(old: Path, new: Path) -> None:
-            self._live_on()
+            self._count_instant()
             rename(old, new)
 
         SharedBlock.store, os.pwrite, os.rename = mortal_store, mortal_pwrite, mortal_rename
         while os.read(orders, 1):
-            step(session)
+            drain_and_write(session)
             os.write(answers, b".")
         session.finish("finished")
 
-    def _live_on(self) -> None:
+    def _count_instant(self) -> None:
+        """Count one instant, and kill this process at its last one."""
         self._instant -= 1
         if self._instant < 0:
             os.kill(os.getpid(), signal.SIGKILL)
 
 
-def record_with_replacement(run: Run, instant: int) -> bool:
-    """Record a run whose first recorder is killed at `instant`. Returns False if it ended before that."""
+def record_with_replacement(run: HandMadeRun, instant: int) -> bool:
+    """Record a run whose first recorder is killed at `instant`. Returns False if that recorder ended earlier."""
     first, second = MortalRecorder(run, instant), None
     while run.advance():
         if second is None and not first.step():
             second = run.session()
         if second is not None:
-            step(second)
+            drain_and_write(second)
     if first.end():
         return False
     second = second or run.session()
-    step(second)
+    drain_and_write(second)
     second.finish("finished")
     return True
 
 
 def test_no_data_is_lost_or_written_twice_whenever_a_recorder_is_killed(tmp_path: Path):
-    """Ticks, events and snapshots equal those of a recorder that lives."""
-    alone = Run(tmp_path / "alone")
-    recorder = alone.session()
-    while alone.advance():
-        step(recorder)
+    """Ticks, events and snapshots equal the recording of a recorder that is not killed."""
+    undisturbed = HandMadeRun(tmp_path / "alone")
+    recorder = undisturbed.session()
+    while undisturbed.advance():
+        drain_and_write(recorder)
     recorder.finish("finished")
-    expected, faults = alone.contents(), {}
+    expected, faults = undisturbed.contents(), {}
     assert (expected.ticks, expected.problems) == (list(range(TICKS)), [])
     assert (len(expected.events), len(expected.snapshots)) == (2 * TICKS // COMMAND_TICKS, -(-TICKS // SNAPSHOT_TICKS))
     for instant in count():
-        run = Run(tmp_path / str(instant))
+        run = HandMadeRun(tmp_path / str(instant))
         if not record_with_replacement(run, instant):
             break
         if differences := run.contents().differences(expected):
@@ -197,11 +202,11 @@ def test_no_data_is_lost_or_written_twice_whenever_a_recorder_is_killed(tmp_path
         if any(tick % SNAPSHOT_TICKS for tick in run.first_ticks()):
             faults[instant] = ["a file that does not begin at a snapshot"]
     assert faults == {}
-    assert instant > LEAST_INSTANTS
+    assert instant > MIN_INSTANTS
 
 
 def begin_run(folder: Path, killed: int = KILLED) -> tuple[RecordedRun, Path]:
-    """Record a run up to tick `killed`. Returns it with a copy of the unfinished file."""
+    """Record a run up to tick `killed`. Returns the run and a copy of its unfinished file."""
     run = RecordedRun(folder / "run.mcap")
     run.run_to(killed)
     run.session._write_all()
@@ -209,7 +214,7 @@ def begin_run(folder: Path, killed: int = KILLED) -> tuple[RecordedRun, Path]:
 
 
 def test_a_snapshot_in_two_files_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """An earlier version wrote it twice, if its recorder had died before it stored its progress."""
+    """An earlier version wrote a snapshot twice, if its recorder died before it stored its progress."""
     monkeypatch.setattr(session, "snapshot_before", lambda *_: None)  # A replacement of that version began there.
     run, _ = begin_run(tmp_path, 12_000)
     run.session._write_all()  # This time there is no data behind the announced byte.
@@ -224,21 +229,21 @@ def test_a_snapshot_in_two_files_is_reported(tmp_path: Path, monkeypatch: pytest
 
 
 class RunFiles(NamedTuple):
-    """Files of one run: the unfinished one of a killed recorder, its replacement's, and one of the whole run."""
+    """Files of one run: unfinished by a killed recorder, written by its replacement, and of a run without a kill."""
 
     first: Path
     second: Path
-    whole: Path
+    complete: Path
 
     def recovered(self, folder: Path, cut_bytes: int = 0) -> Path:
-        """Recover the first file, without its last `cut_bytes`."""
+        """Recover a copy of the first file without its last `cut_bytes` bytes. Returns the path."""
         part = folder / "first.mcap.part"
         part.write_bytes(self.first.read_bytes()[: -cut_bytes or None])
         return Path(recover(part)["output"])
 
 
 def record_two_files(folder: Path, *, killed: int = KILLED, missed: int = 100) -> RunFiles:
-    """Kill a recorder at a tick and replace it `missed` ticks later."""
+    """Record a run whose recorder dies at tick `killed` and is replaced `missed` ticks later. Returns the files."""
     run, first = begin_run(folder, killed)
     run.loop.run(missed)
     run.begin(sequence=2)
@@ -254,7 +259,7 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> RunFiles:
     return record_two_files(folder)
 
 
-def check_second_file(second: Path, snapshot: int) -> None:
+def require_second_file(second: Path, snapshot: int) -> None:
     """Require that a replacement's file begins with a snapshot and replays from there."""
     recording, summary = load(second), summarise(second)
     assert recording["tick"].tolist() == list(range(snapshot, END))
@@ -265,30 +270,30 @@ def check_second_file(second: Path, snapshot: int) -> None:
 
 
 def test_the_file_of_a_replacement_replays_alone_from_its_first_tick(files: RunFiles):
-    """It holds the commands between its first snapshot and the death of the other recorder."""
-    check_second_file(files.second, SNAPSHOT)
+    """The file holds the commands between its first snapshot and the death of the first recorder."""
+    require_second_file(files.second, SNAPSHOT)
 
 
 def test_a_replacement_at_a_snapshot_repeats_only_the_snapshot(tmp_path: Path):
     files = record_two_files(tmp_path, killed=2 * SNAPSHOT)
-    check_second_file(files.second, 2 * SNAPSHOT)
+    require_second_file(files.second, 2 * SNAPSHOT)
     assert replay(load([files.recovered(tmp_path), files.second])).identical
 
 
 @pytest.mark.parametrize("recovered", [True, False])
 def test_both_files_of_a_replaced_recorder_hold_all_data_once(files: RunFiles, tmp_path: Path, recovered: bool):
     paths = [files.recovered(tmp_path) if recovered else files.first, files.second]
-    assert contents(paths)[:3] == contents([files.whole])[:3]
+    assert read_contents(paths)[:3] == read_contents([files.complete])[:3]
     report, summary = replay(load(paths)), summarise(paths)
     assert (report.first_difference, report.ticks, report.gaps, report.not_verified) == (None, END, [], [])
     assert (summary.ticks_logged, summary.ticks_lost, summary.complete) == (END, 0, recovered)
-    assert summary.commands == summarise(files.whole).commands
+    assert summary.commands == summarise(files.complete).commands
 
 
 def test_a_cut_across_a_replacement_holds_all_data_once(files: RunFiles, tmp_path: Path):
     output = tmp_path / "cut.mcap"
     cut([files.recovered(tmp_path), files.second], 12_000, 21_000, output)
-    copied, expected = contents([output]), contents([files.whole])
+    copied, expected = read_contents([output]), read_contents([files.complete])
     assert copied.ticks == list(range(SNAPSHOT, 21_000))
     assert copied.events == [event for event in expected.events if SNAPSHOT <= event["tick"] < 21_000]
     assert copied.snapshots == [snapshot for snapshot in expected.snapshots if SNAPSHOT <= snapshot.tick < 21_000]
@@ -323,7 +328,7 @@ def test_replacements_that_die_before_they_repeated_all_ticks_leave_each_tick_on
     run.end(END)
     paths = [Path(recover(part)["output"]) for part in (first, second)] + [tmp_path / "run-0003.mcap"]
     assert 0 < len(load(paths[1])) < KILLED - SNAPSHOT
-    assert contents(paths) == contents([files.whole])
+    assert read_contents(paths) == read_contents([files.complete])
     assert [replay(load(part)).identical for part in (paths, paths[2])] == [True, True]
 
 
@@ -335,4 +340,4 @@ def test_events_that_a_dead_recorder_wrote_before_their_ticks_are_recorded_once(
     first = run.copy_part("first.mcap.part")
     run.begin(sequence=2)
     run.end(END)
-    assert contents([first, tmp_path / "run-0002.mcap"])[:3] == contents([files.whole])[:3]
+    assert read_contents([first, tmp_path / "run-0002.mcap"])[:3] == read_contents([files.complete])[:3]

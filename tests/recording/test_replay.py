@@ -22,18 +22,19 @@ ROTATED_TICKS = 45_000
 
 @pytest.fixture(scope="module")
 def parts(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
-    """The eventful run, rotated."""
+    """Files of the eventful run of ROTATED_TICKS ticks, one second each."""
     return record(tmp_path_factory.mktemp("parts") / "run.mcap", scheduled(), ROTATED_TICKS, rotate_s=1.0)
 
 
-def replayed(paths: Path | list[Path]) -> ReplayReport:
+def replay_without_difference(paths: Path | list[Path]) -> ReplayReport:
+    """Replay files and require that no value differs. Returns the report."""
     report = replay(load(paths))
     assert report.first_difference is None
     return report
 
 
 def test_saturation_trips_and_changes_of_mode_replay(eventful: Path):
-    report, recording = replayed(eventful), load(eventful)
+    report, recording = replay_without_difference(eventful), load(eventful)
     assert (report.ticks, report.unverified, report.gaps, report.snapshots) == (EVENTFUL_TICKS, 0, [], 2)
     flags = int(np.bitwise_or.reduce(recording["flags"].astype(int)))
     for flag in (Flag.COMMAND_LIMITED, Flag.SLEW_LIMITED, Flag.RAMPING, Flag.TRIP_POSITION):
@@ -45,23 +46,23 @@ def test_saturation_trips_and_changes_of_mode_replay(eventful: Path):
 @pytest.mark.parametrize(("text", "axes"), [(TWO_AXES, 2), (eight_axes(), 8)], ids=["two axes", "eight axes"])
 def test_several_axes_replay(text: str, axes: int, tmp_path: Path):
     path = record(tmp_path / "run.mcap", text, 12_000)[0]
-    report = replayed(path)
+    report = replay_without_difference(path)
     assert (len(load(path).header["axes"]), report.ticks, report.snapshots) == (axes, 12_000, 1)
 
 
 def test_the_files_of_a_rotated_recording_replay_together_and_alone(parts: list[Path]):
     assert len(parts) == 5
-    report = replayed([parts[i] for i in (3, 0, 4, 2, 1)])
+    report = replay_without_difference([parts[i] for i in (3, 0, 4, 2, 1)])
     assert (report.ticks, report.gaps, report.problems) == (ROTATED_TICKS, [], [])
     assert replay(load(str(parts[0].parent / "run-*.mcap"))).ticks == ROTATED_TICKS
-    assert [replayed(part).ticks for part in parts] == [10_000] * 4 + [5_000]
+    assert [replay_without_difference(part).ticks for part in parts] == [10_000] * 4 + [5_000]
 
 
 @pytest.mark.parametrize(("number", "gaps"), [(0, []), (1, [{"first_tick": 10_000, "count": 10_000}])])
 def test_a_rotated_recording_replays_without_one_of_its_files(
     parts: list[Path], number: int, gaps: list[dict[str, int]]
 ):
-    report = replayed([part for part in parts if part != parts[number]])
+    report = replay_without_difference([part for part in parts if part != parts[number]])
     assert (report.ticks, report.gaps) == (35_000, gaps)
     assert report.problems == [f"file {number + 1} of the run is missing"]
 
@@ -71,7 +72,7 @@ def test_a_recovered_file_replays(eventful: Path, tmp_path: Path):
     part.write_bytes(eventful.read_bytes()[: eventful.stat().st_size * 2 // 3])
     report = recover(part)
     assert 10_000 < report["ticks"] < EVENTFUL_TICKS
-    assert replayed(Path(report["output"])).ticks == report["ticks"]
+    assert replay_without_difference(Path(report["output"])).ticks == report["ticks"]
 
 
 def test_the_replay_continues_after_a_gap_at_the_next_snapshot(tmp_path: Path):
@@ -89,7 +90,7 @@ def test_the_replay_continues_after_a_gap_at_the_next_snapshot(tmp_path: Path):
         loop.end()
         lost = recorder.result()[1]["ticks_lost"]
     assert lost > 20_000
-    report = replayed(tmp_path / "run.mcap")
+    report = replay_without_difference(tmp_path / "run.mcap")
     assert (report.gaps, report.snapshots > 4) == ([{"first_tick": 13_500, "count": lost}], True)
     assert 0 < report.unverified < 10_000
     assert report.ticks + report.unverified + lost == 187_700

@@ -28,19 +28,20 @@ def path(tmp_path: Path) -> Path:
 
 
 def difference(path: Path) -> dict[str, Any]:
-    found = replay(load(path)).first_difference
-    assert found is not None
-    return found
+    """Return the first difference of a replay; there must be one."""
+    first = replay(load(path)).first_difference
+    assert first is not None
+    return first
 
 
-def place(path: Path) -> tuple[int, str]:
-    """Tick and signal of the first difference."""
-    found = difference(path)
-    return found["tick"], found["signal"]
+def difference_place(path: Path) -> tuple[int, str]:
+    """Return (tick, signal) of the first difference of a replay."""
+    first = difference(path)
+    return first["tick"], first["signal"]
 
 
 def flip_bit(rows: Rows, tick: int, column: int) -> None:
-    """Flip the lowest bit of one number."""
+    """Flip the lowest bit of a column at a tick, in place."""
     for row in np.flatnonzero(rows[:, 0] == tick):
         rows.view(np.uint64)[row, column] ^= np.uint64(1)
 
@@ -64,17 +65,19 @@ def test_one_bit_of_any_other_signal_is_found_at_its_tick(signal_name: str, even
 
 
 @pytest.mark.parametrize(
-    ("signal_name", "offset", "found"),
+    ("signal_name", "offset", "expected"),
     [("x_feed_um", 0.01, "x_command_um"), ("mode", -1.0, "mode"), ("flags", 16.0, "flags")],
 )
-def test_a_changed_value_is_found_at_its_tick(signal_name: str, offset: float, found: str, eventful: Path, path: Path):
-    """The second column of a table is an input: its effect on the command is found."""
+def test_a_changed_value_is_found_at_its_tick(
+    signal_name: str, offset: float, expected: str, eventful: Path, path: Path
+):
+    """x_feed_um, an input, shows in the command; mode and flags show in themselves."""
     column = load(eventful).columns.index(signal_name)
 
     def change(rows: Rows) -> None:
         rows[rows[:, 0] == 20_111, column] += offset
 
-    assert place(rewrite(eventful, path, rows=change)) == (20_111, found)
+    assert difference_place(rewrite(eventful, path, rows=change)) == (20_111, expected)
 
 
 def change_first_snapshot(source: Path, path: Path, offset: int, value: float) -> Path:
@@ -92,13 +95,13 @@ def test_one_unit_in_the_last_place_of_a_coefficient_is_found(eventful: Path, pa
     assert struct.unpack_from("<d", next(iter(load(eventful).snapshots())).data, offset) == (10.0,)
     volts = load(eventful)["x_adc_v"]
     expected = int(np.flatnonzero(volts * changed != volts * 10.0)[0])
-    assert place(change_first_snapshot(eventful, path, offset, changed)) == (expected, "x_position_um")
+    assert difference_place(change_first_snapshot(eventful, path, offset, changed)) == (expected, "x_position_um")
 
 
 def test_a_coefficient_without_an_effect_is_found_at_the_next_snapshot(eventful: Path, path: Path):
     offset = 8 + COEFFICIENTS.fields["sample_age_limit_us"][1]  # type: ignore[index]
-    found = difference(change_first_snapshot(eventful, path, offset, 123.0))
-    assert (found["tick"], found["signal"], found["replayed"]) == (10_000, "law.x.sample_age_limit_us", 123.0)
+    first = difference(change_first_snapshot(eventful, path, offset, 123.0))
+    assert (first["tick"], first["signal"], first["replayed"]) == (10_000, "law.x.sample_age_limit_us", 123.0)
 
 
 @pytest.mark.parametrize(("shift", "found_at"), [(1, 5_000), (-1, 4_999)])
@@ -107,7 +110,7 @@ def test_a_command_shifted_by_one_tick_is_found_at_the_right_one(shift: int, fou
         if event["kind"] == "set_mode" and event["tick"] == 5_000:
             event["tick"] += shift
 
-    assert place(rewrite(eventful, path, event=move)) == (found_at, "mode")
+    assert difference_place(rewrite(eventful, path, event=move)) == (found_at, "mode")
 
 
 def test_a_rewritten_recording_without_a_change_is_identical(eventful: Path, path: Path):
@@ -151,14 +154,15 @@ def test_a_different_state_of_the_loop_is_named(field: str):
     assert recorded != replayed
 
 
-@pytest.mark.parametrize(("ticks", "judged"), [(50, False), (51, True)])
-def test_a_rate_is_judged_from_fifty_periods_on(ticks: int, judged: bool):
-    """The first ticks of a run may be late by some periods' time."""
+@pytest.mark.parametrize(("ticks", "is_judged"), [(50, False), (51, True)])
+def test_a_rate_is_judged_from_fifty_periods_on(ticks: int, is_judged: bool):
+    """The first ticks of a run may be late by the time of some periods."""
     rows = np.zeros((ticks, PERIODS_MISSED + 1))
     rows[:, DEADLINE] = 200_000 * np.arange(ticks)
-    found: list[Any] = []
+    differences: list[Any] = []
     self = SimpleNamespace(
-        _recording=SimpleNamespace(header={"rate_hz": 10_000.0}), _record_difference=lambda *told: found.append(told)
+        _recording=SimpleNamespace(header={"rate_hz": 10_000.0}),
+        _record_difference=lambda *details: differences.append(details),
     )
     Replay._compare_rate(self, rows)  # type: ignore[arg-type]
-    assert [(signal, recorded) for _, signal, recorded, _ in found] == [("rate_hz", 10_000.0)] * judged
+    assert [(signal, recorded) for _, signal, recorded, _ in differences] == [("rate_hz", 10_000.0)] * is_judged

@@ -1,4 +1,4 @@
-"""The compiled passes of a replay against numpy: which value differs first, and what the tape of inputs holds."""
+"""The compiled passes of a replay against numpy: the first value that differs, and the tape of inputs."""
 
 from __future__ import annotations
 
@@ -15,14 +15,15 @@ COLUMNS = 21
 NUMBERS = np.array([0.0, -0.0, 1.0, -1.0, np.nan, -np.nan, np.inf, 5e-324, 1e300])
 
 
-def rows_of(random: np.random.Generator, count: int) -> np.ndarray:
+def random_rows(random: np.random.Generator, count: int) -> np.ndarray:
+    """Return rows (count, COLUMNS) of NUMBERS, with whole numbers as flags."""
     rows = random.choice(NUMBERS, (count, COLUMNS))
     rows[:, FLAGS] = random.integers(0, 2**20, count)
     return rows
 
 
-def differs(recorded: np.ndarray, replayed: np.ndarray) -> np.ndarray:
-    """Which values differ, by numpy; flags as whole numbers without the bit OVERRUN."""
+def expected_differences(recorded: np.ndarray, replayed: np.ndarray) -> np.ndarray:
+    """Return (rows, columns) of bool: the values that differ; flags as whole numbers without the bit OVERRUN."""
     unequal = recorded.view(np.uint64) != replayed.view(np.uint64)
     unequal[:, MEASURED] = False
     masks = [rows[:, FLAGS].astype(np.int64) & ~int(Flag.OVERRUN) for rows in (recorded, replayed)]
@@ -36,20 +37,20 @@ def differs(recorded: np.ndarray, replayed: np.ndarray) -> np.ndarray:
 def test_the_first_value_that_differs_is_found(seed: int, order: Any) -> None:
     random = np.random.default_rng(seed)
     count = int(random.integers(1, 60))
-    recorded = rows_of(random, count)
-    replayed = np.vstack([recorded, rows_of(random, 2)])
+    recorded = random_rows(random, count)
+    replayed = np.vstack([recorded, random_rows(random, 2)])
     replayed[:count, MEASURED] = 7.0
     replayed[:count, FLAGS] = (recorded[:, FLAGS].astype(np.int64) ^ random.choice([0, int(Flag.OVERRUN)], count)) * 1.0
     for _ in range(int(random.integers(0, 4))):
         row, column = random.integers(0, count), random.integers(0, COLUMNS)
         replayed[row, column] = random.choice(NUMBERS) if column != FLAGS else replayed[row, column] + 2.0
-    expected = differs(recorded, replayed[:count])
-    found = first_unequal(np.array(recorded, order=order), replayed)
+    expected = expected_differences(recorded, replayed[:count])
+    difference = first_unequal(np.array(recorded, order=order), replayed)
     if not expected.any():
-        assert found is None
+        assert difference is None
         return
     row = int(np.argmax(expected.any(axis=1)))
-    assert found == (row, int(np.argmax(expected[row])))
+    assert difference == (row, int(np.argmax(expected[row])))
 
 
 @pytest.mark.parametrize("number", [-0.0, 0.5])
@@ -62,9 +63,9 @@ def test_recorded_flags_that_are_no_number_of_flags_differ(number: float) -> Non
 def test_arrays_that_do_not_fit_are_refused() -> None:
     rows = np.zeros((3, COLUMNS))
     assert first_unequal(rows[:0], rows[:0]) is None
-    for other in (rows[:2], rows[:, :5]):
+    for misfit in (rows[:2], rows[:, :5]):
         with pytest.raises(ValueError, match="at least 3 rows of 21 values"):
-            first_unequal(rows, other)
+            first_unequal(rows, misfit)
     with pytest.raises(ValueError, match="allowed: float64, steps of 0, 8, 16, … bytes"):
         first_unequal(rows, rows.astype(np.float32))  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="allowed: float64, steps of 0, 8, 16, … bytes"):

@@ -1,4 +1,4 @@
-"""A replay in spans, a process each, says what a replay in one piece says: of good recordings and of every bad one."""
+"""A replay in spans, one process each, gives the report of a replay in one process, for good and bad recordings."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ from rtloop.recording.replay.laws import NO_TRUST, recorded_laws
 from rtloop.recording.replay.replay import replay
 from tests.asked import answer
 from tests.laws.test_shipped import DEPLOY
-from tests.recording.forging import TICKS, Base, pack_file, take_apart, with_snapshot
+from tests.recording.forging import TICKS, Base, pack_changed_snapshot, pack_file, take_apart
 from tests.recording.real_loop import record, scheduled
 from tests.recording.tamper import flip_byte
-from tests.recording.test_verdict import pack_with_gap, tick_chunks, with_ticks, without, without_snapshots
+from tests.recording.test_verdict import change_ticks, drop_chunks, drop_snapshots, pack_with_gap, tick_chunks
 
 
 @pytest.fixture(autouse=True)
-def short_spans(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A chunk is enough for a span: the recordings here have six."""
+def shorten_spans(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Allow spans of one chunk: the recordings of this file have six chunks."""
     monkeypatch.setattr(spans, "LEAST_CHUNKS", 1)
 
 
@@ -34,13 +34,13 @@ def path(tmp_path: Path) -> Path:
 
 
 def reports(path: Path) -> list[dict[str, Any]]:
-    """The answers in one piece, and with two and five processes."""
+    """Return the reports of a replay with one, two and five processes."""
     return [replay(load(path)).as_dict(), *(spans.replay_on_cores(load(path), jobs=n).as_dict() for n in (2, 5))]
 
 
-def in_spans(path: Path, jobs: int) -> dict[str, Any] | None:
-    """The answer of spans alone; None where they leave it to one piece."""
-    recording = load(path)
+def span_report(paths: Path | list[Path], jobs: int) -> dict[str, Any] | None:
+    """Return the report of a replay in spans alone; None if the spans leave the replay to one process."""
+    recording = load(paths)
     report = spans._replay_in_spans(recording, recorded_laws(recording, NO_TRUST), jobs, None)
     return report and report.as_dict()
 
@@ -48,7 +48,7 @@ def in_spans(path: Path, jobs: int) -> dict[str, Any] | None:
 @pytest.mark.parametrize("jobs", [2, 3, 4, 6])
 def test_a_good_recording_is_identical_in_spans(jobs: int, base: Base, path: Path):
     path.write_bytes(pack_file(base))
-    report = in_spans(path, jobs)
+    report = span_report(path, jobs)
     assert report == replay(load(path)).as_dict()
     assert (report["identical"], report["ticks"], report["snapshots_compared"]) == (True, TICKS, 4)
 
@@ -58,7 +58,7 @@ def test_a_run_of_whole_seconds_is_replayed_in_spans(tmp_path: Path):
     path = Path(answer("run", DEPLOY / "paper.toml", "--duration", "3", "--unpaced", "--out", tmp_path)["recording"])
     with closing(load(path).snapshots()) as snapshots:
         assert [snapshot.tick for snapshot in snapshots] == [0, 10_000, 20_000, 30_000]
-    report = in_spans(path, 3)
+    report = span_report(path, 3)
     assert report == replay(load(path)).as_dict()
     assert (report["identical"], report["ticks"], report["snapshots_compared"]) == (True, 30_000, 2)
 
@@ -67,12 +67,6 @@ def test_a_run_of_whole_seconds_is_replayed_in_spans(tmp_path: Path):
 def rotated(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
     """Four files of one run, each of which begins at a snapshot."""
     return record(tmp_path_factory.mktemp("rotated") / "run.mcap", scheduled(), 35_000, rotate_s=1.0)
-
-
-def span_report(paths: list[Path], jobs: int) -> dict[str, Any] | None:
-    recording = load(paths)
-    report = spans._replay_in_spans(recording, recorded_laws(recording, NO_TRUST), jobs, None)
-    return report and report.as_dict()
 
 
 @pytest.mark.parametrize("jobs", [2, 3, 7])
@@ -92,15 +86,15 @@ def test_a_rotated_run_without_a_file_gets_the_answer_of_one_piece(missing: int,
 
 def test_a_changed_output_is_found_in_any_file_of_a_rotated_run(rotated: list[Path], tmp_path: Path):
     for number, path in enumerate(rotated):
-        copies = [tmp_path / other.name for other in rotated]
+        copies = [tmp_path / source_path.name for source_path in rotated]
         for source, copy in zip(rotated, copies, strict=True):
             copy.write_bytes(source.read_bytes())
         base = take_apart(path)
 
-        def forged(records: np.ndarray) -> None:
+        def change_drive(records: np.ndarray) -> None:
             records["x_drive_v"][records["tick"] % 10_000 == 4_321] += 1e-9
 
-        copies[number].write_bytes(pack_file(with_ticks(base, forged)))
+        copies[number].write_bytes(pack_file(change_ticks(base, change_drive)))
         report = spans.replay_on_cores(load(copies), jobs=3).as_dict()
         assert report == replay(load(copies)).as_dict()
         assert report["first_difference"]["tick"] == 10_000 * number + 4_321
@@ -108,73 +102,75 @@ def test_a_changed_output_is_found_in_any_file_of_a_rotated_run(rotated: list[Pa
 
 @pytest.mark.parametrize("which", [3, 4])
 def test_a_snapshot_after_the_end_is_left_to_one_piece(which: int, base: Base, path: Path):
-    path.write_bytes(with_snapshot(base, "tick", 4_000, which))
-    first, *others = reports(path)
-    assert not first["identical"]
-    assert all(other == first for other in others)
+    path.write_bytes(pack_changed_snapshot(base, "tick", 4_000, which))
+    single, *in_spans = reports(path)
+    assert not single["identical"]
+    assert all(report == single for report in in_spans)
 
 
 def test_spans_begin_at_snapshots_and_cover_every_tick(base: Base, path: Path):
     """Snapshots: of ticks 0, 150, 200 (another law), 350 and 500; six chunks of a hundred ticks."""
     path.write_bytes(pack_file(base))
-    found = spans._find_spans(load(path), 3, [0, 150, 200, 350, 500])
-    assert [(span.first_tick, span.last_tick) for span in found] == [(0, 200), (200, 500), (500, None)]
-    assert [span.chunk for span in found] == [0, 2, 4]
+    found_spans = spans._find_spans(load(path), 3, [0, 150, 200, 350, 500])
+    assert [(span.first_tick, span.last_tick) for span in found_spans] == [(0, 200), (200, 500), (500, None)]
+    assert [span.chunk for span in found_spans] == [0, 2, 4]
 
 
 def test_a_short_recording_is_replayed_in_one_piece(base: Base, path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(spans, "LEAST_CHUNKS", 8)
     path.write_bytes(pack_file(base))
     assert spans._find_spans(load(path), 8, [0, 150, 200, 350, 500]) == []
-    assert in_spans(path, 8) is None
-    first, *others = reports(path)
-    assert all(other == first for other in others)
+    assert span_report(path, 8) is None
+    single, *in_spans = reports(path)
+    assert all(report == single for report in in_spans)
 
 
 @pytest.mark.parametrize("tick", [0, 199, 200, 350, 599])
 def test_a_changed_output_is_found_at_its_tick_in_any_span(tick: int, base: Base, path: Path):
-    def forged(records: np.ndarray) -> None:
+    def change_drive(records: np.ndarray) -> None:
         records["x_drive_v"][records["tick"] == tick] += 1e-9
 
-    path.write_bytes(pack_file(with_ticks(base, forged)))
-    first, *others = reports(path)
-    assert first["first_difference"]["tick"] == tick
-    assert all(other == first for other in others)
-    assert in_spans(path, 3) is None
+    path.write_bytes(pack_file(change_ticks(base, change_drive)))
+    single, *in_spans = reports(path)
+    assert single["first_difference"]["tick"] == tick
+    assert all(report == single for report in in_spans)
+    assert span_report(path, 3) is None
 
 
 @pytest.mark.parametrize("which", [1, 2, 3, 4])
 def test_a_changed_state_is_found_in_any_snapshot(which: int, base: Base, path: Path):
-    path.write_bytes(with_snapshot(base, "x.applied_command_um", 1e-3, which))
-    first, *others = reports(path)
-    assert not first["identical"]
-    assert all(other == first for other in others)
+    path.write_bytes(pack_changed_snapshot(base, "x.applied_command_um", 1e-3, which))
+    single, *in_spans = reports(path)
+    assert not single["identical"]
+    assert all(report == single for report in in_spans)
 
 
 def test_incomplete_and_damaged_recordings_get_the_answer_of_one_piece(base: Base, path: Path):
     chunks = tick_chunks(base)
     for data in (
-        pack_file(without(base, chunks[3])),
-        pack_file(without(base, len(base.chunks) - 1)),
-        pack_file(without_snapshots(base, {0})),
-        pack_file(without_snapshots(base, {2})),
+        pack_file(drop_chunks(base, chunks[3])),
+        pack_file(drop_chunks(base, len(base.chunks) - 1)),
+        pack_file(drop_snapshots(base, {0})),
+        pack_file(drop_snapshots(base, {2})),
         pack_with_gap(base, (3, 4), {"first_tick": 300, "count": 200}),
     ):
         path.write_bytes(data)
-        first, *others = reports(path)
-        assert all(other == first for other in others)
+        single, *in_spans = reports(path)
+        assert all(report == single for report in in_spans)
     path.write_bytes(pack_file(base))
     flip_byte(path, path.stat().st_size // 2)
-    first, *others = reports(path)
-    assert not first["identical"]
-    assert all(other == first for other in others)
+    single, *in_spans = reports(path)
+    assert not single["identical"]
+    assert all(report == single for report in in_spans)
 
 
 def test_a_process_that_dies_costs_time_and_no_answer(base: Base, path: Path, monkeypatch: pytest.MonkeyPatch):
     path.write_bytes(pack_file(base))
-    parent, real = os.getpid(), spans._replay_span
-    monkeypatch.setattr(spans, "_replay_span", lambda *told: real(*told) if os.getpid() == parent else os._exit(9))
-    assert in_spans(path, 3) is None
+    parent, replay_span = os.getpid(), spans._replay_span
+    monkeypatch.setattr(
+        spans, "_replay_span", lambda *arguments: replay_span(*arguments) if os.getpid() == parent else os._exit(9)
+    )
+    assert span_report(path, 3) is None
     assert spans.replay_on_cores(load(path), jobs=3).identical
 
 

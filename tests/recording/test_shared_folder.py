@@ -41,18 +41,18 @@ from tests.users import ATTACKER, ROOT_ONLY, VICTIM, Raised, as_user
 
 GROUP = 54323
 PRECIOUS = b"the only copy"
-PATIENCE_S = 20
+TIMEOUT_S = 20
 
 
 @pytest.fixture(autouse=True)
-def patience() -> Iterator[None]:
+def fail_after_timeout() -> Iterator[None]:
     """Turn an open that never returns into a failure."""
 
     def give_up(*_: object) -> None:
-        raise AssertionError(f"still waiting after {PATIENCE_S} s")
+        raise AssertionError(f"still waiting after {TIMEOUT_S} s")
 
     previous = signal.signal(signal.SIGALRM, give_up)
-    signal.alarm(PATIENCE_S)
+    signal.alarm(TIMEOUT_S)
     yield
     signal.alarm(0)
     signal.signal(signal.SIGALRM, previous)
@@ -60,7 +60,7 @@ def patience() -> Iterator[None]:
 
 @pytest.fixture
 def shared() -> Iterator[Path]:
-    """A folder of mode 2775, in which all members of a group may write."""
+    """A folder of mode 2775, in which all members of GROUP may write."""
     parent = Path(tempfile.mkdtemp())
     parent.chmod(0o755)
     yield make_group_folder(parent / "shared")
@@ -68,6 +68,7 @@ def shared() -> Iterator[Path]:
 
 
 def make_group_folder(folder: Path) -> Path:
+    """Make a folder in which all members of GROUP may write. Returns its path."""
     folder.mkdir()
     os.chown(folder, 0, GROUP)
     folder.chmod(0o2775)
@@ -84,8 +85,8 @@ def precious(shared: Path) -> Path:
     return path
 
 
-def member(uid: int, function: Callable[..., Any], *arguments: Any) -> Any:
-    """Call a function in a process of a member of the group, with the usual umask. Returns its result."""
+def call_as_member(uid: int, function: Callable[..., Any], *arguments: Any) -> Any:
+    """Call a function in a process of a member of the group, with umask 002. Returns its result."""
 
     def as_member() -> Any:
         os.umask(0o002)
@@ -95,22 +96,24 @@ def member(uid: int, function: Callable[..., Any], *arguments: Any) -> Any:
 
 
 def write_short(path: Path) -> str:
+    """Write a recording of 1,000 ticks. Returns its path."""
     return str(write_recording(path, make_rows(1_000)))
 
 
-def begin(path: Path) -> Writer:
-    """Begin a recording of 1,000 ticks."""
+def begin_recording(path: Path) -> Writer:
+    """Begin a recording and write 1,000 ticks. Returns its writer."""
     writer = Writer(path, make_header(), START_UNIX_NS)
     writer.write_ticks(make_rows(1_000))
     return writer
 
 
 def leave_unfinished(path: Path) -> None:
-    """Leave the file of a recorder that died."""
-    begin(path).close()
+    """Write an unfinished file, as a recorder that died leaves it."""
+    begin_recording(path).close()
 
 
 def import_scan(folder: Path) -> Any:
+    """Import a table of two columns as `scan.mcap`."""
     table = Table({"time": np.arange(100) * 1e-3, "drive": np.arange(100.0)}, {"time": "s", "drive": "V"}, "time")
     return import_data(folder / "scan.csv", ColumnSelection(all=True), table=table)
 
@@ -137,16 +140,17 @@ WRITERS: dict[str, Callable[[Path], Any]] = {
 
 @pytest.fixture(scope="module")
 def old(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A recording of 1,000 ticks, which the writers read."""
     return write_recording(tmp_path_factory.mktemp("old") / "old.mcap", make_rows(1_000))
 
 
-def outcomes(shared: Path, old: Path, lay: Callable[[Path], None]) -> dict[str, int]:
-    """Exit code of each writer after `lay` has put a file in its place; 0 for a writer that wrote."""
+def writer_exit_codes(shared: Path, old: Path, place_file: Callable[[Path], None]) -> dict[str, int]:
+    """Run each writer after `place_file` has put a file in its place. Returns exit codes by name; 0: it wrote."""
     for name in WRITERS:
         folder = make_group_folder(shared / name.replace(".", "_"))
         shutil.copy(old, folder / "old.mcap")
         (folder / "scan.csv").touch()
-        lay(folder / name)
+        place_file(folder / name)
 
     def write_all() -> dict[str, int]:
         codes = {}
@@ -161,40 +165,40 @@ def outcomes(shared: Path, old: Path, lay: Callable[[Path], None]) -> dict[str, 
                     raise
         return codes
 
-    return member(VICTIM, write_all)
+    return call_as_member(VICTIM, write_all)
 
 
-def as_attacker(lay: Callable[[Path], Any]) -> Callable[[Path], None]:
-    """Return `lay` with a change of the owner to the attacker."""
+def as_attacker(place_file: Callable[[Path], Any]) -> Callable[[Path], None]:
+    """Return a function that calls `place_file` and gives the file to the attacker."""
 
-    def lay_as_attacker(path: Path) -> None:
-        lay(path)
+    def place_as_attacker(path: Path) -> None:
+        place_file(path)
         os.chown(path, ATTACKER, GROUP, follow_symlinks=False)
 
-    return lay_as_attacker
+    return place_as_attacker
 
 
 @ROOT_ONLY
 @pytest.mark.parametrize("target", ["precious", "new"])
 def test_no_file_is_written_through_a_link_of_another_user(shared: Path, old: Path, precious: Path, target: str):
-    lay = as_attacker(lambda path: path.symlink_to(precious.with_name(target)))
-    assert outcomes(shared, old, lay) == dict.fromkeys(WRITERS, OutputError.exit_code)
+    place_file = as_attacker(lambda path: path.symlink_to(precious.with_name(target)))
+    assert writer_exit_codes(shared, old, place_file) == dict.fromkeys(WRITERS, OutputError.exit_code)
     assert (precious.read_bytes(), precious.with_name("new").exists()) == (PRECIOUS, False)
 
 
 @ROOT_ONLY
 def test_a_file_of_another_user_is_not_overwritten(shared: Path, old: Path):
-    def lay(path: Path) -> None:
+    def place_file(path: Path) -> None:
         path.write_bytes(b"theirs")
         path.chmod(0o666)
 
-    assert outcomes(shared, old, as_attacker(lay)) == dict.fromkeys(WRITERS, OutputError.exit_code)
+    assert writer_exit_codes(shared, old, as_attacker(place_file)) == dict.fromkeys(WRITERS, OutputError.exit_code)
     assert all((shared / name.replace(".", "_") / name).read_bytes() == b"theirs" for name in WRITERS)
 
 
 @ROOT_ONLY
 def test_a_file_with_two_names_keeps_its_content(shared: Path, old: Path, precious: Path):
-    codes = outcomes(shared, old, lambda path: os.link(precious, path))
+    codes = writer_exit_codes(shared, old, lambda path: os.link(precious, path))
     assert precious.read_bytes() == PRECIOUS
     assert {name for name, code in codes.items() if not code} == {
         name for name in WRITERS if name.endswith((".new", ".part"))
@@ -203,11 +207,11 @@ def test_a_file_with_two_names_keeps_its_content(shared: Path, old: Path, precio
 
 @ROOT_ONLY
 def test_a_file_of_the_same_user_is_overwritten(shared: Path, old: Path):
-    def lay(path: Path) -> None:
+    def place_file(path: Path) -> None:
         path.write_bytes(b"ours, and longer than what comes")
         os.chown(path, VICTIM, GROUP)
 
-    codes = outcomes(shared, old, lay)
+    codes = writer_exit_codes(shared, old, place_file)
     overwritten = {
         "old.html",
         "fit.png",
@@ -220,13 +224,13 @@ def test_a_file_of_the_same_user_is_overwritten(shared: Path, old: Path):
 
 @ROOT_ONLY
 def test_no_recording_is_begun_through_a_folder_that_another_user_linked(shared: Path, precious: Path):
-    own = precious.with_name("own")
-    own.mkdir()
-    os.chown(own, VICTIM, VICTIM)
-    member(ATTACKER, lambda: (shared / "recordings").symlink_to(own))
+    private_folder = precious.with_name("own")
+    private_folder.mkdir()
+    os.chown(private_folder, VICTIM, VICTIM)
+    call_as_member(ATTACKER, lambda: (shared / "recordings").symlink_to(private_folder))
     with pytest.raises(Raised) as caught:
-        member(VICTIM, write_short, shared / "recordings" / "run.mcap")
-    assert (caught.value.exit_code, os.listdir(own)) == (OutputError.exit_code, []), caught.value.message
+        call_as_member(VICTIM, write_short, shared / "recordings" / "run.mcap")
+    assert (caught.value.exit_code, os.listdir(private_folder)) == (OutputError.exit_code, []), caught.value.message
     assert f"user {ATTACKER}" in caught.value.message
 
 
@@ -234,22 +238,22 @@ def test_no_recording_is_begun_through_a_folder_that_another_user_linked(shared:
 def test_members_of_a_group_can_use_each_others_recordings(shared: Path):
     first, second = shared / "first.mcap", shared / "second.mcap"
     for path, uid in ((first, VICTIM), (second, ATTACKER)):
-        member(uid, write_short, path)
+        call_as_member(uid, write_short, path)
         status = path.stat()
         assert (status.st_uid, status.st_gid, stat.S_IMODE(status.st_mode)) == (uid, GROUP, 0o644)
-    member(VICTIM, leave_unfinished, shared / "third.mcap")
+    call_as_member(VICTIM, leave_unfinished, shared / "third.mcap")
     for use in (
         lambda: recover(shared / "third.mcap.part"),
         lambda: cut(second, output=shared / "cut.mcap"),
         lambda: export(second, "csv", shared / "mine.csv"),
     ):
-        assert member(VICTIM, use)["ticks"] == 1_000
+        assert call_as_member(VICTIM, use)["ticks"] == 1_000
     status = (shared / "mine.csv").stat()
     assert (status.st_gid, stat.S_IMODE(status.st_mode)) == (GROUP, 0o664)
     for _ in range(2):  # The second file replaces the first.
-        member(VICTIM, lambda: str(write_page(second, shared / "mine.html")))
-        member(VICTIM, lambda: write_output(shared / "design.toml", b"new"))
-    assert member(ATTACKER, lambda: len(load(first))) == 1_000
+        call_as_member(VICTIM, lambda: str(write_page(second, shared / "mine.html")))
+        call_as_member(VICTIM, lambda: write_output(shared / "design.toml", b"new"))
+    assert call_as_member(ATTACKER, lambda: len(load(first))) == 1_000
 
 
 def test_a_pipe_among_unfinished_recordings_does_not_block(tmp_path: Path):
@@ -269,16 +273,16 @@ def test_unfinished_recordings_of_other_users_are_only_recovered_by_name(shared:
     private.mkdir()
     os.chown(private, VICTIM, VICTIM)
     for uid, path in ((VICTIM, private / "secret"), (VICTIM, shared / "own"), (ATTACKER, shared / "theirs")):
-        member(uid, leave_unfinished, path.with_suffix(".mcap"))
-    member(ATTACKER, lambda: (shared / "laid.mcap.part").symlink_to(private / "secret.mcap.part"))
-    assert member(VICTIM, lambda: [path.name for path in find_leftovers(shared)]) == ["own.mcap.part"]
-    assert member(VICTIM, lambda: recover(shared / "theirs.mcap.part")["ticks"]) == 1_000
+        call_as_member(uid, leave_unfinished, path.with_suffix(".mcap"))
+    call_as_member(ATTACKER, lambda: (shared / "laid.mcap.part").symlink_to(private / "secret.mcap.part"))
+    assert call_as_member(VICTIM, lambda: [path.name for path in find_leftovers(shared)]) == ["own.mcap.part"]
+    assert call_as_member(VICTIM, lambda: recover(shared / "theirs.mcap.part")["ticks"]) == 1_000
 
 
 @ROOT_ONLY
 def test_a_recorder_writes_no_file_that_replaces_its_own(shared: Path, precious: Path):
     def record() -> tuple[bool, list[str]]:
-        writer = begin(shared / "run.mcap")
+        writer = begin_recording(shared / "run.mcap")
         writer.part.rename(shared / "away")
         writer.part.symlink_to(precious)
         is_replaced = not writer.file.is_in_place()
@@ -288,7 +292,7 @@ def test_a_recorder_writes_no_file_that_replaces_its_own(shared: Path, precious:
             writer.finish(lambda logged: final_message(logged, logged))
         return is_replaced, sorted(os.listdir(shared))
 
-    assert member(VICTIM, record) == (True, ["away", "run.mcap.part"])
+    assert call_as_member(VICTIM, record) == (True, ["away", "run.mcap.part"])
     assert precious.read_bytes() == PRECIOUS
 
 
@@ -296,12 +300,12 @@ def test_a_recorder_writes_no_file_that_replaces_its_own(shared: Path, precious:
 def test_a_quota_counts_and_removes_no_file_of_another_user(shared: Path):
     names = [f"test-2025010{day}T000000.mcap" for day in range(1, 4)]
     for name in names[1:]:
-        member(VICTIM, write_short, shared / name)
-    member(ATTACKER, lambda: shutil.copyfile(shared / names[1], shared / names[0]) and None)
-    member(ATTACKER, lambda: os.truncate(shared / names[0], 1 << 40))
+        call_as_member(VICTIM, write_short, shared / name)
+    call_as_member(ATTACKER, lambda: shutil.copyfile(shared / names[1], shared / names[0]) and None)
+    call_as_member(ATTACKER, lambda: os.truncate(shared / names[0], 1 << 40))
 
     def removed() -> tuple[list[str], int]:
         quota = Quota(shared, "test", 1 << 30, 0)
         return [removal.file.name for removal in quota.enforce()], quota.total_bytes
 
-    assert member(VICTIM, removed) == ([], sum((shared / name).stat().st_size for name in names[1:]))
+    assert call_as_member(VICTIM, removed) == ([], sum((shared / name).stat().st_size for name in names[1:]))

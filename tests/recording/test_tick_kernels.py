@@ -1,4 +1,4 @@
-"""The checks of a chunk of ticks against whole arrays: bytes that never vary, whole numbers, times that grow."""
+"""The compiled checks of a chunk of ticks against numpy: bytes that never vary, whole numbers, times that grow."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ END_NS = 1 << 40
 
 
 def expected_fault(numbers: np.ndarray, times_ns: np.ndarray) -> tuple[int, int] | None:
-    """The first check that a row fails, by whole arrays."""
+    """Return (check, row) of the first failed check, computed on whole arrays; None if there is no fault."""
     low, high = BOUNDS[:, :1], BOUNDS[:, 1:]
     with np.errstate(invalid="ignore"):
         checks = [*~((numbers >= low) & (numbers <= high) & (numbers % 1.0 == 0.0))]
@@ -26,7 +26,7 @@ def expected_fault(numbers: np.ndarray, times_ns: np.ndarray) -> tuple[int, int]
         starts = times_ns[0] - numbers[1].astype(np.int64)
         is_in_range = (times_ns[0] >= 0) & (times_ns[0] < END_NS)
         checks.append(~is_in_range | (times_ns[0] != times_ns[1]) | (starts != starts[0]))
-    return next(((number, int(np.argmax(bad))) for number, bad in enumerate(checks) if bad.any()), None)
+    return next(((number, int(np.argmax(is_bad))) for number, is_bad in enumerate(checks) if is_bad.any()), None)
 
 
 @pytest.mark.parametrize("seed", range(200))
@@ -57,28 +57,28 @@ def test_the_ends_of_the_bounds_are_allowed_and_the_end_of_time_is_not() -> None
 
 @pytest.mark.parametrize("count", [1, 4, 9])
 def test_each_byte_that_never_varies_is_looked_at_in_each_tick(count: int) -> None:
-    """Opcode, length, channel, sequence, tags; no time and no value."""
+    """Opcode, length, channel, sequence and tags never vary; times and values do."""
     layout = TickLayout(COLUMNS)
     records = format.blank_ticks(COLUMNS, count)
     format.fill_ticks(records, COLUMNS, np.outer(1.0 + np.arange(count), np.ones(len(COLUMNS))), 5)
     size = records.dtype.itemsize
-    free = [("_log_time", 8), ("_publish_time", 8), *((name, 8) for name in COLUMNS)]
-    varying = {records.dtype.fields[name][1] + k for name, width in free for k in range(width)}
+    varying_fields = [("_log_time", 8), ("_publish_time", 8), *((name, 8) for name in COLUMNS)]
+    varying = {records.dtype.fields[name][1] + k for name, width in varying_fields for k in range(width)}
     for place in range(count * size):
         content = bytearray(records.tobytes())
         content[place] ^= 0x10
         try:
             layout.parse_ticks(bytes(content), COLUMNS)
             message = ""
-        except DamagedChunk as fault:
-            message = str(fault)
+        except DamagedChunk as error:
+            message = str(error)
         assert (message == "contains other data than ticks") is (place % size not in varying), place
     assert layout.parse_ticks(records.tobytes(), COLUMNS).last == count
 
 
 @pytest.mark.parametrize("seed", range(50))
 def test_the_words_of_records_are_those_at_their_offsets(seed: int) -> None:
-    """Records of 8 to 60 random bytes; then one byte of one record is another one."""
+    """Records of 8 to 60 random bytes; then one bit of one record is flipped."""
     random = np.random.default_rng(seed)
     size, count = int(random.integers(8, 61)), int(random.integers(0, 9))
     template, is_fixed = random.integers(0, 256, size, np.uint8), random.random(size) < 0.5
@@ -127,7 +127,7 @@ CHANGES = {
 
 @pytest.mark.parametrize("message", CHANGES)
 def test_each_fault_of_a_chunk_is_named_with_its_value(message: str) -> None:
-    """Ticks 6 … 9, deadlines 0 … 300, and then one value that does not belong there."""
+    """Ticks 6 … 9 and deadlines 0 … 300 ns are valid; one changed value is a fault."""
     records = format.blank_ticks(COLUMNS, 4)
     rows = np.zeros((4, len(COLUMNS)))
     rows[:, 0], rows[:, 1] = 6.0 + np.arange(4), 100.0 * np.arange(4)

@@ -24,7 +24,7 @@ from rtloop.recording.load import load
 from rtloop.recording.replay.replay import replay
 from rtloop.recording.views.summary import summarise
 from rtloop.workbench.other_law import replay_on_the_rig
-from tests.recording.forging import DEEP, DIGEST_BYTES, Base, Chunk, first_chunk, pack_file, with_snapshot
+from tests.recording.forging import DEPTH, DIGEST_BYTES, Base, Chunk, first_chunk, pack_changed_snapshot, pack_file
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -34,25 +34,25 @@ def path(tmp_path: Path) -> Path:
     return tmp_path / "run.mcap"
 
 
-def with_event(base: Base, kind: str, change: Any) -> bytes:
-    """Pack the file with one event changed by the function `change`, or replaced by it if it is bytes."""
+def pack_changed_event(base: Base, kind: str, change: Any) -> bytes:
+    """Pack the file with the first event of a kind changed by the function `change`, or replaced by the bytes."""
     for i, j in base.messages(format.EVENTS):
         event = json.loads(base.chunks[i].messages[j].payload)
         if event["kind"] == kind:
             if not isinstance(change, bytes):
                 change(event)
             return pack_file(
-                base.with_payload(i, j, change if isinstance(change, bytes) else json.dumps(event).encode())
+                base.replace_payload(i, j, change if isinstance(change, bytes) else json.dumps(event).encode())
             )
     raise AssertionError(kind)
 
 
-def with_tick(base: Base, column: str, value: float) -> bytes:
+def pack_changed_tick(base: Base, column: str, value: float) -> bytes:
     """Pack the file with one number of the fourth tick of the third chunk of ticks replaced."""
     i = [i for i, chunk in enumerate(base.chunks) if not chunk.channels][2]
     records = np.frombuffer(base.chunks[i].content, base.dtype).copy()
     records[column][3] = value
-    return pack_file(base.with_chunk(i, Chunk(records.tobytes())))
+    return pack_file(base.replace_chunk(i, Chunk(records.tobytes())))
 
 
 INDICES = [
@@ -78,17 +78,17 @@ INDICES = [
 @pytest.mark.parametrize(("field", "value", "allowed"), INDICES)
 def test_counts_and_indices_of_a_snapshot_are_refused(field: str, value: int, allowed: str, base: Base, path: Path):
     for which in (0, 2):
-        path.write_bytes(with_snapshot(base, field, value, which))
+        path.write_bytes(pack_changed_snapshot(base, field, value, which))
         name = field.partition(".")[2]
         with pytest.raises(RecordingError, match=rf"run\.mcap: .*{name}.*: {value}; allowed: {allowed}"):
             replay(load(path))
-    path.write_bytes(with_snapshot(base, field, value))
+    path.write_bytes(pack_changed_snapshot(base, field, value))
     with pytest.raises(RecordingError, match=field.partition(".")[2]):
         replay_on_the_rig([path], None)
 
 
 def test_uncompiled_kernels_find_an_index_out_of_range_only_in_refused_snapshots(base: Base):
-    """The law runs in numpy, which checks indices."""
+    """The uncompiled law uses numpy, which checks indices."""
     environment = {**os.environ, "NUMBA_DISABLE_JIT": "1", "PYTHONPATH": str(ROOT)}
     i, j = base.messages(format.LAW)[1]
     snapshot = base.chunks[i].messages[j].payload[DIGEST_BYTES:]
@@ -102,7 +102,7 @@ def test_uncompiled_kernels_find_an_index_out_of_range_only_in_refused_snapshots
 
 
 def set_detail(key: str, value: Any) -> Any:
-    """Function that sets a field in the `what` of an event."""
+    """Return a function that sets a field in the `what` of an event."""
     return lambda event: event["what"].update({key: value})
 
 
@@ -110,7 +110,7 @@ EVENTS = [
     ("set_mode", b"{", "not JSON"),
     ("set_mode", b"null", "object"),
     ("set_mode", b"\xff\xfe", "not JSON"),
-    ("set_mode", b"[" * DEEP, "not JSON"),
+    ("set_mode", b"[" * DEPTH, "not JSON"),
     ("set_mode", lambda event: event.update(tick=-1), "tick"),
     ("set_mode", lambda event: event.update(tick=10**400), "tick"),
     ("set_mode", lambda event: event.update(axis="y"), "axis.*'y'.*x"),
@@ -130,7 +130,7 @@ EVENTS = [
 
 @pytest.mark.parametrize(("kind", "change", "message"), EVENTS)
 def test_malformed_events_are_problems_by_name(kind: str, change: Any, message: str, base: Base, path: Path):
-    path.write_bytes(with_event(base, kind, change))
+    path.write_bytes(pack_changed_event(base, kind, change))
     for problems in (summarise(path).problems, load(path).problems, recover(path)["problems"]):
         assert any(re.search(f"event.*{message}", problem) for problem in problems)
     assert not replay(load(path)).identical
@@ -139,10 +139,10 @@ def test_malformed_events_are_problems_by_name(kind: str, change: Any, message: 
 def test_a_leftover_that_cannot_be_read_does_not_stop_the_recovery_of_others(
     base: Base, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
-    whole = pack_file(base)
-    (tmp_path / "a.mcap.part").write_bytes(with_event(base, "set_mode", b"{"))
+    valid = pack_file(base)
+    (tmp_path / "a.mcap.part").write_bytes(pack_changed_event(base, "set_mode", b"{"))
     (tmp_path / "b.mcap.part").write_bytes(pack_file(base, first_chunk(b"{", base.header["columns"])))
-    (tmp_path / "c.mcap.part").write_bytes(whole[: len(whole) * 2 // 3])
+    (tmp_path / "c.mcap.part").write_bytes(valid[: len(valid) * 2 // 3])
     recover_leftovers(tmp_path)
     messages = capsys.readouterr().err
     assert all((tmp_path / name).exists() for name in ("a.mcap", "c.mcap"))
@@ -178,7 +178,7 @@ def test_malformed_headers_are_refused_by_name(key: str, value: Any, message: st
 
 
 def test_a_recording_of_an_older_version_is_refused_by_the_name_of_that_version(base: Base, path: Path):
-    """The records of version 0.1.0 have no x_feed_um."""
+    """The recordings of version 0.1.0 have no column x_feed_um."""
     columns = [name for name in base.header["columns"] if name != "x_feed_um"]
     header = {**base.header, "columns": columns, "versions": {"rtloop": "0.1.0"}}
     path.write_bytes(pack_file(base, first_chunk(header, columns)))
@@ -193,7 +193,7 @@ def test_a_recording_of_an_older_version_is_refused_by_the_name_of_that_version(
      ("flags", 0.5), ("mode", 4.0), ("mode", np.inf), ("periods_missed", -1.0), ("driver_status", 1e10)],
 )  # fmt: skip
 def test_invalid_ticks_are_left_out_and_named(column: str, value: float, base: Base, path: Path):
-    path.write_bytes(with_tick(base, column, value))
+    path.write_bytes(pack_changed_tick(base, column, value))
     summary = summarise(path)
     assert (summary.ticks_logged, summary.complete) == (500, False)
     assert any(column in problem for problem in summary.problems)

@@ -1,4 +1,4 @@
-"""Uses of a recording: summary, load, export, plot."""
+"""Summary, load, export and plot of a recording, against numpy on the rows that were written."""
 
 from __future__ import annotations
 
@@ -30,6 +30,7 @@ SPECIAL = (0.0, -0.0, np.nan, np.inf, -np.inf, 5e-324, 1.7976931348623157e308, 0
 
 @pytest.fixture(scope="module")
 def rows() -> np.ndarray:
+    """Rows with ticks in mode off, flags, missed periods, a large lateness, and SPECIAL doubles."""
     rows = make_rows(COUNT)
     for name, ticks, value in (
         ("mode", slice(1000), Mode.OFF),
@@ -45,6 +46,7 @@ def rows() -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def path(tmp_path_factory: pytest.TempPathFactory, rows: np.ndarray) -> Path:
+    """A recording that holds `rows`."""
     return write_recording(tmp_path_factory.mktemp("use") / "run.mcap", rows, ticks_expected=COUNT)
 
 
@@ -101,7 +103,7 @@ def test_times_are_rounded_to_the_nearest_nanosecond():
 
 
 def test_classes_of_times_end_at_1_2_and_5_in_each_decade():
-    """Each bound with the last nanosecond before it: one more of each in a class than in the one below."""
+    """Class n = 1, 2, … gets n times 1 ns below its bound, and the bound of the class before, if there is one."""
     bounds_us = (1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0, 200.0, 500.0, 1000.0)
     histogram = TimeHistogram()
     for number, bound_us in enumerate(bounds_us):
@@ -134,14 +136,15 @@ def test_load_gives_signals_by_name(path: Path, rows: np.ndarray):
 
 
 def test_load_refuses_files_of_different_runs(path: Path, tmp_path: Path):
-    other = write_recording(tmp_path / "other.mcap", make_rows(10), name="other")
+    other_path = write_recording(tmp_path / "other.mcap", make_rows(10), name="other")
     with pytest.raises(RecordingError, match="not of the same run"):
-        load([path, other])
+        load([path, other_path])
     with pytest.raises(RecordingError, match="no such file"):
         load(tmp_path / "absent-*.mcap")
 
 
 def read_csv(path: Path) -> dict[str, np.ndarray]:
+    """Return the columns of a file by name, as do the two functions below."""
     with path.open(newline="") as file:
         names, *lines = csv.reader(file)
     return dict(zip(names, np.array(lines, float).T, strict=True))
@@ -219,9 +222,9 @@ def test_plot_writes_a_picture(paced: bool, tmp_path: Path):
     path = write_recording(tmp_path / "run.mcap", make_rows(30_000, paced=paced), paced=paced)
     with Image.open(plot(path, tmp_path / "run.png")) as picture:
         assert (picture.format, picture.width > 1000) == ("PNG", True)
-    drawn = plot(path, tmp_path / "run.svg").read_text(encoding="utf-8")
-    assert ("timing / µs" in drawn) == paced
-    assert "error / µm" in drawn
+    svg_text = plot(path, tmp_path / "run.svg").read_text(encoding="utf-8")
+    assert ("timing / µs" in svg_text) == paced
+    assert "error / µm" in svg_text
     with pytest.raises(RecordingError, match="no tick from"):
         plot(path, tmp_path / "run.png", start_s=100.0)
 

@@ -17,7 +17,7 @@ from rtloop.recording.load import load
 from rtloop.recording.replay.replay import ReplayReport, replay
 from rtloop.recording.views.summary import summarise
 from tests.asked import answer, run
-from tests.recording.forging import CHUNK_TICKS, TICKS, Base, Chunk, first_chunk, pack_file, with_snapshot
+from tests.recording.forging import CHUNK_TICKS, TICKS, Base, Chunk, first_chunk, pack_changed_snapshot, pack_file
 
 
 @pytest.fixture
@@ -26,24 +26,26 @@ def path(tmp_path: Path) -> Path:
 
 
 def tick_chunks(base: Base) -> list[int]:
+    """Return the places of the chunks of ticks."""
     return [i for i, chunk in enumerate(base.chunks) if not chunk.channels]
 
 
-def without(base: Base, *places: int) -> Base:
+def drop_chunks(base: Base, *places: int) -> Base:
+    """Return the recording without the chunks at these places."""
     return base._replace(chunks=[chunk for i, chunk in enumerate(base.chunks) if i not in places])
 
 
-def without_snapshots(base: Base, which: set[int]) -> Base:
-    """The recording without some of its snapshots."""
+def drop_snapshots(base: Base, which: set[int]) -> Base:
+    """Return the recording without the snapshots number `which`."""
     for number, (i, _) in enumerate(base.messages(format.LAW)):
         if number in which:
             messages = [message for message in base.chunks[i].messages if message.channel != format.LAW]
-            base = base.with_chunk(i, base.chunks[i].with_messages(messages))
+            base = base.replace_chunk(i, base.chunks[i].replace_messages(messages))
     return base
 
 
 def unverified_report(path: Path) -> ReplayReport:
-    """Replay a recording without a difference that must not be identical, by API and command. Returns the report."""
+    """Replay by API and command. Require no difference, and no verdict `identical`. Returns the report."""
     report, verdict = replay(load(path)), answer("replay", path, code=1)
     assert (report.identical, report.first_difference, verdict["identical"]) == (False, None, False)
     assert verdict["not_verified"] == report.not_verified != []
@@ -63,37 +65,38 @@ def test_a_good_recording_is_identical_and_lists_what_is_not_judged(base: Base, 
 
 def test_ticks_of_a_damaged_chunk_are_unverified(base: Base, path: Path):
     place = tick_chunks(base)[2]
-    path.write_bytes(damaged(base, place))
+    path.write_bytes(pack_with_damaged_chunk(base, place))
     report = unverified_report(path)
     assert any("is damaged" in problem for problem in report.problems)
     assert {"first_tick": 2 * CHUNK_TICKS, "count": CHUNK_TICKS} in map(tick_range, report.not_verified)
     assert report.ticks + report.unverified == TICKS
 
 
-def damaged(base: Base, place: int) -> bytes:
+def pack_with_damaged_chunk(base: Base, place: int) -> bytes:
     """Pack the file with one damaged byte in the content of a chunk."""
     content = base.chunks[place].content
-    marked = pack_file(base.with_chunk(place, base.chunks[place]._replace(content=content[:-1] + b"\x5a")))
-    whole = pack_file(base)
-    start = next(i for i, (byte, mark) in enumerate(zip(whole, marked, strict=False)) if byte != mark)
-    data = bytearray(whole)
+    marked = pack_file(base.replace_chunk(place, base.chunks[place]._replace(content=content[:-1] + b"\x5a")))
+    original = pack_file(base)
+    start = next(i for i, (byte, mark) in enumerate(zip(original, marked, strict=False)) if byte != mark)
+    data = bytearray(original)
     data[start] ^= 1
     return bytes(data)
 
 
 def tick_range(entry: dict[str, Any]) -> dict[str, int]:
+    """Return the first tick and the count of an entry of `not_verified`."""
     return {key: entry[key] for key in ("first_tick", "count")}
 
 
 def test_a_damaged_chunk_with_a_snapshot_is_a_problem(base: Base, path: Path):
-    path.write_bytes(damaged(base, base.messages(format.LAW)[3][0]))
+    path.write_bytes(pack_with_damaged_chunk(base, base.messages(format.LAW)[3][0]))
     for problems in (unverified_report(path).problems, load(path).problems):
         assert any("is damaged" in problem for problem in problems)
 
 
 def test_a_chunk_replaced_by_a_copy_of_another_is_unverified(base: Base, path: Path):
     chunks = tick_chunks(base)
-    path.write_bytes(pack_file(base.with_chunk(chunks[4], base.chunks[chunks[1]])))
+    path.write_bytes(pack_file(base.replace_chunk(chunks[4], base.chunks[chunks[1]])))
     report = unverified_report(path)
     assert tick_range(report.not_verified[0]) == {"first_tick": 4 * CHUNK_TICKS, "count": CHUNK_TICKS}
     summary = summarise(path)
@@ -114,28 +117,28 @@ def test_commands_that_are_recorded_twice_are_unverified(base: Base, path: Path)
 @pytest.mark.parametrize("present", [slice(0, -1), slice(1, None), slice(0, None, 2)], ids=["end", "start", "middle"])
 def test_ticks_of_missing_chunks_are_unverified(present: slice, base: Base, path: Path):
     missing = set(tick_chunks(base)) - set(tick_chunks(base)[present])
-    path.write_bytes(pack_file(without(base, *missing)))
+    path.write_bytes(pack_file(drop_chunks(base, *missing)))
     report = unverified_report(path)
     assert report.ticks + report.unverified == TICKS
     assert any(str(TICKS - 100 * len(missing)) in problem for problem in summarise(path).problems)
 
 
 def test_ticks_before_the_first_snapshot_are_unverified(base: Base, path: Path):
-    def altered(chunk: Chunk) -> Chunk:
+    def raise_drive(chunk: Chunk) -> Chunk:
         records = np.frombuffer(chunk.content, base.dtype).copy()
         records["x_drive_v"] += 1.0
         return Chunk(records.tobytes())
 
-    late = without_snapshots(base, {0, 1})
-    place = tick_chunks(late)[0]
-    path.write_bytes(pack_file(late.with_chunk(place, altered(late.chunks[place]))))
+    late_base = drop_snapshots(base, {0, 1})
+    place = tick_chunks(late_base)[0]
+    path.write_bytes(pack_file(late_base.replace_chunk(place, raise_drive(late_base.chunks[place]))))
     report = unverified_report(path)
     assert (report.unverified, tick_range(report.not_verified[0])) == (200, {"first_tick": 0, "count": 200})
     assert report.ticks == TICKS - 200
 
 
 def begin_earlier(index: list[ChunkIndex]) -> None:
-    """Let a chunk begin within the one before it."""
+    """Make the entry of one chunk begin within the chunk before it."""
     index[3] = replace(index[3], chunk_start_offset=index[3].chunk_start_offset - 40)
 
 
@@ -151,12 +154,12 @@ def test_an_index_that_contradicts_the_chunks_is_not_used(
 
 @pytest.mark.parametrize("which", [3, 4])
 def test_a_snapshot_after_the_end_is_reported(which: int, base: Base, path: Path):
-    path.write_bytes(with_snapshot(base, "tick", 4_000, which))
+    path.write_bytes(pack_changed_snapshot(base, "tick", 4_000, which))
     assert any("4000" in entry["why"] for entry in unverified_report(path).not_verified)
 
 
 def test_a_recording_without_its_end_is_unverified(base: Base, path: Path):
-    path.write_bytes(pack_file(without(base, len(base.chunks) - 1)))
+    path.write_bytes(pack_file(drop_chunks(base, len(base.chunks) - 1)))
     assert "has no recorded end" in unverified_report(path).not_verified[-1]["why"]
 
 
@@ -166,44 +169,44 @@ def test_a_rate_that_the_deadlines_contradict_is_a_difference(rate_hz: float, ba
     assert not replay(load(path)).identical
 
 
-def with_ticks(base: Base, change: Callable[[np.ndarray], None]) -> Base:
-    """The recording with its ticks changed: `change` gets the records of a chunk; log times follow the deadlines."""
+def change_ticks(base: Base, change: Callable[[np.ndarray], None]) -> Base:
+    """Return the recording with the tick records of each chunk changed by `change`; log times follow the deadlines."""
     for i in tick_chunks(base):
         records = np.frombuffer(base.chunks[i].content, base.dtype).copy()
         before_ns = records["deadline_ns"].copy()
         change(records)
         for name in ("_log_time", "_publish_time"):
             records[name] += (records["deadline_ns"] - before_ns).astype(np.uint64)
-        base = base.with_chunk(i, Chunk(records.tobytes()))
+        base = base.replace_chunk(i, Chunk(records.tobytes()))
     return base
 
 
 def test_periods_that_were_missed_are_no_wrong_rate(base: Base, path: Path):
-    """Every tenth tick came a period late; a rate that does not count it would be 9 % off."""
+    """Every tenth tick is a period late; a rate that ignores missed periods would be 9 % off."""
 
-    def late(records: np.ndarray) -> None:
+    def delay_ticks(records: np.ndarray) -> None:
         records["deadline_ns"] += 100_000 * (records["tick"] // 10)
         records["periods_missed"] = (records["tick"] % 10 == 0) & (records["tick"] > 0)
 
-    path.write_bytes(pack_file(with_ticks(base, late)))
+    path.write_bytes(pack_file(change_ticks(base, delay_ticks)))
     assert replay(load(path)).first_difference is None
 
 
 def test_a_wrong_rate_is_told_with_that_of_the_deadlines(base: Base, path: Path):
-    def slow(records: np.ndarray) -> None:
+    def double_deadlines(records: np.ndarray) -> None:
         records["deadline_ns"] *= 2
 
-    path.write_bytes(pack_file(with_ticks(base, slow)))
+    path.write_bytes(pack_file(change_ticks(base, double_deadlines)))
     difference = replay(load(path)).first_difference
     assert difference == {"tick": 0, "signal": "rate_hz", "recorded": 10_000.0, "replayed": pytest.approx(5_000.0)}
 
 
 @pytest.mark.parametrize("tick", [0, 299, 377])
 def test_ticks_are_counted_up_to_the_one_that_differs(tick: int, base: Base, path: Path):
-    def forged(records: np.ndarray) -> None:
+    def change_drive(records: np.ndarray) -> None:
         records["x_drive_v"][records["tick"] == tick] += 1e-9
 
-    path.write_bytes(pack_file(with_ticks(base, forged)))
+    path.write_bytes(pack_file(change_ticks(base, change_drive)))
     report = replay(load(path))
     assert report.first_difference is not None
     assert (report.first_difference["tick"], report.first_difference["signal"]) == (tick, "x_drive_v")
@@ -223,13 +226,13 @@ def test_a_recorded_gap_is_no_unverified_tick(lost: tuple[int, int], unverified:
 def pack_with_gap(base: Base, lost: tuple[int, int], gap: dict[str, int]) -> bytes:
     """Pack the recording without two chunks of ticks, with a gap event and the recorder's totals."""
     chunks = tick_chunks(base)
-    base = without(base, *(chunks[i] for i in lost))
+    base = drop_chunks(base, *(chunks[i] for i in lost))
     event = {"tick": 400, "time_ns": 0, "kind": "gap", "who": "recorder", "axis": None, "what": gap}
     (last,), place = base.chunks[-1].messages, len(base.chunks) - 1
     end = json.loads(last.payload)
     end["what"] |= {"ticks_logged": TICKS - 200, "ticks_lost": 200, "complete": False}
     messages = [last._replace(payload=json.dumps(content).encode()) for content in (event, end)]
-    return pack_file(base.with_chunk(place, base.chunks[place].with_messages(messages)))
+    return pack_file(base.replace_chunk(place, base.chunks[place].replace_messages(messages)))
 
 
 def test_missing_ticks_beyond_the_recorded_gap_are_unverified(base: Base, path: Path):

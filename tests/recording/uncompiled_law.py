@@ -21,14 +21,14 @@ from rtloop.kernel.step import evaluate, update
 from rtloop.laws.binding import bind_functions
 from rtloop.laws.registry import law_layout
 from rtloop.signals import Mode
-from tests.recording.law_fields import COUNTS, fields_of
+from tests.recording.law_fields import INTEGERS, snapshot_fields
 
 TICKS, SEED, TRIES = 2, 3, 400
 LAYOUT, FUNCTIONS = law_layout(DEFAULT_LAWS), bind_functions(DEFAULT_LAWS)
 
 
 def reaches_beyond(data: bytes, axes: int) -> bool:
-    """Whether the law, run from an unvalidated snapshot, reaches beyond its arrays."""
+    """Return whether the law, run from an unvalidated snapshot, reaches beyond its arrays."""
     unchecked = {"require_owners": DEFAULT, "require_allowed": DEFAULT}
     with patch.object(memory.Layout, "require_allowed_axis"), patch.multiple(memory, **unchecked):
         _, *arrays = LAYOUT.split_snapshot(data, axes)
@@ -50,7 +50,7 @@ def reaches_beyond(data: bytes, axes: int) -> bool:
 
 
 def is_accepted(data: bytes, axes: int) -> bool:
-    """Whether a snapshot passes the validation."""
+    """Return whether a snapshot passes the validation."""
     try:
         LAYOUT.split_snapshot(data, axes)
     except ValueError:
@@ -59,16 +59,16 @@ def is_accepted(data: bytes, axes: int) -> bool:
 
 
 def main() -> None:
-    """Forge whole numbers of the snapshot on stdin and print the counts."""
+    """Replace whole numbers of the snapshot on stdin, one at a time, and print the counts of outcomes."""
     random, counts = np.random.default_rng(SEED), {"accepted": 0, "refused": 0}
     beyond = {"accepted": 0, "refused": 0}
     snapshot = sys.stdin.buffer.read()
-    fields = [field for field in fields_of(["x"]) if field.dtype.base.kind in "iu"]
+    fields = [field for field in snapshot_fields(["x"]) if field.dtype.base.kind in "iu"]
     for number in range(TRIES):
         data = bytearray(snapshot)
         _, dtype, start = fields[number % len(fields)]
         start += int(random.integers(max(int(np.prod(dtype.shape)), 1))) * dtype.base.itemsize
-        value = np.array(COUNTS[int(random.integers(len(COUNTS)))]) if number % 3 else np.array(random.integers(5))
+        value = np.array(INTEGERS[int(random.integers(len(INTEGERS)))]) if number % 3 else np.array(random.integers(5))
         data[start : start + dtype.base.itemsize] = value.astype(dtype.base).tobytes()
         kind = "accepted" if is_accepted(bytes(data), 1) else "refused"
         counts[kind] += 1
