@@ -1,4 +1,4 @@
-"""An archive for tests: copies of one short recording, and bent, cut and forged ones among them."""
+"""Archives for tests: copies of one short recording, with damaged, cut and forged recordings among them."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def flip_tick_byte(source: Path, target: Path) -> None:
 
 
 def truncate(source: Path, target: Path) -> None:
-    """Leave out the last third of the file."""
+    """Write the file without its last third."""
     data = source.read_bytes()
     target.write_bytes(data[: len(data) * 2 // 3])
 
@@ -87,7 +87,7 @@ def change_drive(source: Path, target: Path) -> None:
 
 
 def change_header(source: Path, target: Path, **values: Any) -> None:
-    """Change fields of the header."""
+    """Write the recording with changed fields of its header."""
     base = take_apart(source)
     target.write_bytes(pack_file(base, first_chunk({**base.header, **values}, base.header["columns"])))
 
@@ -101,11 +101,11 @@ BAD: dict[str, tuple[Callable[[Path, Path], None], str, str]] = {
     "drive": (change_drive, "differs", "replayed"),
     "layout": (lambda *paths: change_header(*paths, law={"laws": []}), "other version", "stores a law's state"),
 }
-"""Bad recordings by name: how one is made, its verdict, and a part of its reason."""
+"""Bad recordings by name: the function that writes one, its verdict, and a part of the verdict's reason."""
 
 
 def make_archive(folder: Path, source: Path, count: int, bad: Sequence[str]) -> None:
-    """Fill a folder, and folders in it, with copies of a recording, and with the `bad` ones among them."""
+    """Fill five subfolders with `count` copies of a recording, and with the bad recordings of the names `bad`."""
     for number in range(count):
         place = folder / f"day-{number % 5}" / f"run-{number:03d}.mcap"
         place.parent.mkdir(parents=True, exist_ok=True)
@@ -115,16 +115,16 @@ def make_archive(folder: Path, source: Path, count: int, bad: Sequence[str]) -> 
 
 
 def archive(*arguments: object, folder: Path, environment: dict[str, str] | None = None) -> tuple[int, dict[str, Any]]:
-    """Run `rtloop archive` with --json in a folder. Returns its exit code and its object."""
+    """Run `rtloop archive` with --json in a folder. Returns its exit code and its JSON object."""
     process = rtloop("archive", *arguments, "--json", folder=folder, environment=environment)
     output, errors = process.communicate(timeout=280)
     assert "Traceback" not in errors, errors
     return process.returncode, json.loads(output) if output else {"error": errors}
 
 
-def bad_rows(report: dict[str, Any], good: str = "identical") -> dict[str, dict[str, Any]]:
-    """Return the rows that are not good, by the name of the file."""
-    return {Path(row["path"]).stem: row for row in report["verdicts"] if row["verdict"] != good}
+def bad_rows(report: dict[str, Any], good_verdict: str = "identical") -> dict[str, dict[str, Any]]:
+    """Return the rows with another verdict than `good_verdict`, by the stem of the file name."""
+    return {Path(row["path"]).stem: row for row in report["verdicts"] if row["verdict"] != good_verdict}
 
 
 def require_exact(report: dict[str, Any], bad: Sequence[str]) -> None:
@@ -141,7 +141,7 @@ def require_exact(report: dict[str, Any], bad: Sequence[str]) -> None:
 def dask_cluster(folder: Path, workers: int, settings: Mapping[str, str] = MappingProxyType({})) -> Iterator[str]:
     """Start a Dask scheduler and worker processes with one thread each. Yields the scheduler's address.
 
-    `settings` are further variables of their environment.
+    `settings` are additional environment variables of these processes.
     """
     address_file = folder / "scheduler.json"
     paths = [str(ROOT), *filter(None, [os.environ.get("PYTHONPATH")])]
@@ -160,8 +160,8 @@ def dask_cluster(folder: Path, workers: int, settings: Mapping[str, str] = Mappi
                         command, cwd=folder, env=environment, start_new_session=True, stdout=log, stderr=log
                     )
                 )
-            _await(address_file.exists, folder / f"{kind}.log")
-        _await(lambda: (folder / "worker.log").read_text().count("Registered to") >= workers, folder / "worker.log")
+            _wait_for(address_file.exists, folder / f"{kind}.log")
+        _wait_for(lambda: (folder / "worker.log").read_text().count("Registered to") >= workers, folder / "worker.log")
         yield json.loads(address_file.read_text())["address"]
     finally:
         for process in reversed(processes):
@@ -173,7 +173,7 @@ def dask_cluster(folder: Path, workers: int, settings: Mapping[str, str] = Mappi
                 process.wait()
 
 
-def _await(is_ready: Callable[[], bool], log: Path) -> None:
+def _wait_for(is_ready: Callable[[], bool], log: Path) -> None:
     """Wait until a process is ready. Raises AssertionError with its log after START_S."""
     end_s = time.monotonic() + START_S
     while not is_ready():

@@ -1,4 +1,4 @@
-"""Campaigns for tests: the paper's loop on rigs that differ, in short experiments."""
+"""Campaigns for tests: short experiments with the paper's loop on varied rigs."""
 
 from __future__ import annotations
 

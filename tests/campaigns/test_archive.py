@@ -1,4 +1,4 @@
-"""Archives: exactly the bad recordings are named, whatever runs the replays, and after any process was killed."""
+"""Archives: exactly the bad recordings are named, for any kind of workers, and after any process was killed."""
 
 from __future__ import annotations
 
@@ -60,20 +60,20 @@ if os.environ.get("HOOK"):
         return load_recording(paths)
     load.load = load_or_die
 """
-"""A `sitecustomize` with which a recording named HOOK ends its worker by SIGSEGV, and any other one takes SLOW_S."""
+"""A `sitecustomize`: the load of a recording named HOOK ends the process by SIGSEGV; any other load takes SLOW_S."""
 
 
 @pytest.fixture(scope="module")
-def good(tmp_path_factory):
+def good_recording(tmp_path_factory):
     """A short recording of the paper's loop."""
     return record_short_run(tmp_path_factory.mktemp("good"))
 
 
 @pytest.fixture(scope="module")
-def folder(good, tmp_path_factory):
+def folder(good_recording, tmp_path_factory):
     """An archive of good and bad recordings."""
     folder = tmp_path_factory.mktemp("archive")
-    make_archive(folder, good, GOOD, list(BAD))
+    make_archive(folder, good_recording, GOOD, list(BAD))
     return folder
 
 
@@ -85,14 +85,15 @@ def report(folder):
     return report
 
 
-def hook(tmp_path: Path, name: str, slow_s: str = "0") -> dict[str, str]:
-    """Return the environment in which the recording `name` ends its worker."""
+def hook_environment(tmp_path: Path, name: str, slow_s: str = "0") -> dict[str, str]:
+    """Return an environment with HOOK in force: the recording `name` ends its worker, any other one takes `slow_s`."""
     (tmp_path / "sitecustomize.py").write_text(HOOK)
     paths = [str(tmp_path), *filter(None, [os.environ.get("PYTHONPATH")])]
     return {"PYTHONPATH": os.pathsep.join(paths), "HOOK": name, "SLOW_S": slow_s}
 
 
-def judge(*paths: Path) -> dict[str, Any]:
+def replay_verdict(*paths: Path) -> dict[str, Any]:
+    """Return the verdict of a replay of the files of one recording."""
     return replay_files([str(path) for path in paths], __version__)
 
 
@@ -119,8 +120,8 @@ def test_exactly_the_bad_recordings_are_named(report):
 
 
 def test_two_workers_give_the_same_answer(folder, report):
-    code, other = archive("replay", str(folder / "**/*.mcap"), "--jobs", 2, folder=folder)
-    assert (code, other["verdicts"], other["counts"]) == (1, report["verdicts"], report["counts"])
+    code, other_report = archive("replay", str(folder / "**/*.mcap"), "--jobs", 2, folder=folder)
+    assert (code, other_report["verdicts"], other_report["counts"]) == (1, report["verdicts"], report["counts"])
 
 
 def test_the_table_has_the_bad_recordings_alone(folder):
@@ -134,8 +135,8 @@ def test_the_table_has_the_bad_recordings_alone(folder):
     assert "recordings/s" in lines[-1]
 
 
-def test_an_archive_of_good_recordings_ends_with_0(good, tmp_path):
-    make_archive(tmp_path / "archive", good, 3, [])
+def test_an_archive_of_good_recordings_ends_with_0(good_recording, tmp_path):
+    make_archive(tmp_path / "archive", good_recording, 3, [])
     assert archive("replay", tmp_path / "archive", folder=tmp_path)[0] == 0
     code, report = archive("info", tmp_path / "archive", folder=tmp_path)
     assert (code, report["counts"]) == (0, {"readable": 3})
@@ -151,10 +152,10 @@ def test_info_names_the_recordings_that_are_damaged_or_cannot_be_read(folder):
 
 
 def test_a_call_whose_coordinator_was_killed_continues(folder, report, tmp_path):
-    out, environment = tmp_path / "out", hook(tmp_path, "no such name", SLOW_S)
+    out, environment = tmp_path / "out", hook_environment(tmp_path, "no such name", SLOW_S)
     process = rtloop("archive", "replay", folder, "--out", out, folder=tmp_path, environment=environment)
     await_lines(out, 5, process)
-    os.kill(process.pid, signal.SIGKILL)  # The workers notice it, and end.
+    os.kill(process.pid, signal.SIGKILL)  # The workers notice the kill, and end.
     process.communicate(timeout=60)
     before = [line for line in stored_lines(out) if json.loads(line)["verdict"] != UNREADABLE]
     code, continued = archive("replay", folder, "--out", out, folder=tmp_path)
@@ -163,16 +164,14 @@ def test_a_call_whose_coordinator_was_killed_continues(folder, report, tmp_path)
     assert after[: len(before)] == before
     assert len({json.loads(line)["path"] for line in after}) == len(after) == GOOD + len(BAD)
     _, again = archive("replay", folder, "--out", out, folder=tmp_path)
-    assert (again["verdicts"], again["stored"]) == (
-        report["verdicts"],
-        GOOD + len(BAD) - 1,
-    )  # what cannot be read may be
+    # A recording that cannot be read is tried again.
+    assert (again["verdicts"], again["stored"]) == (report["verdicts"], GOOD + len(BAD) - 1)
     assert sorted(stored_lines(out)) == sorted(after)
 
 
 @pytest.mark.soak
 def test_ctrl_c_lets_the_recordings_end_and_the_same_command_continues(folder, report, tmp_path):
-    out, environment = tmp_path / "out", hook(tmp_path, "no such name", SLOW_S)
+    out, environment = tmp_path / "out", hook_environment(tmp_path, "no such name", SLOW_S)
     process = rtloop("archive", "replay", folder, "--out", out, folder=tmp_path, environment=environment)
     await_lines(out, 2, process)
     os.killpg(process.pid, signal.SIGINT)
@@ -183,55 +182,58 @@ def test_ctrl_c_lets_the_recordings_end_and_the_same_command_continues(folder, r
 
 
 def test_a_recording_that_kills_its_worker_is_named_and_no_other(folder, report, tmp_path):
-    environment = hook(tmp_path, "run-003")
-    code, other = archive("replay", folder, "--jobs", 2, folder=tmp_path, environment=environment)
-    rows = bad_rows(other)
+    environment = hook_environment(tmp_path, "run-003")
+    code, other_report = archive("replay", folder, "--jobs", 2, folder=tmp_path, environment=environment)
+    rows = bad_rows(other_report)
     assert (code, rows.pop("run-003")["verdict"]) == (1, "crashed its worker")
     assert rows == bad_rows(report)
-    assert other["recordings"] == len(other["verdicts"]) == GOOD + len(BAD)
+    assert other_report["recordings"] == len(other_report["verdicts"]) == GOOD + len(BAD)
 
 
 @pytest.mark.soak
 def test_dask_workers_give_the_same_answer(folder, report, tmp_path):
     pytest.importorskip("distributed")
     with dask_cluster(tmp_path, 2) as address:
-        code, other = archive("replay", folder, "--scheduler", address, folder=tmp_path)
-    assert (code, other["verdicts"]) == (1, report["verdicts"]), other
+        code, other_report = archive("replay", folder, "--scheduler", address, folder=tmp_path)
+    assert (code, other_report["verdicts"]) == (1, report["verdicts"]), other_report
 
 
-def test_a_changed_recording_is_replayed_again_and_a_torn_line_does_not_count(good, tmp_path):
-    out, place = tmp_path / "out", tmp_path / "archive"
-    make_archive(place, good, 4, [])
-    archive("replay", place, "--out", out, folder=tmp_path)
-    flip_tick_byte(good, place / "day-1/run-001.mcap")
+def test_a_changed_recording_is_replayed_again_and_a_torn_line_does_not_count(good_recording, tmp_path):
+    out, archive_folder = tmp_path / "out", tmp_path / "archive"
+    make_archive(archive_folder, good_recording, 4, [])
+    archive("replay", archive_folder, "--out", out, folder=tmp_path)
+    flip_tick_byte(good_recording, archive_folder / "day-1/run-001.mcap")
     lines = stored_lines(out)
     other_version = lines[2].replace(f'"rtloop": "{__version__}"'.encode(), b'"rtloop": "0.0.1"')
     (out / "verdicts.jsonl").write_bytes(lines[0] + lines[1] + other_version + lines[3][:40])
-    code, report = archive("replay", place, "--out", out, folder=tmp_path)
+    code, report = archive("replay", archive_folder, "--out", out, folder=tmp_path)
     stored = sum(b"run-001" not in line for line in lines[:2])
     assert (code, report["stored"], report["counts"]) == (1, stored, {"identical": 3, "damaged": 1})
-    assert archive("replay", place, "--out", out, folder=tmp_path)[1]["stored"] == 4
+    assert archive("replay", archive_folder, "--out", out, folder=tmp_path)[1]["stored"] == 4
 
 
 def test_the_files_of_a_rotated_run_are_one_recording(tmp_path):
     record(tmp_path / "run.mcap", scheduled(), 25_000, rotate_s=1.0)
-    (whole,) = find_recordings([tmp_path])
-    assert [Path(path).name for path in whole.paths] == [f"run-000{number}.mcap" for number in (1, 2, 3)]
-    assert judge(*map(Path, whole.paths)) == {"verdict": "identical", "reason": ""}
+    (complete,) = find_recordings([tmp_path])
+    assert [Path(path).name for path in complete.paths] == [f"run-000{number}.mcap" for number in (1, 2, 3)]
+    assert replay_verdict(*map(Path, complete.paths)) == {"verdict": "identical", "reason": ""}
     (tmp_path / "run-0001.mcap").unlink()
-    (rest,) = find_recordings([tmp_path])
-    assert judge(*map(Path, rest.paths)) == {"verdict": "identical", "reason": "file 1 of the run is missing"}
+    (remaining,) = find_recordings([tmp_path])
+    assert replay_verdict(*map(Path, remaining.paths)) == {
+        "verdict": "identical",
+        "reason": "file 1 of the run is missing",
+    }
 
 
-def test_numbered_copies_are_recordings_of_their_own(good, tmp_path):
+def test_numbered_copies_are_recordings_of_their_own(good_recording, tmp_path):
     for name in ("copy-0001.mcap", "copy-0002.mcap"):
-        shutil.copy(good, tmp_path / name)
+        shutil.copy(good_recording, tmp_path / name)
     assert [len(recording.paths) for recording in find_recordings([tmp_path])] == [1, 1]
 
 
-def test_a_leftover_is_unfinished_unless_its_recovered_file_exists(good, tmp_path):
+def test_a_leftover_is_unfinished_unless_its_recovered_file_exists(good_recording, tmp_path):
     for name in ("left.mcap.part", "recovered.mcap.part", "recovered.mcap"):
-        shutil.copy(good, tmp_path / name)
+        shutil.copy(good_recording, tmp_path / name)
     code, report = archive("replay", tmp_path, folder=tmp_path)
     assert [(Path(row["path"]).name, row["verdict"]) for row in report["verdicts"]] == [
         ("left.mcap.part", "unfinished"),
@@ -240,14 +242,14 @@ def test_a_leftover_is_unfinished_unless_its_recovered_file_exists(good, tmp_pat
     assert (code, "rtloop recover" in report["verdicts"][0]["reason"]) == (1, True)
 
 
-def test_a_damaged_index_is_named_although_all_ticks_are_identical(good, tmp_path):
-    flip_byte(good, good.stat().st_size - 100, tmp_path / "run.mcap")
-    row = judge(tmp_path / "run.mcap")
+def test_a_damaged_index_is_named_although_all_ticks_are_identical(good_recording, tmp_path):
+    flip_byte(good_recording, good_recording.stat().st_size - 100, tmp_path / "run.mcap")
+    row = replay_verdict(tmp_path / "run.mcap")
     assert (row["verdict"], "all ticks are identical" in row["reason"]) == ("damaged", True)
 
 
-def test_a_later_format_is_another_version(good, tmp_path):
-    change_header(good, tmp_path / "run.mcap", format=99)
+def test_a_later_format_is_another_version(good_recording, tmp_path):
+    change_header(good_recording, tmp_path / "run.mcap", format=99)
     for examine in (replay_files, summarise_files):
         row = examine([str(tmp_path / "run.mcap")], __version__)
         assert (row["verdict"], row["reason"].startswith("header of the recording")) == ("other version", True)
@@ -256,13 +258,13 @@ def test_a_later_format_is_another_version(good, tmp_path):
 def test_an_import_has_no_law(tmp_path):
     (tmp_path / "scan.csv").write_text("t,u,y\n" + "".join(f"{k / 1000},{k % 7},{k % 5}\n" for k in range(100)))
     assert run("import", tmp_path / "scan.csv", "--time", "t", "--all").exit_code == 0
-    assert judge(tmp_path / "scan.mcap")["verdict"] == "no law"
+    assert replay_verdict(tmp_path / "scan.mcap")["verdict"] == "no law"
     assert summarise_files([str(tmp_path / "scan.mcap")], __version__)["verdict"] == "readable"
 
 
-def test_a_worker_of_another_version_is_refused(good):
+def test_a_worker_of_another_version_is_refused(good_recording):
     with pytest.raises(UnavailableError, match=r"a worker process has rtloop .*; allowed: 99\.0"):
-        replay_files([str(good)], "99.0")
+        replay_files([str(good_recording)], "99.0")
 
 
 @pytest.mark.parametrize("pattern", ["none/*.mcap", "empty", "none.mcap"])
@@ -274,10 +276,10 @@ def test_a_pattern_without_a_recording_is_refused(pattern, tmp_path, monkeypatch
 
 
 @pytest.fixture
-def shared(good) -> Iterator[Path]:
-    """An archive in a folder for all, of which one folder is closed to other users."""
+def shared(good_recording) -> Iterator[Path]:
+    """An archive that all users may read, except one of its folders."""
     folder = Path(mkdtemp(dir="/tmp"))
-    make_archive(folder, good, 2, [])
+    make_archive(folder, good_recording, 2, [])
     folder.chmod(0o755)
     (folder / "day-1").chmod(0o700)
     yield folder
@@ -289,8 +291,10 @@ def test_a_folder_that_cannot_be_read_is_named(shared):
     closed = str(shared / "day-1")
 
     def examine() -> list[str]:
-        found = [find_recordings([pattern]) for pattern in (shared, shared / "**/*.mcap")]
-        recordings = [recording for both in found for recording in both if recording.paths[0] == closed]
+        lists = [find_recordings([pattern]) for pattern in (shared, shared / "**/*.mcap")]
+        recordings = [
+            recording for recording_list in lists for recording in recording_list if recording.paths[0] == closed
+        ]
         return [replay_files(recording.paths, __version__)["reason"] for recording in recordings]
 
     assert as_user(VICTIM, examine) == ["Permission denied"] * 2
@@ -307,15 +311,15 @@ def test_a_folder_takes_the_verdicts_of_one_process_at_a_time(tmp_path):
 def test_ticks_without_a_snapshot_are_not_verified_and_a_file_without_an_end_is_damaged(tmp_path):
     base, path = record_bases(tmp_path)[0], tmp_path / "run.mcap"
     path.write_bytes(pack_file(drop_snapshots(base, {0, 1})))
-    row = judge(path)
+    row = replay_verdict(path)
     assert (row["verdict"], "no earlier snapshot" in row["reason"]) == ("not verified", True)
     path.write_bytes(pack_file(drop_chunks(base, len(base.chunks) - 1)))
-    for row in (judge(path), summarise_files([str(path)], __version__)):
+    for row in (replay_verdict(path), summarise_files([str(path)], __version__)):
         assert (row["verdict"], "no recorded end" in row["reason"]) == ("damaged", True)
 
 
-class BrokenOnce:
-    """Workers whose pool is found broken at one submission, before any future fails."""
+class PoolBrokenOnce:
+    """Workers whose pool is broken at the second submission, before any future fails."""
 
     count, name = 1, "workers"
 
@@ -343,6 +347,8 @@ class BrokenOnce:
 @pytest.mark.parametrize("alone", [True, False])
 def test_a_pool_that_is_broken_at_a_submission_costs_no_item(alone):
     class Doubling:
+        """Job that doubles numbers and stores the results."""
+
         def __init__(self) -> None:
             self.results: dict[int, int] = {}
 
@@ -355,14 +361,14 @@ def test_a_pool_that_is_broken_at_a_submission_costs_no_item(alone):
         def set_aside(self, item: Any) -> None:
             raise AssertionError(item)
 
-    workers, job = BrokenOnce(), Doubling()
+    workers, job = PoolBrokenOnce(), Doubling()
     done = Dispatcher(workers, job).run([Task((k,), alone) for k in range(5)], lambda _: None, lambda: False)
     assert (done, job.results) == (5, {k: 2 * k for k in range(5)})
 
 
-def test_a_rewritten_recording_leaves_no_open_file_in_the_worker(good, tmp_path):
-    """Each such recording is converted to a temporary copy; an archive has more of them than a process may open."""
-    path = rewriting.write(tmp_path / "rewritten.mcap", rewriting.messages(good), chunk_size=20_000)
+def test_a_rewritten_recording_leaves_no_open_file_in_the_worker(good_recording, tmp_path):
+    """Each rewritten recording is converted to a temporary copy; an archive may have more than a process may open."""
+    path = rewriting.write(tmp_path / "rewritten.mcap", rewriting.messages(good_recording), chunk_size=20_000)
     assert replay_files([str(path)], __version__)["verdict"] == "identical"
     opened = len(os.listdir("/proc/self/fd"))
     for number in range(3):

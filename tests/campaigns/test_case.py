@@ -1,3 +1,5 @@
+"""The rigs of a campaign: their values, and their figures against a simulation by python-control."""
+
 from __future__ import annotations
 
 import math
@@ -40,6 +42,7 @@ lasts_s = 0.05
 
 @pytest.fixture
 def runner(tmp_path):
+    """The runner of a campaign with all kinds of experiments."""
     return CaseRunner(load_campaign(write_campaign(tmp_path, experiments=STEPS + OTHER_EXPERIMENTS)))
 
 
@@ -54,11 +57,11 @@ def test_the_nominal_rig_is_the_configured_one(runner):
 
 
 def test_a_rig_twice_is_equal_and_another_rig_is_not(runner):
-    first, again, other = runner.run(7), runner.run(7), runner.run(8)
-    assert first == again
-    assert set(first.figures.values()).isdisjoint(other.figures.values())
-    assert first.values.keys() == other.values.keys()
-    assert set(map(str, first.values.values())).isdisjoint(map(str, other.values.values()))
+    first, repeated, other_case = runner.run(7), runner.run(7), runner.run(8)
+    assert first == repeated
+    assert set(first.figures.values()).isdisjoint(other_case.figures.values())
+    assert first.values.keys() == other_case.values.keys()
+    assert set(map(str, first.values.values())).isdisjoint(map(str, other_case.values.values()))
 
 
 def true_motion(recording: Path, points: int, pushed_um: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
@@ -79,7 +82,7 @@ def true_motion(recording: Path, points: int, pushed_um: float = 0.0) -> tuple[n
 
 
 def test_figures_are_those_of_the_recorded_motion_between_ticks(runner, tmp_path):
-    """The nominal rig is eq (5): python-control simulates it from the recorded hysteresis."""
+    """The nominal rig is eq (5) of the paper, which python-control simulates from the recorded hysteresis."""
     case = runner.run(0)
     steps, sine, scan, push = (
         true_motion(path, 8, 2.0 if "push" in path.name else 0.0) for path in record_rig(runner, 0, tmp_path / "worst")
@@ -118,7 +121,7 @@ def test_the_recording_of_a_rig_replays_and_rings_at_its_resonance(runner, tmp_p
 
 
 def test_a_value_that_is_not_applied_is_found(runner, monkeypatch):
-    """One key is dropped on its way to the rig: no rig runs with a value that the results do not have."""
+    """The test drops one key before it reaches the rig; no rig may run with a value other than its result names."""
     replace = rtloop.campaigns.rig_builder.replace_values
 
     def drop_one(tables, values):
@@ -162,7 +165,7 @@ def test_a_rig_that_is_impossible_is_refused_by_name(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("uncertain", "named"),
+    ("uncertain", "message"),
     [
         ('"driver.plant.dynamics.resonance" = { uniform = [0.0, 1.0] }', "no key 'resonance'; allowed: form, gain"),
         ('"recording.min_free_mib" = { uniform = [1.0, 2.0] }', "run alike; remove the key"),
@@ -173,15 +176,15 @@ def test_a_rig_that_is_impossible_is_refused_by_name(tmp_path):
         ('"driver.plant.hysteresis.truth" = { choice = ["nominal", "residual"], relative = true }', "allowed: numbers"),
     ],
 )
-def test_a_key_without_effect_or_sense_is_an_error(tmp_path, uncertain, named):
+def test_a_key_without_effect_or_sense_is_an_error(tmp_path, uncertain, message):
     with pytest.raises(ConfigError) as raised:
         CaseRunner(load_campaign(write_campaign(tmp_path, uncertain=uncertain, experiments=STEPS + OTHER_EXPERIMENTS)))
-    assert named in str(raised.value)
+    assert message in str(raised.value)
     assert "uncertain." in str(raised.value)
 
 
 @pytest.mark.parametrize(
-    ("changes", "named"),
+    ("changes", "message"),
     [
         ({"keys": 'axis = "y"'}, "axis: 'y' is unknown; allowed: x"),
         ({"keys": "rigs = 0"}, "rigs"),
@@ -195,10 +198,10 @@ def test_a_key_without_effect_or_sense_is_an_error(tmp_path, uncertain, named):
         ({"configuration": ROOT / "deploy/board.toml"}, "a campaign needs the simulated rig"),
     ],
 )
-def test_a_campaign_that_cannot_run_is_refused_with_its_faults(tmp_path, changes, named):
+def test_a_campaign_that_cannot_run_is_refused_with_its_faults(tmp_path, changes, message):
     with pytest.raises(ConfigError) as raised:
         CaseRunner(load_campaign(write_campaign(tmp_path, **changes)))
-    assert named in str(raised.value)
+    assert message in str(raised.value)
 
 
 def test_all_keys_together_have_an_effect(runner):
@@ -216,7 +219,7 @@ def test_a_dwell_of_no_whole_number_of_periods_keeps_all_steps(tmp_path, dwell_s
 
 
 @pytest.mark.parametrize(
-    ("experiment", "named"),
+    ("experiment", "message"),
     [
         (STEPS.replace("0.03", "1e-5"), "experiment.steps: "),
         ('[[experiment]]\nkind = "sine"\namplitude_um = 1.0\nfrequency_hz = 6000.0\n', "below half of the loop's rate"),
@@ -227,12 +230,12 @@ def test_a_dwell_of_no_whole_number_of_periods_keeps_all_steps(tmp_path, dwell_s
         ('[[experiment]]\nkind = "disturbance"\nstep_um = 1.0\nlasts_s = 1e-5\n', "experiment.disturbance: "),
     ],
 )
-def test_an_experiment_that_no_rig_can_run_is_a_fault_of_the_campaign(tmp_path, experiment, named):
+def test_an_experiment_that_no_rig_can_run_is_a_fault_of_the_campaign(tmp_path, experiment, message):
     path = write_campaign(tmp_path, experiments=experiment)
     path.write_text(path.read_text().partition("[limits]")[0])
     with pytest.raises(ConfigError) as raised:
         CaseRunner(load_campaign(path))
-    assert named in str(raised.value)
+    assert message in str(raised.value)
 
 
 def test_a_limit_of_0_ranks_rigs_by_the_figure(tmp_path):

@@ -1,3 +1,5 @@
+"""Two campaigns compared on common rigs, with McNemar's test and intervals against scipy's distributions."""
+
 from __future__ import annotations
 
 import numpy as np
@@ -21,7 +23,7 @@ def test_the_p_value_is_that_of_an_even_binomial(first, second):
 
 
 def test_intervals_of_a_median_cover_it():
-    """95 % of intervals: of 100, at least 88 cover the true median."""
+    """The intervals are of 95 %: of 100 intervals, at least 88 contain the true median."""
     generator = np.random.default_rng(1)
     covered = 0
     for _ in range(100):
@@ -37,8 +39,9 @@ def test_pairs_with_an_infinite_figure_are_left_out():
     assert np.isnan(paired_difference(np.array([1.0]), np.array([2.0])).low)
 
 
-def store(path, folder, rigs):
-    runner = CaseRunner(load_campaign(path[0], configuration=path[1]))
+def store_campaign(files, folder, rigs):
+    """Run rigs of a campaign (campaign file, configuration) and store their results in a folder. Returns the folder."""
+    runner = CaseRunner(load_campaign(files[0], configuration=files[1]))
     with open_store(folder, runner.campaign, runner.sample_values(0)) as results:
         results.add(Unit(1, 8), [runner.run(rig) for rig in rigs])
     return folder
@@ -46,8 +49,8 @@ def store(path, folder, rigs):
 
 def test_two_configurations_are_compared_on_the_rigs_that_both_have(tmp_path):
     campaign = write_campaign(tmp_path)
-    paper = store((campaign, None), tmp_path / "paper", range(1, 9))
-    robust = store((campaign, ROOT / "deploy/robust.toml"), tmp_path / "robust", range(3, 9))
+    paper = store_campaign((campaign, None), tmp_path / "paper", range(1, 9))
+    robust = store_campaign((campaign, ROOT / "deploy/robust.toml"), tmp_path / "robust", range(3, 9))
     comparison = compare_campaigns(paper, robust)
     assert comparison.rigs == 6
     assert comparison.names == ("stage-paper", "stage-robust")
@@ -62,24 +65,24 @@ def test_two_configurations_are_compared_on_the_rigs_that_both_have(tmp_path):
 
 def test_other_rigs_are_refused(tmp_path):
     campaign = write_campaign(tmp_path)
-    first = store((campaign, None), tmp_path / "first", [1, 2])
-    other = store((write_campaign(tmp_path, keys="rigs = 9"), None), tmp_path / "b", [3, 4])
+    first = store_campaign((campaign, None), tmp_path / "first", [1, 2])
+    other_rigs = store_campaign((write_campaign(tmp_path, keys="rigs = 9"), None), tmp_path / "b", [3, 4])
     with pytest.raises(ConfigError, match="the two campaigns have no rig in common"):
-        compare_campaigns(first, other)
+        compare_campaigns(first, other_rigs)
     path = write_campaign(tmp_path)
     path.write_text(path.read_text().replace("seed = 5", "seed = 6"))
-    seeded = store((path, None), tmp_path / "c", [1, 2])
+    seeded = store_campaign((path, None), tmp_path / "c", [1, 2])
     with pytest.raises(ConfigError, match=r"resonance_shift, .*: the rigs differ"):
         compare_campaigns(first, seeded)
 
 
 def test_other_experiments_and_other_limits_are_refused(tmp_path):
     path = write_campaign(tmp_path)
-    first = store((path, None), tmp_path / "first", [1, 2])
+    first = store_campaign((path, None), tmp_path / "first", [1, 2])
     path.write_text(path.read_text().replace('"steps.settling_ms" = 20.0', '"steps.settling_ms" = 10.0'))
-    limits = store((path, None), tmp_path / "limits", [1, 2])
+    limits = store_campaign((path, None), tmp_path / "limits", [1, 2])
     path.write_text(path.read_text().replace("levels_um = [10.0]", "levels_um = [5.0]"))
-    steps = store((path, None), tmp_path / "steps", [1, 2])
+    steps = store_campaign((path, None), tmp_path / "steps", [1, 2])
     with pytest.raises(ConfigError, match="limits: differ between the two campaigns"):
         compare_campaigns(first, limits)
     with pytest.raises(ConfigError, match="experiments: differ between the two campaigns"):

@@ -1,4 +1,4 @@
-"""A real Dask scheduler with real workers: the same files, and nothing lost when one of these processes is killed."""
+"""A real Dask scheduler with real workers: the same files, and no lost result when one of these processes is killed."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ import pytest
 
 from tests.campaigns.bad_recordings import dask_cluster
 from tests.campaigns.campaign_files import result_files, rtloop, write_campaign
-from tests.campaigns.test_workers import KILLING_RIG, killing
+from tests.campaigns.test_workers import KILLING_RIG, killing_environment
 
 pytestmark = pytest.mark.skipif(find_spec("distributed") is None, reason="distributed is not installed")
 
@@ -28,45 +28,47 @@ def campaign(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def expected(campaign):
-    """The files of the campaign's results, by processes."""
+    """The result files of the campaign, computed by local worker processes: bytes by name."""
     process = rtloop("campaign", "run", campaign, "--out", "one", folder=campaign.parent)
     process.communicate(timeout=200)
     return result_files(campaign.parent / "one")
 
 
-def run_beside(campaign, folder, address, act, tmp_path):
-    """Run a campaign on a scheduler, call `act` once some results are there; return exit code and errors."""
+def run_and_disturb(campaign, folder, address, disturb, tmp_path):
+    """Run a campaign on a scheduler, and call `disturb` after four results. Returns exit code and stderr."""
     process = rtloop("campaign", "run", campaign, "--scheduler", address, "--out", folder, folder=tmp_path)
     while len(list(folder.glob("results/rigs-*.parquet"))) < 4:
         assert process.poll() is None, process.communicate()
         time.sleep(0.02)
-    act()
+    disturb()
     _, errors = process.communicate(timeout=200)
     return process.returncode, errors
 
 
 def test_dask_workers_make_the_same_files(tmp_path):
-    few = write_campaign(tmp_path, keys="rigs = 40\nunit_rigs = 5")
+    small_campaign = write_campaign(tmp_path, keys="rigs = 40\nunit_rigs = 5")
     with dask_cluster(tmp_path, 2) as address:
-        process = rtloop("campaign", "run", few, "--scheduler", address, "--out", tmp_path / "a", folder=tmp_path)
+        process = rtloop(
+            "campaign", "run", small_campaign, "--scheduler", address, "--out", tmp_path / "a", folder=tmp_path
+        )
         _, errors = process.communicate(timeout=200)
-    rtloop("campaign", "run", few, "--out", tmp_path / "one", folder=tmp_path).communicate(timeout=200)
+    rtloop("campaign", "run", small_campaign, "--out", tmp_path / "one", folder=tmp_path).communicate(timeout=200)
     assert result_files(tmp_path / "a") == result_files(tmp_path / "one"), errors
 
 
 @pytest.mark.soak
 def test_a_dask_worker_that_is_killed_costs_nothing(campaign, expected, tmp_path):
-    """A worker dies in mid-flight: its nanny starts another one."""
+    """A worker is killed during its work; its nanny process starts another worker."""
     with dask_cluster(tmp_path, 2) as address:
         worker = _process_ids(address, "print(*c.run(os.getpid).values())")[0]
         kill = partial(os.kill, worker, signal.SIGKILL)
-        code, errors = run_beside(campaign, tmp_path / "b", address, kill, tmp_path)
+        code, errors = run_and_disturb(campaign, tmp_path / "b", address, kill, tmp_path)
         assert code == 1, errors
         assert result_files(tmp_path / "b") == expected
 
 
 def _process_ids(address: str, statement: str) -> list[int]:
-    """Return the numbers that a statement prints, with `c` as a client of a scheduler."""
+    """Run a statement that prints process ids, with `c` as a client of a scheduler. Returns these ids."""
     script = f"import os, sys; from distributed import Client; c = Client(sys.argv[1], timeout=20); {statement}"
     output = subprocess.run([sys.executable, "-c", script, address], capture_output=True, text=True, check=True).stdout
     return [int(number) for number in output.split()]
@@ -77,7 +79,7 @@ def test_a_campaign_whose_scheduler_was_killed_continues_elsewhere(campaign, exp
     folder = tmp_path / "results"
     with dask_cluster(tmp_path, 2) as address:
         (scheduler,) = _process_ids(address, "print(c.run_on_scheduler(os.getpid))")
-        code, errors = run_beside(campaign, folder, address, lambda: os.kill(scheduler, signal.SIGKILL), tmp_path)
+        code, errors = run_and_disturb(campaign, folder, address, lambda: os.kill(scheduler, signal.SIGKILL), tmp_path)
     assert code == 69, errors
     assert "the connection to the scheduler is lost; run the same command again to continue" in errors
     assert "Traceback" not in errors, errors
@@ -93,7 +95,7 @@ def test_a_rig_that_kills_its_dask_worker_each_time_is_set_aside_and_no_other(
     campaign, expected, tmp_path, monkeypatch
 ):
     """Dask starts the rig in several workers before it gives up."""
-    for name, value in killing(tmp_path, False).items():
+    for name, value in killing_environment(tmp_path, False).items():
         monkeypatch.setenv(name, value)
     monkeypatch.setenv("DASK_DISTRIBUTED__SCHEDULER__ALLOWED_FAILURES", "0")
     with dask_cluster(tmp_path, 2) as address:
@@ -129,7 +131,7 @@ OUT_OF_REACH = {
     "tcp://127.0.0.1:99999": "scheduler tcp://127.0.0.1:99999: ",
     "tcp://no-such-host:8786": "scheduler tcp://no-such-host:8786: ",
 }
-EACH = """
+CALL_EACH_SCHEDULER = """
 import sys
 from rtloop.cli import main
 campaign, *addresses = sys.argv[1:]
@@ -140,15 +142,15 @@ for address in addresses:
     except SystemExit as end:
         print("exit", end.code, file=sys.stderr)
 """
-"""Asks each scheduler from one process, which imports Dask once."""
+"""Program that runs the campaign on each scheduler, in one process, as the import of Dask is slow."""
 
 
 def test_a_scheduler_that_cannot_be_reached_is_named(campaign, tmp_path):
-    command = [sys.executable, "-c", EACH, str(campaign), *OUT_OF_REACH]
-    asked = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=200, check=True)
-    told = {text.split()[0]: text for text in asked.stderr.split("= ")[1:]}
-    assert told.keys() == OUT_OF_REACH.keys()
-    for address, text in told.items():
+    command = [sys.executable, "-c", CALL_EACH_SCHEDULER, str(campaign), *OUT_OF_REACH]
+    process = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=200, check=True)
+    messages = {text.split()[0]: text for text in process.stderr.split("= ")[1:]}
+    assert messages.keys() == OUT_OF_REACH.keys()
+    for address, text in messages.items():
         assert (OUT_OF_REACH[address] in text, "exit 69" in text, "Traceback" in text) == (True, True, False), text
 
 

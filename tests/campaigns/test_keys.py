@@ -1,3 +1,5 @@
+"""Keys of a campaign: values are read from options and set in tables, and an unknown key is named."""
+
 from __future__ import annotations
 
 import pytest
@@ -20,15 +22,15 @@ def test_values_are_set_in_a_copy():
 
 
 @pytest.mark.parametrize(
-    ("key", "named"),
+    ("key", "message"),
     [
         ("driver.kind.more", "driver.kind.more: 'more' follows the value 'sim', which is neither a table nor a list"),
         ("driver.plant.hysteresis.history_v.2", "no entry '2'; allowed: 0 … 1"),
         ("axis.y.limits.drive_v", "axis.y.limits.drive_v: no entry 'y'; allowed: x"),
     ],
 )
-def test_a_path_through_no_table_is_refused(key, named):
-    with pytest.raises(ValueError, match=named):
+def test_a_path_through_no_table_is_refused(key, message):
+    with pytest.raises(ValueError, match=message):
         replace_values(TABLES, {key: 1.0})
 
 
@@ -46,7 +48,7 @@ def test_values_are_read_from_the_checked_options_with_defaults():
 
 
 @pytest.mark.parametrize(
-    ("key", "named"),
+    ("key", "message"),
     [
         ("driver.plant.dynamics.resonance", "no key 'resonance'; allowed: form, gain"),
         ("axis.y.limits.drive_v", "no axis 'y'; allowed: x"),
@@ -54,9 +56,9 @@ def test_values_are_read_from_the_checked_options_with_defaults():
         ("laws.x", "unknown key; allowed: keys of driver, axis, loop, recording, service"),
     ],
 )
-def test_an_unknown_key_is_named_with_the_allowed_ones(key, named):
+def test_an_unknown_key_is_named_with_the_allowed_ones(key, message):
     configuration = load(PAPER)
-    with pytest.raises(ValueError, match=named):
+    with pytest.raises(ValueError, match=message):
         option_value(configuration, configuration.driver_options, key)
 
 

@@ -1,4 +1,4 @@
-"""Campaigns whose ticks are late as those of a recorded run were."""
+"""Campaigns with the lateness of a recorded run: positions between late ticks are simulated by python-control."""
 
 from __future__ import annotations
 
@@ -69,28 +69,28 @@ def test_positions_between_ticks_are_those_of_python_control():
 
 
 def make_campaign(folder: Path, lateness_us: tuple[float, ...], keys: str = "", **changes: Any) -> Campaign:
-    """Return a campaign whose rigs draw these numbers."""
+    """Return a campaign whose rigs draw their lateness from `lateness_us`."""
     return replace(load_campaign(write_campaign(folder, keys, **changes)), lateness_us=lateness_us)
 
 
 def test_each_rig_draws_lateness_of_its_own_and_the_same_each_time(tmp_path):
     runner = CaseRunner(make_campaign(tmp_path, (0.0, 110.0, 20.0, 210.0)))
-    first, again, other = runner.run(2), runner.run(2), runner.run(3)
-    assert first == again
+    first, repeated, other_case = runner.run(2), runner.run(2), runner.run(3)
+    assert first == repeated
     assert not first.refusal
     on_time = CaseRunner(make_campaign(tmp_path, ()))
     assert first.values == on_time.run(2).values
     assert first.figures != on_time.run(2).figures
     (path,), (other_path,) = (record_rig(runner, rig, tmp_path / "worst") for rig in (2, 3))
     recording, other_recording = rtloop.load(path), rtloop.load(other_path)
-    assert other.values != first.values
+    assert other_case.values != first.values
     assert not np.array_equal(recording["lateness_us"], other_recording["lateness_us"])
     assert np.unique(np.round(recording["lateness_us"], 6)).tolist() == [0.0, 10.0, 20.0]
     assert np.unique(recording["periods_missed"]).tolist() == [0, 1, 2]
 
 
 def test_the_recording_of_a_rig_has_its_motion_and_replays_identical(tmp_path):
-    """The static error of the figures is that of the recording, whose process drew the same lateness."""
+    """The recording's process draws the same lateness, so that its static error equals the figure."""
     runner = CaseRunner(make_campaign(tmp_path, (*50 * (0.0,), 110.0, 310.0)))
     case = runner.run(4)
     (path,) = record_rig(runner, 4, tmp_path / "worst")
@@ -110,7 +110,7 @@ def test_lateness_below_a_period_changes_no_figure(tmp_path):
 
 @pytest.mark.parametrize("key", ['"driver.latency_ticks" = { choice = [1, 2] }', None])
 def test_rigs_whose_motion_in_missed_periods_is_unknown_are_refused(tmp_path, key):
-    """A drive on its way, or creep, moves the actuator in periods of which there is no record."""
+    """A delayed drive, or creep, moves the actuator in missed periods, which have no record."""
     configuration = tmp_path / "creep.toml"
     paper = PAPER.read_text().replace('"paper-spec.toml"', f'"{PAPER.with_name("paper-spec.toml")}"', 1)
     configuration.write_text(paper.replace("[driver.plant.sensor]", f"{CREEP}[driver.plant.sensor]", 1))
@@ -121,18 +121,18 @@ def test_rigs_whose_motion_in_missed_periods_is_unknown_are_refused(tmp_path, ke
 
 
 def test_the_digest_has_the_numbers_and_not_the_path(tmp_path):
-    without, late, other = (make_campaign(tmp_path, table_us) for table_us in ((), (1.0, 2.0), (1.0, 3.0)))
-    assert len({campaign.digest for campaign in (without, late, other)}) == 3
-    moved = replace(late, options=late.options.model_copy(update={"lateness": "moved.mcap"}))
-    assert moved.digest == late.digest
+    on_time, late, other_table = (make_campaign(tmp_path, table_us) for table_us in ((), (1.0, 2.0), (1.0, 3.0)))
+    assert len({campaign.digest for campaign in (on_time, late, other_table)}) == 3
+    renamed = replace(late, options=late.options.model_copy(update={"lateness": "moved.mcap"}))
+    assert renamed.digest == late.digest
 
 
 def run_paced(folder: Path, *arguments: str) -> Path:
     """Run the paper's loop for half a second by the command line; return its recording."""
     command = [sys.executable, "-m", "rtloop", "run", PAPER, "--duration", "0.5", "--out", folder, "--json", *arguments]
-    done = subprocess.run(list(map(str, command)), capture_output=True, text=True, timeout=200)
-    assert done.returncode in (0, 1), done.stderr  # a busy host may be so late that the loop trips
-    return Path(json.loads(done.stdout)["recording"])
+    process = subprocess.run(list(map(str, command)), capture_output=True, text=True, timeout=200)
+    assert process.returncode in (0, 1), process.stderr  # a busy host may be so late that the loop trips
+    return Path(json.loads(process.stdout)["recording"])
 
 
 def test_a_campaign_reads_the_lateness_of_a_paced_recording(tmp_path):
@@ -186,19 +186,19 @@ def test_a_file_that_is_missing_or_no_recording_is_refused(tmp_path):
 
 
 def test_lateness_of_some_ticks_is_counted_from_their_first_deadline(tmp_path, monkeypatch):
-    """NaN is left out, what is negative counts as 0, and a second is the limit."""
+    """NaN is left out, negative lateness counts as 0, and the limit is one second."""
     columns = {
         "lateness_us": np.array([5.0, np.nan, -1.0, 20.1234, 3.0, 840.0, 90.0]),
         "periods_missed": np.array([0.0, 0.0, 0.0, 0.0, 2.0, 0.0, 3.0]),  # the last one: 590 of 750 µs counted before
     }
 
     class Recording:
-        """A recording at 4 kHz of these columns."""
+        """Stand-in for a recording at 4 kHz with `columns`."""
 
         header = {"rate_hz": 4000.0}  # noqa: RUF012
 
         def read(self, *names: str) -> list[np.ndarray]:
-            """Return columns by name."""
+            """Return the named columns."""
             return [columns[name] for name in names]
 
     monkeypatch.setattr("rtloop.campaigns.recorded_lateness.load", lambda _: Recording())

@@ -1,3 +1,5 @@
+"""All code cells of the documentation's notebook run, with fewer rigs."""
+
 from __future__ import annotations
 
 import json

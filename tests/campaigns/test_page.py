@@ -1,4 +1,4 @@
-"""The page of a campaign: its numbers are those of the Parquet files, it needs nothing beside it, and it escapes."""
+"""The page of a campaign shows the numbers of its Parquet files, needs no other file, and escapes all names."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ class Page(HTMLParser):
 
     def attributes(self, tag: str, name: str) -> list[str]:
         """Return an attribute of each tag of a kind that has it."""
-        return [values[name] or "" for found, values in self.tags if found == tag and name in values]
+        return [values[name] or "" for kind, values in self.tags if kind == tag and name in values]
 
     @property
     def pictures(self) -> list[tuple[bytes, bytes]]:
@@ -80,8 +80,8 @@ def make_runner(folder, name="stage", **options) -> CaseRunner:
     return CaseRunner(load_campaign(path))
 
 
-def store(runner, folder, cases=None) -> Path:
-    """Store the nominal rig and all sampled rigs, or the given results."""
+def store_cases(runner, folder, cases=None) -> Path:
+    """Store the nominal rig and all sampled rigs, or the results `cases`. Returns the folder."""
     rigs = runner.options.rigs
     with open_store(folder, runner.campaign, runner.sample_values(0)) as results:
         results.add(Unit(0, 0), [runner.run(0)])
@@ -90,15 +90,15 @@ def store(runner, folder, cases=None) -> Path:
 
 
 def make_page(folder, page, *options) -> Page:
-    """Write the page of a folder by the command line, and return it."""
+    """Write the page of a folder by the command line. Returns the parsed page."""
     result = run("campaign", "report", folder, "--page", page, *options)
     assert result.exit_code in (0, 1), result.output
     assert str(page) in result.stderr
     return Page(page)
 
 
-def require_whole(page: Page) -> None:
-    """Require a page without scripts and other files, with pictures in both themes and links that exist."""
+def require_complete(page: Page) -> None:
+    """Require a page without scripts and external files, with pictures in both themes, whose links exist."""
     assert "<script" not in page.source.lower()
     assert "http" not in "".join(page.attributes("img", "src") + page.attributes("source", "srcset"))[:100]
     assert not re.search(r"""(src|srcset|href)\s*=\s*["']?(https?:|//|file:)""", page.source)
@@ -114,17 +114,18 @@ def require_whole(page: Page) -> None:
 
 @pytest.fixture(scope="module")
 def campaign(tmp_path_factory):
-    """A campaign with a hostile name, some failures, and recordings of its worst rig."""
+    """Runner, folder and worst rig of a campaign: hostile name, some failures, recordings of the worst rig."""
     folder = tmp_path_factory.mktemp("campaign & results")
     runner = make_runner(folder, "a<b>&c", experiments=STEPS + SCAN)
-    results = store(runner, folder / "50% of <results>")
-    worst = summarise_campaign(results).worst_rigs[0].rig
-    record_rig(runner, worst, results / "worst")
-    return runner, results, worst
+    results = store_cases(runner, folder / "50% of <results>")
+    worst_rig = summarise_campaign(results).worst_rigs[0].rig
+    record_rig(runner, worst_rig, results / "worst")
+    return runner, results, worst_rig
 
 
 @pytest.fixture(scope="module")
 def page(campaign, tmp_path_factory):
+    """The page of the campaign, parsed."""
     return make_page(campaign[1], tmp_path_factory.mktemp("pages") / "of a campaign" / "page.html")
 
 
@@ -132,28 +133,29 @@ def page(campaign, tmp_path_factory):
 def paper(tmp_path_factory):
     """Results of a campaign of the paper's controller."""
     folder = tmp_path_factory.mktemp("paper")
-    return store(make_runner(folder), folder / "results")
+    return store_cases(make_runner(folder), folder / "results")
 
 
 @pytest.fixture(scope="module")
 def robust(tmp_path_factory):
     """Results of a campaign in which no rig fails."""
     folder = tmp_path_factory.mktemp("robust")
-    return store(make_runner(folder, configuration=ROOT / "deploy/robust.toml"), folder / "results")
+    return store_cases(make_runner(folder, configuration=ROOT / "deploy/robust.toml"), folder / "results")
 
 
 @pytest.fixture
 def coarse_pictures(monkeypatch):
-    """Pictures of few points, for a test that looks at other things than the pictures of all points of `page`."""
+    """Draw coarse pictures, for tests of the text; the pictures of `page` are drawn in full."""
     monkeypatch.setattr("rtloop.design.palette.DPI", 20)
 
 
-def rows(folder) -> list[dict]:
+def result_rows(folder) -> list[dict]:
+    """Return the rows of the stored Parquet files."""
     return pyarrow.parquet.read_table(folder / "results").to_pylist()
 
 
 def test_the_yield_is_that_of_the_parquet_files(campaign, page):
-    states = [row["status"] for row in rows(campaign[1]) if row["rig"]]
+    states = [row["status"] for row in result_rows(campaign[1]) if row["rig"]]
     passed, rigs = states.count("passed"), len(states)
     assert 0 < passed < rigs == RIGS
     low = stats.beta.ppf(0.025, passed, rigs - passed + 1)
@@ -164,27 +166,27 @@ def test_the_yield_is_that_of_the_parquet_files(campaign, page):
 
 
 def test_the_figures_are_those_of_the_parquet_files(campaign, page):
-    sampled = [row for row in rows(campaign[1]) if row["rig"]]
+    sampled = [row for row in result_rows(campaign[1]) if row["rig"]]
     assert len(campaign[0].campaign.limits) == 3
     for name in campaign[0].options.figures:
         values = sorted(row[name] for row in sampled)
         quantiles = [values[math.ceil(share * (RIGS - 1))] for share in (0.05, 0.5, 0.95)]
         limit = campaign[0].campaign.limits.get(name)
         beyond = "–" if limit is None else str(sum(value > limit for value in values))
-        nominal = next(row for row in rows(campaign[1]) if row["rig"] == 0)[name]
+        nominal = next(row for row in result_rows(campaign[1]) if row["rig"] == 0)[name]
         cells = [name, *map(value_text, [nominal, *quantiles, values[-1], limit]), beyond]
         assert " ".join(cells) in page.text
 
 
 def test_the_page_is_whole_and_escapes_names(campaign, page):
-    require_whole(page)
+    require_complete(page)
     assert "a<b>" not in page.source
     assert "a&lt;b&gt;&amp;c-paper" in page.source
     assert "a<b>&c-paper" in page.text
 
 
 def test_causes_and_worst_rigs_are_listed_with_pictures_of_their_recordings(campaign, page):
-    runner, results, worst = campaign
+    runner, results, worst_rig = campaign
     summary = summarise_campaign(results)
     for cause, count in summary.causes.items():
         assert f"{count} {cause}" in page.text
@@ -192,24 +194,26 @@ def test_causes_and_worst_rigs_are_listed_with_pictures_of_their_recordings(camp
         values = [value_text(rig.values[key]) for key in runner.keys]
         assert " ".join([str(rig.rig), value_text(rig.ratio), *values, rig.missed]) in page.text
     recordings = [unquote(link) for link in page.attributes("a", "href") if link.endswith(".mcap")]
-    assert [Path(link).name for link in recordings] == [f"rig-{worst:09d}-{name}.mcap" for name in ("steps", "scan")]
+    assert [Path(link).name for link in recordings] == [
+        f"rig-{worst_rig:09d}-{name}.mcap" for name in ("steps", "scan")
+    ]
     assert len(page.pictures) == 3 + 1 + 1
-    assert f"rig {worst}: reference and true position" in page.attributes("img", "alt")
+    assert f"rig {worst_rig}: reference and true position" in page.attributes("img", "alt")
 
 
 def test_a_damaged_recording_is_named_on_the_page(coarse_pictures, campaign, tmp_path):
-    _, results, worst = campaign
+    _, results, worst_rig = campaign
     copy = shutil.copytree(results, tmp_path / "copy", ignore=shutil.ignore_patterns("worst"))
     (copy / "worst").mkdir()
-    (copy / "worst" / f"rig-{worst:09d}-scan.mcap").write_bytes(b"<i>nothing</i>")
+    (copy / "worst" / f"rig-{worst_rig:09d}-scan.mcap").write_bytes(b"<i>nothing</i>")
     page = make_page(copy, tmp_path / "page.html")
-    require_whole(page)
-    assert re.search(rf"rig-{worst:09d}-scan\.mcap: .* Recordings: rig-{worst:09d}-scan\.mcap", page.text)
+    require_complete(page)
+    assert re.search(rf"rig-{worst_rig:09d}-scan\.mcap: .* Recordings: rig-{worst_rig:09d}-scan\.mcap", page.text)
 
 
 def test_a_campaign_without_failures_has_a_page(coarse_pictures, robust, tmp_path):
     page = make_page(robust, tmp_path / "page.html")
-    require_whole(page)
+    require_complete(page)
     assert f"{RIGS} of {RIGS} rigs pass: yield 100 %" in page.text
     assert "as all rigs pass" in page.text
     assert "Causes of failure" not in page.text
@@ -217,8 +221,8 @@ def test_a_campaign_without_failures_has_a_page(coarse_pictures, robust, tmp_pat
 
 def test_a_campaign_without_limits_has_a_page(coarse_pictures, tmp_path):
     runner = make_runner(tmp_path, experiments=SCAN, without_limits=True, uncertain=ONE_KEY)
-    page = make_page(store(runner, tmp_path / "results"), tmp_path / "page.html")
-    require_whole(page)
+    page = make_page(store_cases(runner, tmp_path / "results"), tmp_path / "page.html")
+    require_complete(page)
     assert "The campaign has no limits: a rig fails by a trip alone." in page.text
     assert "nominal, residual" in page.text
     assert len(page.pictures) == 1
@@ -230,8 +234,8 @@ def test_crashed_and_refused_rigs_are_listed_with_their_reasons(coarse_pictures,
     fields = {"figures": {}, "trips": {}, "missed": (), "ratio": math.nan}
     cases[-1] = dataclasses.replace(cases[-1], **fields, refusal="<u>no rig</u>")
     cases.append(crashed_case(FEW_RIGS, runner.sample_values(FEW_RIGS)))
-    page = make_page(store(runner, tmp_path / "results", cases), tmp_path / "page.html")
-    require_whole(page)
+    page = make_page(store_cases(runner, tmp_path / "results", cases), tmp_path / "page.html")
+    require_complete(page)
     assert f"{FEW_RIGS - 1} <u>no rig</u>" in page.text
     assert "<u>" not in page.source
     assert f"{FEW_RIGS} the worker process died" in page.text
@@ -243,15 +247,15 @@ def test_a_campaign_whose_rigs_cannot_run_has_a_page(tmp_path):
     runner = make_runner(tmp_path, keys="rigs = 1")
     fields = {"figures": {}, "trips": {}, "missed": (), "ratio": math.nan}
     refused = dataclasses.replace(runner.run(1), **fields, refusal="no rig")
-    page = make_page(store(runner, tmp_path / "results", [refused]), tmp_path / "page.html")
-    require_whole(page)
+    page = make_page(store_cases(runner, tmp_path / "results", [refused]), tmp_path / "page.html")
+    require_complete(page)
     assert "No rig could run, so that there is no yield." in page.text
 
 
 def test_saltellis_design_shows_indices_and_counts_its_independent_rows(coarse_pictures, tmp_path):
     runner = make_runner(tmp_path, keys='rigs = 20\nsampling = "saltelli"', configuration=ROOT / "deploy/robust.toml")
-    page = make_page(store(runner, tmp_path / "results"), tmp_path / "page.html")
-    require_whole(page)
+    page = make_page(store_cases(runner, tmp_path / "results"), tmp_path / "page.html")
+    require_complete(page)
     assert "8 of 8 rigs pass" in page.text
     assert 'With sampling = "saltelli" rigs depend on each other: the interval is only a guide.' in page.text
     assert "The yield counts only rigs that are independent of each other: 8 of 20 rigs." in page.text
@@ -262,12 +266,13 @@ def test_two_campaigns_are_compared_on_one_page(coarse_pictures, paper, robust, 
     path = tmp_path / "comparison.html"
     assert run("campaign", "compare", paper, robust, "--page", path).exit_code == 0
     page = Page(path)
-    require_whole(page)
+    require_complete(page)
     passed = [
-        {row["rig"] for row in rows(folder) if row["rig"] and row["status"] == "passed"} for folder in (paper, robust)
+        {row["rig"] for row in result_rows(folder) if row["rig"] and row["status"] == "passed"}
+        for folder in (paper, robust)
     ]
-    alone = [len(passed[0] - passed[1]), len(passed[1] - passed[0])]
-    assert f"Passed by stage-paper alone: {alone[0]}; by stage-robust alone: {alone[1]}." in page.text
+    passed_alone = [len(passed[0] - passed[1]), len(passed[1] - passed[0])]
+    assert f"Passed by stage-paper alone: {passed_alone[0]}; by stage-robust alone: {passed_alone[1]}." in page.text
     assert "First campaign: stage-paper" in page.text
     assert "Second campaign: stage-robust" in page.text
 
@@ -276,7 +281,7 @@ def test_a_run_writes_its_page(tmp_path):
     path = write_campaign(tmp_path, keys="rigs = 2")
     result = run("campaign", "run", path, "--out", tmp_path / "out", "--jobs", 1, "--page", tmp_path / "page.html")
     assert result.exit_code in (0, 1), result.output
-    require_whole(Page(tmp_path / "page.html"))
+    require_complete(Page(tmp_path / "page.html"))
 
 
 def test_without_matplotlib_the_report_names_the_extra(campaign, tmp_path, monkeypatch):
@@ -326,9 +331,9 @@ def test_a_key_that_fails_rigs_at_both_ends_comes_first(campaign):
     """Medians of passed and failed rigs are equal for such a key: the distributions are compared."""
     summary = dataclasses.replace(summarise_campaign(campaign[1]), sensitivity={})
     generator = np.random.default_rng(3)
-    shift, other, kind = generator.uniform(-1, 1, 400), generator.uniform(size=400), generator.choice(["a", "b"], 400)
+    shift, noise, kind = generator.uniform(-1, 1, 400), generator.uniform(size=400), generator.choice(["a", "b"], 400)
     status = np.where(np.abs(shift) < 0.5, "passed", "failed")
-    columns = {"other": other, "kind": kind, "shift": shift, "status": status}
+    columns = {"other": noise, "kind": kind, "shift": shift, "status": status}
     ranked = rank_keys(["other", "kind", "shift"], columns, summary)
     assert ranked.keys[0] == "shift"
     assert re.search(r"largest difference: shift 0\.[45]\d+,", ranked.measure)
@@ -369,7 +374,7 @@ def test_a_figure_has_a_picture(values, limit):
 @pytest.mark.parametrize("values", VALUES)
 @pytest.mark.parametrize("limit", LIMITS)
 def test_every_figure_has_a_picture(values, limit):
-    """Every kind of values beside every kind of limit: a picture takes a quarter of a second."""
+    """All pairs of values and limits; one picture takes a quarter of a second."""
     require_pictures(values, limit)
 
 

@@ -1,3 +1,5 @@
+"""Samples of campaigns: independent of batches, uniform by the Kolmogorov–Smirnov test of scipy, evenly spread."""
+
 from __future__ import annotations
 
 import numpy as np

@@ -1,3 +1,5 @@
+"""The search for the worst rig and for a boundary, on planted functions whose solution is known."""
+
 from __future__ import annotations
 
 import math
@@ -20,17 +22,20 @@ BAND, WIDTH = 0.0637, 0.0004
 
 @pytest.fixture(scope="module")
 def runner(tmp_path_factory):
+    """The runner of a campaign of the paper's loop."""
     return CaseRunner(load_campaign(write_campaign(tmp_path_factory.mktemp("campaign"))))
 
 
-def planted(values) -> float:
-    """Return the height of a resonance that is met in a narrow band of frequency, and at low damping."""
+def planted_height(values) -> float:
+    """Return the height of a resonance that is high only in a narrow band of the shift, and at low damping."""
     return 1.0 / math.hypot((values[SHIFT] - BAND) / WIDTH, 1.0) / values[DAMPING]
 
 
 def run_planted(rigs):
+    """Return results of rigs, as (number, values), whose figure is the height of the planted resonance."""
     return [
-        CaseResult(rig, values, {"steps.settling_ms": planted(values)}, {}, (), planted(values)) for rig, values in rigs
+        CaseResult(rig, values, {"steps.settling_ms": planted_height(values)}, {}, (), planted_height(values))
+        for rig, values in rigs
     ]
 
 
@@ -43,21 +48,21 @@ def sobol_rigs(runner, seed: int) -> int:
     shares = unit_samples("sobol", runner.keys, 0, 8192, 8192, seed)
     for count, row in enumerate(shares, start=1):
         values = {key: runner.quantile_value(key, share) for key, share in zip(runner.keys, row, strict=True)}
-        if planted(values) >= TARGET:
+        if planted_height(values) >= TARGET:
             return count
     return 8192
 
 
 def test_the_search_finds_a_narrow_band_with_fewer_rigs_than_sobols_sequence(runner, tmp_path):
-    searched, drawn = [], []
+    search_rigs, sequence_rigs = [], []
     for seed in range(20):
         seeded = CaseRunner(load_campaign(write_campaign(tmp_path).rename(tmp_path / f"{seed}.toml")))
         seeded.options = seeded.options.model_copy(update={"seed": seed})
         result = find_worst(seeded, run_planted, 4096, target=TARGET)
         assert result.figure >= TARGET
-        searched.append(result.rigs)
-        drawn.append(sobol_rigs(runner, seed))
-    assert np.median(searched) < 0.5 * np.median(drawn), (searched, drawn)
+        search_rigs.append(result.rigs)
+        sequence_rigs.append(sobol_rigs(runner, seed))
+    assert np.median(search_rigs) < 0.5 * np.median(sequence_rigs), (search_rigs, sequence_rigs)
 
 
 def test_the_search_tries_about_as_many_rigs_as_allowed(runner):
@@ -67,7 +72,7 @@ def test_the_search_tries_about_as_many_rigs_as_allowed(runner):
 
 
 def test_a_rig_that_tripped_is_the_worst_whatever_the_figure(runner):
-    """It trips early, and its figure is small."""
+    """The tripped rig has a small figure, as it trips early."""
 
     def evaluate(rigs):
         cases = run_planted(rigs)
@@ -110,22 +115,22 @@ def test_an_end_without_a_failure_is_open_and_a_nominal_failure_is_said(runner):
 
 def test_a_real_search_returns_the_rig_that_it_ran(runner):
     result = find_worst(runner, lambda rigs: [runner.run(rig, values) for rig, values in rigs], 32, "steps.settling_ms")
-    again = runner.run(result.worst.rig, result.worst.values)
-    assert again == result.worst
+    repeated = runner.run(result.worst.rig, result.worst.values)
+    assert repeated == result.worst
 
 
 @pytest.mark.parametrize(
-    ("uncertain", "figure", "named"),
+    ("uncertain", "figure", "message"),
     [
         ('"driver.latency_ticks" = { choice = [0, 1] }', "steps.height", "figure: 'steps.height'; allowed: steps.over"),
         ('"driver.plant.hysteresis.truth" = { choice = ["nominal", "residual"] }', "", "a search needs numbers"),
     ],
 )
-def test_a_search_that_cannot_be_is_refused(tmp_path, uncertain, figure, named):
+def test_a_search_that_cannot_be_is_refused(tmp_path, uncertain, figure, message):
     runner = CaseRunner(load_campaign(write_campaign(tmp_path, uncertain=uncertain)))
     with pytest.raises(ConfigError) as raised:
         find_worst(runner, run_planted, 10, figure)
-    assert named in str(raised.value)
+    assert message in str(raised.value)
 
 
 def test_a_boundary_of_another_key_is_refused(runner):
@@ -144,13 +149,13 @@ def test_a_side_on_which_the_range_does_not_lie_is_not_searched(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("key", "distribution", "named"),
+    ("key", "distribution", "message"),
     [
         ("driver.latency_ticks", "choice = [0, 3]", "allowed: keys with a range"),
         ("driver.plant.sensor.bandwidth_hz", "uniform = [2e3, 4e3]", "has no value in the configuration; set a value"),
     ],
 )
-def test_a_boundary_without_a_range_or_a_nominal_value_is_refused(tmp_path, key, distribution, named):
+def test_a_boundary_without_a_range_or_a_nominal_value_is_refused(tmp_path, key, distribution, message):
     runner = CaseRunner(load_campaign(write_campaign(tmp_path, uncertain=f'"{key}" = {{ {distribution} }}')))
-    with pytest.raises(ConfigError, match=named):
+    with pytest.raises(ConfigError, match=message):
         find_boundary(runner, key, run_planted)

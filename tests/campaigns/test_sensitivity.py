@@ -1,3 +1,5 @@
+"""Sensitivity indices against the analytic indices of Ishigami's function."""
+
 from __future__ import annotations
 
 import numpy as np
@@ -22,7 +24,7 @@ def ishigami(shares: np.ndarray) -> np.ndarray:
 
 
 def test_the_indices_of_ishigamis_function_lie_in_their_intervals():
-    """Intervals of 95 %: of 60 indices by ten designs, at least 54 lie inside. A third key has no effect of its own."""
+    """At least 54 of 60 indices (ten designs) lie in their 95 % intervals. Key c has an effect by interaction only."""
     rigs, covered = 1024 * block_size(3), 0
     for seed in range(10):
         indices = sensitivity_indices(ishigami(unit_samples("saltelli", KEYS, 0, rigs, rigs, seed)), KEYS)
@@ -48,6 +50,6 @@ def test_a_half_block_is_left_out_and_without_variance_there_is_no_index():
     ]
     constant = sensitivity_indices(np.ones(640), KEYS)
     infinite = sensitivity_indices(np.append(np.inf, np.arange(639.0)), KEYS)
-    few = sensitivity_indices(np.arange(5.0), KEYS)
-    for indices in (constant, infinite, few):
+    too_few = sensitivity_indices(np.arange(5.0), KEYS)
+    for indices in (constant, infinite, too_few):
         assert all(np.isnan(value) for index in indices.values() for value in index)

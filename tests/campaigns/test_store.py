@@ -1,3 +1,5 @@
+"""The store of results: no rig is lost or counted twice, whatever order, damage or kill its files met."""
+
 from __future__ import annotations
 
 import math
@@ -20,20 +22,24 @@ UNIT = Unit(1, 4)
 
 @pytest.fixture
 def runner(tmp_path):
+    """The runner of a campaign of eight rigs in units of four."""
     return CaseRunner(load_campaign(write_campaign(tmp_path, keys="rigs = 8\nunit_rigs = 4")))
 
 
 @pytest.fixture
 def folder(tmp_path):
+    """The folder of the stored results; it does not exist yet."""
     return tmp_path / "results of a campaign"
 
 
 def store_rigs(runner, folder, unit, rigs) -> None:
+    """Run rigs of a unit and store their results in a folder."""
     with open_store(folder, runner.campaign, runner.sample_values(0)) as store:
         store.add(unit, [runner.run(rig) for rig in rigs])
 
 
-def missing(runner, folder, unit=UNIT) -> list[int]:
+def missing_rigs(runner, folder, unit=UNIT) -> list[int]:
+    """Return the rigs of a unit that have no stored result."""
     with open_store(folder, runner.campaign, runner.sample_values(0)) as store:
         return list(store.missing(unit))
 
@@ -62,11 +68,11 @@ def test_rigs_that_come_later_make_the_file_that_all_would_have_made(runner, fol
         store_rigs(runner, folder, UNIT, rigs)
     store_rigs(runner, tmp_path / "together", UNIT, [1, 2, 3, 4])
     assert result_files(folder) == result_files(tmp_path / "together")
-    assert missing(runner, folder) == []
+    assert missing_rigs(runner, folder) == []
 
 
 def test_a_rig_that_is_stored_again_counts_once(runner, folder):
-    """A worker that reports late, after its rigs ran elsewhere, changes nothing."""
+    """A worker may report late, after its rigs ran elsewhere; its report must not change a result."""
     store_rigs(runner, folder, UNIT, [1, 2, 3, 4])
     before = result_files(folder)
     store_rigs(runner, folder, UNIT, [2, 3])
@@ -74,13 +80,13 @@ def test_a_rig_that_is_stored_again_counts_once(runner, folder):
     assert summarise_campaign(folder).yield_of_rigs.rigs == 4
 
 
-@pytest.mark.parametrize("kept", [0, 4, 500, -1])
-def test_a_damaged_file_is_set_aside_and_its_rigs_are_missing(runner, folder, kept):
+@pytest.mark.parametrize("length", [0, 4, 500, -1])
+def test_a_damaged_file_is_set_aside_and_its_rigs_are_missing(runner, folder, length):
     store_rigs(runner, folder, UNIT, [1, 2, 3, 4])
     (path,) = (folder / "results").iterdir()
     content = path.read_bytes()
-    path.write_bytes(content[:kept])
-    assert missing(runner, folder) == [1, 2, 3, 4]
+    path.write_bytes(content[:length])
+    assert missing_rigs(runner, folder) == [1, 2, 3, 4]
     assert [file.name for file in (folder / "results").iterdir()] == [f".{path.name}{DAMAGED}"]
     store_rigs(runner, folder, UNIT, [1, 2, 3, 4])
     assert path.read_bytes() == content
@@ -96,13 +102,13 @@ def test_a_damaged_file_is_named_by_the_report(runner, folder):
 
 def test_the_results_of_another_campaign_are_refused(runner, folder, tmp_path):
     store_rigs(runner, folder, UNIT, [1])
-    other = CaseRunner(
+    other_runner = CaseRunner(
         load_campaign(
             write_campaign(tmp_path, keys="rigs = 8\nunit_rigs = 4", experiments=STEPS.replace("10.0", "9.0"))
         )
     )
     with pytest.raises(ConfigError, match="campaign 'stage-paper', which differs from this one in experiments, digest"):
-        missing(other, folder)
+        missing_rigs(other_runner, folder)
 
 
 def test_two_processes_do_not_write_to_one_folder(runner, folder):
@@ -110,8 +116,8 @@ def test_two_processes_do_not_write_to_one_folder(runner, folder):
         open_store(folder, runner.campaign, runner.sample_values(0)),
         pytest.raises(UnavailableError, match="another process runs this campaign"),
     ):
-        missing(runner, folder)
-    assert missing(runner, folder) == [1, 2, 3, 4]
+        missing_rigs(runner, folder)
+    assert missing_rigs(runner, folder) == [1, 2, 3, 4]
 
 
 def test_a_write_that_fails_loses_no_earlier_result(runner, folder, monkeypatch):
@@ -126,7 +132,7 @@ def test_a_write_that_fails_loses_no_earlier_result(runner, folder, monkeypatch)
         store_rigs(runner, folder, UNIT, [3])
     monkeypatch.undo()
     assert result_files(folder) == before
-    assert missing(runner, folder) == [3, 4]
+    assert missing_rigs(runner, folder) == [3, 4]
 
 
 def test_the_summary_counts_every_state_of_a_rig(runner, folder):
@@ -150,7 +156,7 @@ def test_the_summary_counts_every_state_of_a_rig(runner, folder):
 
 
 def test_a_kill_between_writing_and_removing_a_file_stores_no_rig_twice(runner, folder):
-    """A campaign with more rigs has longer files; the shorter one that was left behind is removed."""
+    """A campaign with more rigs has longer files; the shorter file that a kill left is removed."""
     store_rigs(runner, folder, Unit(1, 2), [1, 2])
     (short,) = (folder / "results").iterdir()
     content = short.read_bytes()
@@ -160,7 +166,7 @@ def test_a_kill_between_writing_and_removing_a_file_stores_no_rig_twice(runner, 
         InputFileError, match="some rigs are stored twice, as after a run that was killed; run the campaign again"
     ):
         summarise_campaign(folder)
-    assert missing(runner, folder) == []
+    assert missing_rigs(runner, folder) == []
     assert summarise_campaign(folder).yield_of_rigs.rigs == 4
 
 
@@ -174,12 +180,12 @@ def test_a_file_of_another_name_is_ignored_and_one_that_cannot_be_read_stays(run
     store_rigs(runner, folder, UNIT, [1, 2, 3, 4])
     (path,) = (folder / "results").iterdir()
     (folder / "results/rigs-copy.parquet").write_bytes(path.read_bytes())
-    assert missing(runner, folder) == []
+    assert missing_rigs(runner, folder) == []
     assert summarise_campaign(folder).yield_of_rigs.rigs == 4
     path.unlink()
     path.symlink_to("rigs-copy.parquet")
     with pytest.raises(OutputError, match=path.name):
-        missing(runner, folder)
+        missing_rigs(runner, folder)
     assert path.is_symlink()
 
 
@@ -187,4 +193,4 @@ def test_the_results_of_another_version_are_refused(runner, folder, monkeypatch)
     store_rigs(runner, folder, UNIT, [1])
     monkeypatch.setattr("rtloop.campaigns.unit.__version__", "0.0.1")
     with pytest.raises(ConfigError, match="which differs from this one in versions"):
-        missing(runner, folder)
+        missing_rigs(runner, folder)

@@ -1,3 +1,5 @@
+"""Distributions of uncertain keys against the quantiles of scipy's distributions."""
+
 from __future__ import annotations
 
 import numpy as np
@@ -33,7 +35,7 @@ def test_choices_are_equally_likely():
 
 
 @pytest.mark.parametrize(
-    ("options", "named"),
+    ("options", "message"),
     [
         ({}, "no distribution; allowed: exactly one of"),
         ({"uniform": (0.0, 1.0), "normal": (0.0, 1.0)}, "uniform, normal; allowed: exactly one of"),
@@ -45,10 +47,10 @@ def test_choices_are_equally_likely():
         ({"uniform": (0.0, float("nan"))}, "finite"),
     ],
 )
-def test_other_options_are_refused(options, named):
+def test_other_options_are_refused(options, message):
     with pytest.raises(ValidationError) as raised:
         UncertainOptions(**options)
-    assert named in str(raised.value)
+    assert message in str(raised.value)
 
 
 def test_a_normal_that_does_not_reach_its_limits_is_refused():

@@ -1,4 +1,4 @@
-"""Real worker processes: equal results whatever runs them, and after any of them was killed."""
+"""Real worker processes: equal results for any number of workers, and after any process was killed."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from tests.campaigns.campaign_files import result_files, rtloop, write_campaign
 from tests.users import ROOT_ONLY
 
 KILLING_RIG = 7
-DIES = f"""
+DYING_WORKER_HOOK = f"""
 import os, sys
 if os.environ.get("KILLING"):
     import rtloop.campaigns.case as case
@@ -33,7 +33,7 @@ if os.environ.get("KILLING"):
         return run(self, rig, values)
     case.CaseRunner.run = run_or_die
 """
-"""A `sitecustomize` with which one rig ends its worker by SIGSEGV: each time, or ONCE, as the file KILLING notes."""
+"""A `sitecustomize`: one rig ends its worker by SIGSEGV; with ONCE, only until the file KILLING exists."""
 
 
 @pytest.fixture(scope="module")
@@ -44,16 +44,16 @@ def campaign(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def expected(campaign):
-    """The files of the campaign's results, by one worker without an incident."""
+    """The result files of the campaign, computed by one worker that is not disturbed: bytes by name."""
     process = rtloop("campaign", "run", campaign, "--jobs", 1, "--out", "one", folder=campaign.parent)
     _, errors = process.communicate(timeout=200)
     assert process.returncode == 1, errors  # some rigs fail
     return result_files(campaign.parent / "one")
 
 
-def killing(tmp_path: Path, once: bool) -> dict[str, str]:
-    """Return the environment in which rig KILLING_RIG ends its worker."""
-    (tmp_path / "sitecustomize.py").write_text(DIES)
+def killing_environment(tmp_path: Path, once: bool) -> dict[str, str]:
+    """Return the environment in which rig KILLING_RIG ends its worker: each time, or once."""
+    (tmp_path / "sitecustomize.py").write_text(DYING_WORKER_HOOK)
     paths = [str(tmp_path), *filter(None, [os.environ.get("PYTHONPATH")])]
     return {
         "PYTHONPATH": os.pathsep.join(paths),
@@ -118,7 +118,7 @@ def test_a_worker_that_dies_once_costs_nothing(campaign, expected, tmp_path):
         "--out",
         "results",
         folder=tmp_path,
-        environment=killing(tmp_path, True),
+        environment=killing_environment(tmp_path, True),
     )
     _, errors = process.communicate(timeout=200)
     assert (tmp_path / "killed").exists(), errors
@@ -128,7 +128,7 @@ def test_a_worker_that_dies_once_costs_nothing(campaign, expected, tmp_path):
 def test_a_rig_that_kills_its_worker_each_time_is_set_aside_and_no_other(campaign, expected, tmp_path):
     process = rtloop(
         "campaign", "run", campaign, "--jobs", 2, "--out", "results", "--json",
-        folder=tmp_path, environment=killing(tmp_path, False),
+        folder=tmp_path, environment=killing_environment(tmp_path, False),
     )  # fmt: skip
     output, errors = process.communicate(timeout=200)
     summary = json.loads(output)
@@ -149,18 +149,18 @@ def test_a_rig_repeats_with_equal_bytes(campaign, expected, tmp_path):
 
 
 def test_a_worker_of_another_version_is_refused_by_name(campaign):
-    here = WorkerFacts.of_this_process()
-    others = tuple((name, "0.0.1" if name == "numpy" else number) for name, number in here.versions)
+    facts = WorkerFacts.of_this_process()
+    other_versions = tuple((name, "0.0.1" if name == "numpy" else number) for name, number in facts.versions)
     with pytest.raises(
         OtherVersion, match=r"this worker has numpy [\d.]+, the coordinator 0\.0\.1; install equal versions"
     ):
-        run_unit(load_campaign(campaign), [1], replace(here, versions=others))
+        run_unit(load_campaign(campaign), [1], replace(facts, versions=other_versions))
 
 
 @ROOT_ONLY
 @pytest.mark.soak
 def test_a_full_disk_loses_no_result_and_the_same_command_continues(campaign, expected, tmp_path):
-    """A disk of 40 KiB has room for the first units."""
+    """A disk of 40 KiB has room for the first units only."""
     disk, folder = tmp_path / "disk", tmp_path / "disk/results"
     disk.mkdir()
     subprocess.run(["mount", "-t", "tmpfs", "-o", "size=40k", "tmpfs", str(disk)], check=True)
@@ -181,7 +181,7 @@ def test_a_full_disk_loses_no_result_and_the_same_command_continues(campaign, ex
 
 
 @pytest.mark.parametrize(
-    ("arguments", "code", "named"),
+    ("arguments", "code", "message"),
     [
         (["campaign", "run", "nothing.toml"], 66, "nothing.toml: No such file"),
         (["campaign", "report", "nothing"], 66, "nothing/campaign.json: No such file"),
@@ -193,18 +193,18 @@ def test_a_full_disk_loses_no_result_and_the_same_command_continues(campaign, ex
         (["campaign", "rerun", "stage.toml", "61"], 2, "RIG: value is 61; allowed: 0 … 60"),
     ],
 )
-def test_a_mistake_of_the_command_line_is_named(campaign, arguments, code, named, monkeypatch):
+def test_a_mistake_of_the_command_line_is_named(campaign, arguments, code, message, monkeypatch):
     monkeypatch.chdir(campaign.parent)
-    ran = run(*arguments)
-    assert (ran.exit_code, named in ran.stderr) == (code, True), ran.output
+    result = run(*arguments)
+    assert (result.exit_code, message in result.stderr) == (code, True), result.output
 
 
 def test_a_campaign_from_python_returns_the_rows_of_its_files(campaign, expected, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     table = rtloop_campaign(campaign, rigs=30, jobs=1)
-    again = rtloop_campaign(campaign, rigs=30, jobs=1, out="campaigns/stage-paper")
+    repeated = rtloop_campaign(campaign, rigs=30, jobs=1, out="campaigns/stage-paper")
     assert list(table["rig"]) == list(range(31))
-    assert table.equals(again)
+    assert table.equals(repeated)
     files = result_files(Path("campaigns/stage-paper"))
     assert {name: content for name, content in files.items() if name in expected} == {
         name: content for name, content in expected.items() if name in files

@@ -1,3 +1,5 @@
+"""The yield of a campaign with its interval, against scipy's beta distributions."""
+
 from __future__ import annotations
 
 import math
@@ -10,7 +12,7 @@ from rtloop.campaigns.summary import clopper_pearson
 
 @pytest.mark.parametrize(("passed", "rigs"), [(0, 10), (10, 10), (7, 10), (999, 1000), (50, 100)])
 def test_the_interval_is_that_of_clopper_and_pearson(passed, rigs):
-    """Its ends are quantiles of beta distributions."""
+    """The ends of the interval are quantiles of beta distributions."""
     estimate = clopper_pearson(passed, rigs)
     low = stats.beta.ppf(0.025, passed, rigs - passed + 1) if passed else 0.0
     high = stats.beta.ppf(0.975, passed + 1, rigs - passed) if passed < rigs else 1.0

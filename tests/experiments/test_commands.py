@@ -1,4 +1,4 @@
-"""`rtloop experiment` as a user meets it: real processes, real recordings, the report from these alone."""
+"""`rtloop experiment` with real recordings: figures against eq (5) of the paper, and reports of recordings alone."""
 
 from __future__ import annotations
 
@@ -28,47 +28,51 @@ QUICK = (
 )  # fmt: skip
 
 
-def command(*arguments: str | Path) -> Result:
+def run_command(*arguments: str | Path) -> Result:
+    """Run `rtloop experiment` in this process."""
     return CliRunner().invoke(main, ["experiment", *map(str, arguments)])
 
 
 @pytest.fixture(scope="module")
 def campaign(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any]]:
-    """Folder and JSON of a run of three quick experiments, one of them with a run that trips."""
+    """Folder and JSON report of three quick experiments, one of which has a run that trips."""
     folder = tmp_path_factory.mktemp("experiments")
     names = ("step-response", "compensation", "robustness")
-    command = [sys.executable, "-m", "rtloop", "experiment", "run", *names, str(PAPER), *QUICK, "--json", "--out"]
-    ran = subprocess.run([*command, str(folder)], env=ENVIRONMENT, capture_output=True, text=True, timeout=TIMEOUT_S)
-    assert ran.returncode == 0, ran.stderr
-    assert "Traceback" not in ran.stderr
-    return folder, json.loads(ran.stdout)
+    base_command = [sys.executable, "-m", "rtloop", "experiment", "run", *names, str(PAPER), *QUICK, "--json", "--out"]
+    process = subprocess.run(
+        [*base_command, str(folder)], env=ENVIRONMENT, capture_output=True, text=True, timeout=TIMEOUT_S
+    )
+    assert process.returncode == 0, process.stderr
+    assert "Traceback" not in process.stderr
+    return folder, json.loads(process.stdout)
 
 
-def rows(content: dict[str, Any], name: str) -> dict[str, Any]:
+def section_rows(content: dict[str, Any], name: str) -> dict[str, Any]:
+    """Return the rows of an experiment's section of a report, by quantity."""
     section = next(section for section in content["experiments"] if section["name"] == name)
     return {row["quantity"]: row for row in section["rows"]}
 
 
 def test_the_step_is_that_of_eq_5(campaign: tuple[Path, dict[str, Any]]) -> None:
-    found = rows(campaign[1], "step-response")
-    assert found["overshoot"]["run"] == pytest.approx(14.474, abs=0.3)
-    assert found["frequency of the ringing"]["run"] == pytest.approx(595.50, abs=0.2)
-    assert found["damping ratio of the ringing"]["run"] == pytest.approx(0.00735, abs=1e-4)
-    assert found["overshoot"]["claimed"] == "9.5 %"
-    assert found["overshoot"]["as_claimed"] is False
-    assert found["overshoot"]["as_the_model"] is True
-    assert "not as claimed" in found["frequency of the ringing"]["verdict"]
+    rows = section_rows(campaign[1], "step-response")
+    assert rows["overshoot"]["run"] == pytest.approx(14.474, abs=0.3)
+    assert rows["frequency of the ringing"]["run"] == pytest.approx(595.50, abs=0.2)
+    assert rows["damping ratio of the ringing"]["run"] == pytest.approx(0.00735, abs=1e-4)
+    assert rows["overshoot"]["claimed"] == "9.5 %"
+    assert rows["overshoot"]["as_claimed"] is False
+    assert rows["overshoot"]["as_the_model"] is True
+    assert "not as claimed" in rows["frequency of the ringing"]["verdict"]
 
 
 def test_compensation_leaves_the_hysteresis_of_the_rig(campaign: tuple[Path, dict[str, Any]]) -> None:
-    found = rows(campaign[1], "compensation")
+    rows = section_rows(campaign[1], "compensation")
     delay_s = 925 / 4.59e5 - 1 / 1430 + 0.5e-4  # D's slowest poles and zero, and half a tick of hold
     lag_um = 2 * 2 * np.pi * 0.1 * 40.0 * delay_s  # of both branches, where the sine is fastest
-    assert found["h/H after compensation"]["run"] == pytest.approx(3.75 + 100 * lag_um / 80, abs=0.03)
+    assert rows["h/H after compensation"]["run"] == pytest.approx(3.75 + 100 * lag_um / 80, abs=0.03)
 
 
 def test_a_shifted_resonance_trips_and_is_a_result(campaign: tuple[Path, dict[str, Any]]) -> None:
-    section = next(one for one in campaign[1]["experiments"] if one["name"] == "robustness")
+    section = next(entry for entry in campaign[1]["experiments"] if entry["name"] == "robustness")
     assert section["problem"] is None
     assert [row[2] for row in section["tables"][0]["rows"]] == ["settles", "trips (oscillation)"]
 
@@ -77,13 +81,13 @@ def test_the_report_of_the_recordings_alone_is_that_of_the_run(
     campaign: tuple[Path, dict[str, Any]], tmp_path: Path
 ) -> None:
     folder, content = campaign
-    again = command("report", folder, "--out", tmp_path, "--json")
-    assert again.exit_code == 0, again.output
-    found = json.loads(again.stdout)
+    result = run_command("report", folder, "--out", tmp_path, "--json")
+    assert result.exit_code == 0, result.output
+    repeated = json.loads(result.stdout)
     for key in ("files", "interrupted", "skipped"):
         content.pop(key, None)
-        found.pop(key, None)
-    assert found == content
+        repeated.pop(key, None)
+    assert repeated == content
     assert json.loads((tmp_path / "report.json").read_text()) == json.loads((folder / "report.json").read_text())
     page = (tmp_path / "report.html").read_text()
     assert "<script" not in page
@@ -93,7 +97,7 @@ def test_the_report_of_the_recordings_alone_is_that_of_the_run(
 
 
 def test_a_missing_recording_changes_the_report(campaign: tuple[Path, dict[str, Any]], tmp_path: Path) -> None:
-    """The equality above can fail: one recording less is another report."""
+    """A report of fewer recordings differs, so that the equality of reports above can fail."""
     folder, content = campaign
     for path in folder.glob("*robustness*.mcap"):
         shutil.copy(path, tmp_path)
@@ -104,14 +108,14 @@ def test_a_missing_recording_changes_the_report(campaign: tuple[Path, dict[str, 
 
 
 def test_impossible_experiments_name_the_reason(tmp_path: Path) -> None:
-    nothing = command("report", tmp_path)
-    assert (nothing.exit_code, "no recording (*.mcap) found" in nothing.output) == (66, True)
-    unknown = command("run", "fig3", PAPER)
+    empty = run_command("report", tmp_path)
+    assert (empty.exit_code, "no recording (*.mcap) found" in empty.output) == (66, True)
+    unknown = run_command("run", "fig3", PAPER)
     assert (unknown.exit_code, "'fig3' is not an experiment" in unknown.output) == (78, True)
-    fixed = command("run", "disturbance", BOARD, "--out", tmp_path)
+    fixed = run_command("run", "disturbance", BOARD, "--out", tmp_path)
     assert fixed.exit_code == 1
     assert "driver.kind: 'shm'; allowed: 'sim', because this experiment changes" in fixed.output
-    listed = command("list")
+    listed = run_command("list")
     assert listed.exit_code == 0
     assert "harmonic.amplitude_um=2.0" in listed.output
 
@@ -128,7 +132,7 @@ def test_impossible_experiments_name_the_reason(tmp_path: Path) -> None:
     ],
 )
 def test_an_impossible_multisine_is_refused_before_the_run(setting: str, message: str, tmp_path: Path) -> None:
-    refused = command("run", "response", PAPER, "--set", f"response.{setting}", "--out", tmp_path)
+    refused = run_command("run", "response", PAPER, "--set", f"response.{setting}", "--out", tmp_path)
     assert (refused.exit_code, type(refused.exception)) == (78, SystemExit)
     assert message in refused.output
     assert list(tmp_path.iterdir()) == []
@@ -140,28 +144,28 @@ def test_an_interrupted_campaign_parks_and_reports(tmp_path: Path) -> None:
 
 
 def test_a_compared_configuration_gives_the_same_figures_alone(tmp_path: Path) -> None:
-    """Virtual time: the same run to the last bit, whatever it stands beside, and again from the recordings."""
+    """In virtual time, a run has the same bits alone and beside another run, and in the report of its recordings."""
     robust = PAPER.with_name("robust.toml")
     short = ("--set", "steps.levels_um=[10.0, 0.0]", "--set", "steps.dwell_s=0.1", "--json", "--out")
     both, alone = (
-        command("run", "steps", *configurations, *short, tmp_path / name)
+        run_command("run", "steps", *configurations, *short, tmp_path / name)
         for name, configurations in (("both", (PAPER, "--beside", robust)), ("alone", (robust,)))
     )
     assert (both.exit_code, alone.exit_code) == (0, 0), both.output + alone.output
-    content, own = json.loads(both.stdout), rows(json.loads(alone.stdout), "steps")
-    found = rows(content, "steps")
+    content, alone_rows = json.loads(both.stdout), section_rows(json.loads(alone.stdout), "steps")
+    rows = section_rows(content, "steps")
     assert content["beside"] == "robust"
-    assert {name: row["beside"] for name, row in found.items()} == {name: row["run"] for name, row in own.items()}
-    assert all(row["run"] != row["beside"] for row in found.values())
-    assert all(row["beside"] is None for row in own.values())
-    again = command("report", tmp_path / "both", "--json")
-    assert rows(json.loads(again.stdout), "steps") == found
+    assert {name: row["beside"] for name, row in rows.items()} == {name: row["run"] for name, row in alone_rows.items()}
+    assert all(row["run"] != row["beside"] for row in rows.values())
+    assert all(row["beside"] is None for row in alone_rows.values())
+    repeated = run_command("report", tmp_path / "both", "--json")
+    assert section_rows(json.loads(repeated.stdout), "steps") == rows
     assert "<th>robust gave</th>" in (tmp_path / "both" / "report.html").read_text(encoding="utf-8")
 
 
 def test_a_compared_configuration_must_have_the_axis() -> None:
     two = PAPER.with_name("two-axis.toml")
-    refused = command("run", "steps", two, "--axis", "y", "--beside", PAPER)
+    refused = run_command("run", "steps", two, "--axis", "y", "--beside", PAPER)
     assert refused.exit_code != 0
     assert "--axis y: there is no such axis; allowed: x" in refused.output
 

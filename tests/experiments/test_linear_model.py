@@ -1,4 +1,4 @@
-"""What the configuration's models promise, against scipy's simulation of the same loop written down by hand."""
+"""The responses that the configuration's models promise, against scipy's simulation of the same loop."""
 
 from __future__ import annotations
 
@@ -33,56 +33,61 @@ STEP = np.ones(4000)
 
 
 def plant() -> tuple[np.ndarray, np.ndarray]:
-    """Numerator and denominator in z⁻¹ of the held plant behind its delay."""
+    """Return numerator and denominator in z⁻¹ of the plant with zero-order hold and delay."""
     b, a, _ = signal.cont2discrete(([OMEGA**2], [1.0, 2 * ZETA * OMEGA, OMEGA**2]), 1 / RATE_HZ, "zoh")
     return np.concatenate([np.zeros(DELAY_TICKS), b.ravel()]), np.concatenate([a, np.zeros(DELAY_TICKS)])
 
 
 def loop() -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """T, and S, as numerator and denominator in z⁻¹: L = C·P, C = K T/2 (1 + z⁻¹)/(1 − z⁻¹)."""
+    """Return numerators and denominators of T and of S in z⁻¹: L = C·P, C = K T/2 (1 + z⁻¹)/(1 − z⁻¹).
+
+    The numerator of T is the numerator of L, and the numerator of S is the denominator of L.
+    """
     b, a = plant()
-    above, below = np.convolve(KI / (2 * RATE_HZ) * np.array([1.0, 1.0]), b), np.convolve([1.0, -1.0], a)
-    closed = above + below
-    return above, closed, below, closed
+    open_numerator = np.convolve(KI / (2 * RATE_HZ) * np.array([1.0, 1.0]), b)
+    open_denominator = np.convolve([1.0, -1.0], a)
+    closed = open_numerator + open_denominator
+    return open_numerator, closed, open_denominator, closed
 
 
 @pytest.fixture(scope="module")
 def model() -> LinearModel:
+    """The model of AXIS at RATE_HZ."""
     promise = linear_model(AXIS, RATE_HZ)
     return promise
 
 
 def test_answers_to_a_step(model: LinearModel) -> None:
-    above, closed, _below, _ = loop()
-    opened = signal.lfilter(*plant(), STEP)
-    np.testing.assert_allclose(model.open_response(STEP), opened, atol=1e-9)
-    assert model.open_overshoot == pytest.approx(opened.max(), abs=1e-9)
-    answer = model.closed_response(STEP)
+    open_numerator, closed, _open_denominator, _ = loop()
+    open_position = signal.lfilter(*plant(), STEP)
+    np.testing.assert_allclose(model.open_response(STEP), open_position, atol=1e-9)
+    assert model.open_overshoot == pytest.approx(open_position.max(), abs=1e-9)
+    response = model.closed_response(STEP)
     filtered = signal.lfilter(TAPS, 1.0, STEP)
-    position = signal.lfilter(above, closed, filtered)
-    np.testing.assert_allclose(answer[0], position, atol=1e-9)
+    position = signal.lfilter(open_numerator, closed, filtered)
+    np.testing.assert_allclose(response[0], position, atol=1e-9)
     command = signal.lfilter(np.convolve(KI / (2 * RATE_HZ) * np.array([1.0, 1.0]), plant()[1]), closed, filtered)
-    np.testing.assert_allclose(answer[1], command, atol=1e-9)
+    np.testing.assert_allclose(response[1], command, atol=1e-9)
 
 
 def test_response_to_a_disturbance(model: LinearModel) -> None:
     b, a, _ = signal.cont2discrete(([OMEGA**2], [1.0, 2 * ZETA * OMEGA, OMEGA**2]), 1 / RATE_HZ, "zoh")
-    moved = signal.lfilter(b.ravel(), a, STEP)
-    _, _, below, closed = loop()
+    disturbance_um = signal.lfilter(b.ravel(), a, STEP)
+    _, _, open_denominator, closed = loop()
     remaining = model.disturbance_response(STEP)
-    np.testing.assert_allclose(remaining, signal.lfilter(below, closed, moved), atol=1e-9)
+    np.testing.assert_allclose(remaining, signal.lfilter(open_denominator, closed, disturbance_um), atol=1e-9)
 
 
 def test_responses(model: LinearModel) -> None:
     hz = np.array([0.1, 20.0, 299.0, 2000.0])
-    back = np.exp(-2j * np.pi * hz / RATE_HZ)
-    above, closed, below, _ = (np.polyval(fraction[::-1], back) for fraction in loop())
-    numerator, denominator = (np.polyval(fraction[::-1], back) for fraction in plant())
+    z_inverse = np.exp(-2j * np.pi * hz / RATE_HZ)
+    open_numerator, closed, open_denominator, _ = (np.polyval(fraction[::-1], z_inverse) for fraction in loop())
+    numerator, denominator = (np.polyval(fraction[::-1], z_inverse) for fraction in plant())
     np.testing.assert_allclose(model.plant(hz), numerator / denominator, rtol=1e-9)
-    filtered = TAPS[0] + TAPS[1] * back + TAPS[2] * back**2
+    filtered = TAPS[0] + TAPS[1] * z_inverse + TAPS[2] * z_inverse**2
     tracking, rejection = model.tracking(hz), model.rejection(hz)
-    np.testing.assert_allclose(tracking, above / closed * filtered, rtol=1e-9)
-    np.testing.assert_allclose(rejection, below / closed * numerator / denominator, rtol=1e-9)
+    np.testing.assert_allclose(tracking, open_numerator / closed * filtered, rtol=1e-9)
+    np.testing.assert_allclose(rejection, open_denominator / closed * numerator / denominator, rtol=1e-9)
 
 
 def test_resonance_and_peaks(model: LinearModel) -> None:
@@ -100,7 +105,7 @@ def test_resonance_and_peaks(model: LinearModel) -> None:
 
 @pytest.mark.parametrize(("hz", "zeta"), [(15_000.0, 0.02), (1_234.5, 0.0005)])
 def test_the_peak_of_a_plant_of_two_modes(hz: float, zeta: float) -> None:
-    """The upper one above 10 kHz, or with a narrow peak; against scipy's response of the held plant, densely."""
+    """The upper mode is above 10 kHz, or narrow. The oracle is scipy's response of the held plant on a dense grid."""
     rate_hz, omega = 50_000.0, 2 * np.pi * hz
     first, second = np.array([1.0, 1.8 * zeta * OMEGA, OMEGA**2]), np.array([1.0, 2 * zeta * omega, omega**2])
     numerator, denominator = np.polyadd(0.2 * OMEGA**2 * second, 0.8 * omega**2 * first), np.polymul(first, second)
@@ -111,23 +116,22 @@ def test_the_peak_of_a_plant_of_two_modes(hz: float, zeta: float) -> None:
 
 
 def test_a_harmonic_response_is_promised(model: LinearModel) -> None:
-    measured = np.array([0.1, 1.0, 10.0, 250.0, 299.0, 300.0, 1000.0])
-    promised = HarmonicPromise(model, measured, RATE_HZ)
-    assert promised.peak_hz == pytest.approx(300.0, abs=0.5)
-    assert promised.peak_db == pytest.approx(20 * np.log10(1 / (2 * ZETA)), abs=0.1)
-    assert promised.bandwidth_hz == pytest.approx(KI / (2 * np.pi), rel=0.05)  # I-control of a stiff plant
-    nothing = HarmonicPromise(None, measured, RATE_HZ)
-    assert (nothing.peak_hz, nothing.peak_db, nothing.bandwidth_hz, nothing.closed_low_db) == (None,) * 4
-    assert nothing.curves((None, None)) == []
+    frequencies_hz = np.array([0.1, 1.0, 10.0, 250.0, 299.0, 300.0, 1000.0])
+    promise = HarmonicPromise(model, frequencies_hz, RATE_HZ)
+    assert promise.peak_hz == pytest.approx(300.0, abs=0.5)
+    assert promise.peak_db == pytest.approx(20 * np.log10(1 / (2 * ZETA)), abs=0.1)
+    assert promise.bandwidth_hz == pytest.approx(KI / (2 * np.pi), rel=0.05)  # I-control of a stiff plant
+    empty = HarmonicPromise(None, frequencies_hz, RATE_HZ)
+    assert (empty.peak_hz, empty.peak_db, empty.bandwidth_hz, empty.closed_low_db) == (None,) * 4
+    assert empty.curves((None, None)) == []
 
 
 def test_without_controller_or_stability_nothing_is_promised_of_the_loop() -> None:
-    bare = linear_model(AXIS.model_copy(update={"controller": None}), RATE_HZ)
-    assert (bare.loop, bare.tracking(1.0), bare.rejection(1.0), bare.closed_response(STEP), bare.step_peak) == (
-        None,
-    ) * 5
-    wild = AXIS.controller.model_copy(update={"numerator": (1000 * KI,), "allow_unstable": True})
-    unstable = linear_model(AXIS.model_copy(update={"controller": wild}), RATE_HZ)
+    bare_plant = linear_model(AXIS.model_copy(update={"controller": None}), RATE_HZ)
+    loop_answers = bare_plant.tracking(1.0), bare_plant.rejection(1.0), bare_plant.closed_response(STEP)
+    assert (bare_plant.loop, *loop_answers, bare_plant.step_peak) == (None,) * 5
+    unstable_controller = AXIS.controller.model_copy(update={"numerator": (1000 * KI,), "allow_unstable": True})
+    unstable = linear_model(AXIS.model_copy(update={"controller": unstable_controller}), RATE_HZ)
     assert unstable.loop is None
     assert linear_model(AXIS.model_copy(update={"model": None}), RATE_HZ) is None
 
@@ -148,7 +152,7 @@ class Mine(Controller):
     def update(c, s, told):
         s.integral_um += c.ki * told.error_um
 """
-"""Its command jumps where the error changes its sign, at rest."""
+"""A law whose command jumps where the error changes its sign, at rest."""
 
 
 def test_of_a_law_that_is_not_linear_the_plant_alone_is_promised(tmp_path: Path) -> None:
@@ -172,15 +176,15 @@ def test_the_delay_is_the_rigs_if_the_model_states_none(stated_ticks: int | None
     axis = AXIS.model_copy(update={"model": ModelOptions.model_validate(values | stated)})
     promise = linear_model(axis, RATE_HZ, rig_ticks)
     np.testing.assert_allclose(promise.open_response(STEP), signal.lfilter(*plant(), STEP), atol=1e-9)
-    above, closed, _below, _ = loop()
-    position = signal.lfilter(above, closed, signal.lfilter(TAPS, 1.0, STEP))
+    open_numerator, closed, _open_denominator, _ = loop()
+    position = signal.lfilter(open_numerator, closed, signal.lfilter(TAPS, 1.0, STEP))
     np.testing.assert_allclose(promise.closed_response(STEP)[0], position, atol=1e-9)
     shifted = promise.build_loop(promise.dynamics)
     np.testing.assert_allclose(np.sort_complex(shifted.poles), np.sort_complex(promise.loop.poles), atol=1e-9)
 
 
 def test_the_papers_printed_equations() -> None:
-    """Recomputed by scripts of numpy and scipy that share no code with rtloop: plays sample by sample, D(s), C(s)."""
+    """The figures are from numpy and scipy scripts without code of rtloop: plays sample by sample, D(s), C(s)."""
     axis = load(Path(__file__).resolve().parents[2] / "deploy" / "paper.toml").axes[0]
     promise = linear_model(axis, RATE_HZ)
     assert promise.resonance_hz == pytest.approx(595.50, abs=0.01)

@@ -17,8 +17,8 @@ NUMERATOR, DENOMINATOR, _ = signal.cont2discrete(
 )
 
 
-def driven(hz: float, seed: int = 1) -> tuple[np.ndarray, np.ndarray, complex]:
-    """Input and noisy output of at least two seconds, settled, and the response that they must show."""
+def drive_system(hz: float, seed: int = 1) -> tuple[np.ndarray, np.ndarray, complex]:
+    """Return the input and noisy output of at least two seconds, settled, and the response expected from them."""
     cycles = max(2.0, np.ceil(hz))
     ticks = round((0.2 + cycles / hz) * RATE_HZ)
     u = AMPLITUDE * np.sin(2 * np.pi * hz * np.arange(ticks) / RATE_HZ)
@@ -32,7 +32,7 @@ def driven(hz: float, seed: int = 1) -> tuple[np.ndarray, np.ndarray, complex]:
 
 @pytest.mark.parametrize("hz", FREQUENCIES_HZ)
 def test_a_known_response_is_found(hz: float) -> None:
-    u, x, expected = driven(hz)
+    u, x, expected = drive_system(hz)
     result = response(u, x, hz, RATE_HZ)
     assert abs(20 * np.log10(abs(result.gain / expected))) < 0.1
     assert abs(np.degrees(np.angle(result.gain / expected))) < 1.0
@@ -40,7 +40,7 @@ def test_a_known_response_is_found(hz: float) -> None:
 
 
 def test_coherence_is_low_where_nothing_is_excited() -> None:
-    u, x, _ = driven(100.0)
+    u, x, _ = drive_system(100.0)
     for hz in (30.0, 130.0, 1000.0):
         assert response(u, x, hz, RATE_HZ).coherence < 0.01
     noise = np.random.default_rng(2).normal(size=u.size)
@@ -62,7 +62,9 @@ def test_amplitude_and_phase_refer_to_the_first_sample() -> None:
     assert np.angle(result.amplitude) == pytest.approx(1.0, abs=1e-6)
 
 
-@pytest.mark.parametrize(("hz", "said"), [(0.0, "allowed: between 0 and"), (5000.0, "half the rate"), (0.5, "cycles")])
-def test_a_tone_that_cannot_be_measured_is_refused(hz: float, said: str) -> None:
-    with pytest.raises(ValueError, match=said):
+@pytest.mark.parametrize(
+    ("hz", "message"), [(0.0, "allowed: between 0 and"), (5000.0, "half the rate"), (0.5, "cycles")]
+)
+def test_a_tone_that_cannot_be_measured_is_refused(hz: float, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
         tone(np.ones(1000), hz, RATE_HZ)

@@ -1,4 +1,4 @@
-"""What is asked of the loop, what a recording says about itself, and what a verdict says."""
+"""The procedures of experiments: derived configurations, fitted defaults, verdicts, and measured responses."""
 
 from __future__ import annotations
 
@@ -47,17 +47,18 @@ RATE_HZ = 10_000.0
 
 
 def setting(virgin: bool = True) -> Setting:
+    """Return the setting of the paper's loop; its actuator has a memory if it is not virgin."""
     return Setting(PAPER.loop.rate_hz, PAPER.axes[0], virgin)
 
 
-def options_of(name: str) -> Options:
-    """As nobody set them; but a scan of the paper's loop learns nothing where the resonance may move."""
+def default_options(name: str) -> Options:
+    """Return default options; for a scan, without a shift of the resonance, at which the paper's loop cannot learn."""
     return EXPERIMENTS[name].options(**({"resonance_percent": 0.0} if name == "scan" else {}))
 
 
 @pytest.mark.parametrize("name", EXPERIMENTS)
 def test_a_run_is_a_configuration_that_can_be_prepared(name: str, tmp_path: Path) -> None:
-    options = options_of(name)
+    options = default_options(name)
     run = EXPERIMENTS[name].runs(options, setting())[-1]
     store_tables(run, tmp_path)
     plan = prepare(
@@ -70,17 +71,17 @@ def test_a_run_is_a_configuration_that_can_be_prepared(name: str, tmp_path: Path
 @pytest.mark.parametrize("name", EXPERIMENTS)
 def test_limits_and_interlocks_stay_unchanged(name: str) -> None:
     base = tomllib.loads(PAPER.text)
-    for run in EXPERIMENTS[name].runs(options_of(name), setting()):
-        made = tomllib.loads(derive_configuration(PAPER, "x", name, {}, run, 1, {}).text)
+    for run in EXPERIMENTS[name].runs(default_options(name), setting()):
+        derived = tomllib.loads(derive_configuration(PAPER, "x", name, {}, run, 1, {}).text)
         for part in ("limits", "interlocks", "feedforward", "controller", "model"):
-            assert made["axis"][0][part] == base["axis"][0][part]
-        assert made["driver"]["channels"] == base["driver"]["channels"]
-        assert made["loop"]["rate_hz"] == base["loop"]["rate_hz"]
+            assert derived["axis"][0][part] == base["axis"][0][part]
+        assert derived["driver"]["channels"] == base["driver"]["channels"]
+        assert derived["loop"]["rate_hz"] == base["loop"]["rate_hz"]
 
 
 def test_segments_follow_each_other_without_a_gap() -> None:
     for experiment in EXPERIMENTS.values():
-        for run in experiment.runs(options_of(experiment.name), setting(virgin=False)):
+        for run in experiment.runs(default_options(experiment.name), setting(virgin=False)):
             ends = [segment.start_tick + segment.ticks for segment in run.timeline.segments]
             assert [segment.start_tick for segment in run.timeline.segments] == [0, *ends[:-1]]
 
@@ -96,19 +97,19 @@ def test_an_actuator_with_a_memory_is_depolarised_first() -> None:
 
 def test_a_derived_configuration_describes_its_run() -> None:
     (run,) = EXPERIMENTS["compensation"].runs(EXPERIMENTS["compensation"].options(), setting())
-    said = read_metadata(
+    metadata = read_metadata(
         derive_configuration(PAPER, "x", "compensation", {"cycles": 2.0}, run, 1, {"settling_ms": 3.0}).text
     )
-    assert said["name"] == "compensation"
-    assert said["parameters"] == {"cycles": 2.0}
-    assert said["asked"] == {"settling_ms": 3.0}
-    assert said["segments"][1][:4] == ["sine", "feedforward", 1000, 200_000]
+    assert metadata["name"] == "compensation"
+    assert metadata["parameters"] == {"cycles": 2.0}
+    assert metadata["asked"] == {"settling_ms": 3.0}
+    assert metadata["segments"][1][:4] == ["sine", "feedforward", 1000, 200_000]
     assert read_metadata(PAPER.text) is None
     assert read_metadata("# rtloop experiment {") is None
 
 
 @pytest.mark.parametrize(
-    ("setting", "said"),
+    ("setting", "message"),
     [
         ("steps.dwell=1", "steps.dwell: unknown key; did you mean dwell_s"),
         ("steps.dwell_s=0", "steps.dwell_s: 0"),
@@ -117,14 +118,14 @@ def test_a_derived_configuration_describes_its_run() -> None:
         ("steps.levels_um=much", "'much'; allowed: a number"),
     ],
 )
-def test_wrong_parameters_are_named(setting: str, said: str) -> None:
-    with pytest.raises(ConfigError, match=said):
+def test_wrong_parameters_are_named(setting: str, message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
         parse_parameters([EXPERIMENTS["steps"]], [setting])
 
 
 def test_parameters_and_names() -> None:
-    found = parse_parameters(select_experiments(["sines", "steps"]), ["steps.levels_um=[1, 2.5]"])
-    assert found["steps"].model_dump()["levels_um"] == (1.0, 2.5)
+    options = parse_parameters(select_experiments(["sines", "steps"]), ["steps.levels_um=[1, 2.5]"])
+    assert options["steps"].model_dump()["levels_um"] == (1.0, 2.5)
     assert [experiment.name for experiment in select_experiments(["sines", "steps"])] == ["steps", "sines"]
     with pytest.raises(ConfigError, match=r"'step' is not an experiment"):
         select_experiments(["step"])
@@ -150,10 +151,10 @@ def test_a_verdict_answers_for_specification_claim_and_model(
     run: float, limit: float | None, claim: tuple[float | None, float | None] | None, model: float | None,
     verdict: str, mark: str,
 ) -> None:  # fmt: skip
-    """Red is for a missed requirement, and for nothing else."""
-    asked = None if limit is None else Limit(limit, at_most=True)
+    """Only a missed requirement has the mark `bad`."""
+    requirement = None if limit is None else Limit(limit, at_most=True)
     claimed = None if claim is None else ClaimOptions(says="so", at_least=claim[0], at_most=claim[1])
-    row = Row("q", "V", run, model, 0.2, asked, claimed)
+    row = Row("q", "V", run, model, 0.2, requirement, claimed)
     assert (row.verdict, row.mark) == (verdict, mark)
 
 
@@ -161,10 +162,10 @@ def test_the_ringing_of_a_known_system_is_found() -> None:
     omega, zeta = 2 * np.pi * 412.0, 0.0123
     time_s = np.arange(2000) / RATE_HZ
     _, x = signal.step(signal.lti([omega**2], [1, 2 * zeta * omega, omega**2]), T=time_s)
-    found = fit_ringing(40 * x + np.random.default_rng(1).normal(0, 0.01, x.size), RATE_HZ)
-    assert found.frequency_hz == pytest.approx(412.0, abs=0.05)
-    assert found.damping == pytest.approx(zeta, rel=0.01)
-    assert found.level == pytest.approx(40.0, abs=0.01)
+    ringing = fit_ringing(40 * x + np.random.default_rng(1).normal(0, 0.01, x.size), RATE_HZ)
+    assert ringing.frequency_hz == pytest.approx(412.0, abs=0.05)
+    assert ringing.damping == pytest.approx(zeta, rel=0.01)
+    assert ringing.level == pytest.approx(40.0, abs=0.01)
 
 
 def test_bandwidth_of_a_first_order_lag() -> None:
@@ -195,16 +196,16 @@ SMALL = PAPER.axes[0].model_copy(
 
 def test_the_papers_amplitudes_fit_the_papers_limits() -> None:
     for experiment in EXPERIMENTS.values():
-        found, asked = experiment.fit_options(experiment.options(), setting()), experiment.options()
-        for key in type(asked).model_fields:
-            assert getattr(found, key) == getattr(asked, key) or getattr(asked, key) is None
+        fitted, defaults = experiment.fit_options(experiment.options(), setting()), experiment.options()
+        for key in type(defaults).model_fields:
+            assert getattr(fitted, key) == getattr(defaults, key) or getattr(defaults, key) is None
 
 
 @pytest.mark.parametrize("name", EXPERIMENTS)
 def test_default_amplitudes_follow_the_limits(name: str) -> None:
-    """Of every reference: volts within both sides of the drive, micrometres within the command's limit."""
+    """References in V lie within the limits of the drive, references in µm within the limit of the command."""
     experiment, stage = EXPERIMENTS[name], Setting(RATE_HZ, SMALL, is_virgin=False)
-    for run in experiment.runs(experiment.fit_options(options_of(name), stage), stage):
+    for run in experiment.runs(experiment.fit_options(default_options(name), stage), stage):
         for segment, reference in zip(run.timeline.segments, run.timeline.references, strict=True):
             value = reference.get("value", reference.get("offset", 0.0))
             ends = (value - reference.get("amplitude", 0.0), value + reference.get("amplitude", 0.0))
@@ -218,8 +219,8 @@ def test_values_set_beyond_the_limits_are_refused() -> None:
         ConfigError, match=r"_um: 15 µm; allowed: up to 14\.32 µm, limited by axis\.x\.limits\.command_um"
     ):
         steps.fit_options(steps.options(levels_um=(0.0, -15.0)), stage)
-    kept = steps.options(levels_um=(0.0, -14.0))
-    assert steps.fit_options(kept, stage) == kept
+    allowed = steps.options(levels_um=(0.0, -14.0))
+    assert steps.fit_options(allowed, stage) == allowed
 
 
 @pytest.mark.parametrize("smaller", ["compared", "own"])
@@ -235,8 +236,8 @@ def test_compared_configurations_share_the_smaller_defaults(smaller: str, tmp_pa
     experiments, folder = [EXPERIMENTS["steps"]], tmp_path / "runs"
     runs, _ = plan_runs(experiments, parse_parameters(experiments, []), stages[0], folder, compared=stages[1])
     fitted = {planned.experiment.name: planned.options for planned in runs}
-    others, skipped = plan_runs(experiments, fitted, stages[1], folder, is_comparison=True)
-    for (planned,) in (runs, others):
+    compared_runs, skipped = plan_runs(experiments, fitted, stages[1], folder, is_comparison=True)
+    for (planned,) in (runs, compared_runs):
         levels = [segment.values["level_um"] for segment in planned.run.timeline.segments[1:]]
         assert max(levels) == pytest.approx(18.0)
     assert skipped == {}
@@ -249,7 +250,7 @@ def test_compared_configurations_share_the_smaller_defaults(smaller: str, tmp_pa
 
 
 def test_a_configuration_that_is_not_compared_changes_no_default(tmp_path: Path) -> None:
-    """Without a controller the second configuration does no steps, whatever its limits."""
+    """The second configuration has no controller, so that it makes no steps, and its limits do not count."""
     experiments = [EXPERIMENTS["steps"]]
     stages = [load_stage(path, "x") for path in (DEPLOY / "paper.toml", DEPLOY / "own-stage.toml")]
     (planned,), _ = plan_runs(experiments, parse_parameters(experiments, []), stages[0], tmp_path, compared=stages[1])
@@ -261,22 +262,22 @@ STAGE = (
     .axes[0]
     .model_copy(update={"model": ModelOptions(gain=25266187.0, denominator=((1.0, 201.06193, 25266187.0),))})
 )
-"""One resonance at 800 Hz that overshoots by 94 %: 20 µm at rest, 45 µm trip."""
+"""A stage with a resonance at 800 Hz that overshoots by 94 %; the full drive moves it by 20 µm, and 45 µm trip."""
 
 
 @pytest.mark.parametrize("axis", [PAPER.axes[0], SMALL, STAGE], ids=["paper", "small", "stage"])
 @pytest.mark.parametrize("name", [name for name, experiment in EXPERIMENTS.items() if experiment.limits])
 def test_the_named_limit_is_the_one_that_binds(name: str, axis: AxisOptions) -> None:
-    """Half of the named limit allows less; of two limits it is the smaller one, and has the named value."""
+    """The reason has the value of the configured limit, and half of this limit allows less."""
     (bound_of_setting,) = EXPERIMENTS[name].limits.values()
     bound = bound_of_setting(Setting(RATE_HZ, axis, is_virgin=True))
-    named = re.match(r"(limits|interlocks)\.(\w+) = (\S+)", bound.reason)
-    assert named is not None, bound
-    section, key, value = getattr(axis, named[1]), named[2], float(named[3])
+    match = re.match(r"(limits|interlocks)\.(\w+) = (\S+)", bound.reason)
+    assert match is not None, bound
+    section, key, value = getattr(axis, match[1]), match[2], float(match[3])
     assert getattr(section, key) == pytest.approx(value)
     if bound.magnitude == 1.0:  # a part of drive_v itself
         return
-    halved = axis.model_copy(update={named[1]: section.model_copy(update={key: value / 2})})
+    halved = axis.model_copy(update={match[1]: section.model_copy(update={key: value / 2})})
     assert bound_of_setting(Setting(RATE_HZ, halved, is_virgin=True)).magnitude < 0.8 * bound.magnitude
 
 
@@ -312,7 +313,7 @@ def test_the_sensors_range_moves_with_a_tare_and_turns_with_the_sign(offset_v, s
 
 
 def test_a_light_resonance_is_not_driven_into_the_interlock() -> None:
-    """Without control its response is 25 times as large at 800 Hz, and a step goes nearly twice as far."""
+    """Without control, the response at 800 Hz is 25 times as large, and a step nearly reaches twice its height."""
     stage = Setting(RATE_HZ, STAGE, is_virgin=True)
     swept = EXPERIMENTS["harmonic"].fit_options(EXPERIMENTS["harmonic"].options(), stage).model_dump()
     assert 0.7 <= swept["amplitude_um"] <= 20.0 / 25.0
@@ -327,8 +328,8 @@ def test_a_light_resonance_is_not_driven_into_the_interlock() -> None:
 
 
 def test_the_disturbance_is_that_of_the_specification() -> None:
-    asked = SpecificationOptions(disturbance=DisturbanceOptions(largest_um=1.5, error_um=0.1))
-    stage = Setting(RATE_HZ, PAPER.axes[0], is_virgin=True, specification=asked)
+    specification = SpecificationOptions(disturbance=DisturbanceOptions(largest_um=1.5, error_um=0.1))
+    stage = Setting(RATE_HZ, PAPER.axes[0], is_virgin=True, specification=specification)
     experiment = EXPERIMENTS["disturbance"]
     options = experiment.fit_options(experiment.options(), stage)
     assert options.model_dump()["amplitude_um"] == 1.5
@@ -338,12 +339,16 @@ def test_the_disturbance_is_that_of_the_specification() -> None:
 def test_a_unipolar_amplifier_excludes_no_experiment() -> None:
     limits = PAPER.axes[0].limits.model_copy(update={"drive_min_v": 0.0})
     axis = PAPER.axes[0].model_copy(update={"limits": limits})
-    can = [one.name for one in EXPERIMENTS.values() if one.unsuitable_reason(PAPER, axis, is_rig=True) is None]
-    assert can == list(EXPERIMENTS)
+    suitable = [
+        experiment.name
+        for experiment in EXPERIMENTS.values()
+        if experiment.unsuitable_reason(PAPER, axis, is_rig=True) is None
+    ]
+    assert suitable == list(EXPERIMENTS)
 
 
 def test_a_clipped_run_is_not_judged(tmp_path: Path) -> None:
-    """A sine of 40 µm where 20 µm are allowed: the recording is there, a verdict is not."""
+    """A sine of 40 µm is clipped at 20 µm: the run is recorded, but not analysed."""
     experiment = EXPERIMENTS["compensation"]
     options = experiment.options(amplitude_um=40.0, frequency_hz=5.0)
     (run,) = experiment.runs(options, Setting(RATE_HZ, PAPER.axes[0], is_virgin=True))
@@ -359,12 +364,12 @@ def test_a_clipped_run_is_not_judged(tmp_path: Path) -> None:
 
 
 LINEAR = (('truth = "residual"', 'truth = "nominal"'), ('dead_band = "none"', 'dead_band = "exact"'))
-"""The actuator of the inverse, all of its dead band taken off: what is left is the linear loop."""
+"""Changes that give the rig the actuator of the inverse, without a dead band: the loop is then linear."""
 LATENCY = ("latency_ticks = 0", "latency_ticks = 2")
 
 
-def measured_response(folder: Path, *changes: tuple[str, str]) -> tuple[Path, ResponseOptions]:
-    """Record the experiment on the paper's rig with changes."""
+def record_response(folder: Path, *changes: tuple[str, str]) -> tuple[Path, ResponseOptions]:
+    """Record the experiment `response` on the paper's rig with changes. Returns its recording and its options."""
     text = PAPER.text
     for old, new in changes:
         assert old in text, old
@@ -379,7 +384,8 @@ def measured_response(folder: Path, *changes: tuple[str, str]) -> tuple[Path, Re
 
 @pytest.fixture(scope="module")
 def linear_response(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, ResponseOptions]:
-    return measured_response(tmp_path_factory.mktemp("linear"), *LINEAR)
+    """Recording and options of the experiment `response` on the linear loop."""
+    return record_response(tmp_path_factory.mktemp("linear"), *LINEAR)
 
 
 def test_the_measured_margins_are_those_of_the_model_on_a_rig_that_is_as_the_model(
@@ -389,18 +395,18 @@ def test_the_measured_margins_are_those_of_the_model_on_a_rig_that_is_as_the_mod
     (section,) = make_report(load_runs([path])).content["experiments"]
     assert section["problem"] is None
     assert "hysteresis remains" not in " ".join(section["notes"])
-    found = {row["quantity"]: row["run"] for row in section["rows"]}
-    assert found["gain margin"] == pytest.approx(2.566, rel=0.02)
-    assert found["phase margin"] == pytest.approx(73.05, abs=2.0)
-    assert found["resonance"] == pytest.approx(595.50, rel=0.0006)
-    assert found["largest |S|"] == pytest.approx(1.654, rel=0.02)
+    rows = {row["quantity"]: row["run"] for row in section["rows"]}
+    assert rows["gain margin"] == pytest.approx(2.566, rel=0.02)
+    assert rows["phase margin"] == pytest.approx(73.05, abs=2.0)
+    assert rows["resonance"] == pytest.approx(595.50, rel=0.0006)
+    assert rows["largest |S|"] == pytest.approx(1.654, rel=0.02)
     position_um = load_recording(path)["x_true_position_um"]
     assert 0.1 < np.abs(position_um).max() <= options.amplitude_um
 
 
 def test_the_models_margins_are_those_of_a_rig_with_latency(tmp_path: Path) -> None:
     """[axis.model] states no delay: without the rig's, its gain margin would be 2.566, and its phase margin 73.05°."""
-    path, _ = measured_response(tmp_path, *LINEAR, LATENCY)
+    path, _ = record_response(tmp_path, *LINEAR, LATENCY)
     (section,) = make_report(load_runs([path])).content["experiments"]
     rows = {row["quantity"]: row for row in section["rows"]}
     assert rows["gain margin"]["model"] == pytest.approx(rows["gain margin"]["run"], rel=0.02)
@@ -436,23 +442,23 @@ def test_a_law_that_is_not_linear_is_planned_without_its_loop(tmp_path: Path) ->
 
 
 def test_hysteresis_that_is_left_is_said_of_measured_margins(tmp_path: Path) -> None:
-    """The paper's inverse leaves some: the gain margin is then far off the linear loop's 2.566."""
-    path, _ = measured_response(tmp_path)
+    """The paper's inverse leaves hysteresis, which moves the gain margin far off the linear loop's 2.566."""
+    path, _ = record_response(tmp_path)
     (section,) = make_report(load_runs([path])).content["experiments"]
-    found = {row["quantity"]: row["run"] for row in section["rows"]}
-    assert abs(found["gain margin"] / 2.566 - 1) > 0.1
+    rows = {row["quantity"]: row["run"] for row in section["rows"]}
+    assert abs(rows["gain margin"] / 2.566 - 1) > 0.1
     assert "hysteresis remains, so that the stage is not linear in this motion" in " ".join(section["notes"])
     result = CliRunner().invoke(main, ["identify", "response", str(path)])
     assert "hysteresis remains" in " ".join(result.stdout.split())
 
 
 def test_a_position_that_moves_further_than_stated_is_refused(linear_response: tuple[Path, ResponseOptions]) -> None:
-    """The motion at rest is allowed besides, and no more."""
+    """A motion up to the stated amplitude plus REST_MARGIN times the motion at rest is allowed."""
     path, options = linear_response
     (run,) = load_runs([path])
     position_um = load_recording(path)["x_position_um"]
-    multisine, rest = run.segments_labelled("multisine")[0], run.segments_labelled("rest")[-1]
-    moving, resting = position_um[multisine.tick_slice], position_um[rest.tail_slice(rest.ticks // 2)]
+    multisine, rest_segment = run.segments_labelled("multisine")[0], run.segments_labelled("rest")[-1]
+    moving, resting = position_um[multisine.tick_slice], position_um[rest_segment.tail_slice(rest_segment.ticks // 2)]
     moving = moving[round(options.period_s * RATE_HZ) :]
     moved_um, rest_um = np.abs(moving - moving.mean()).max(), np.abs(resting - resting.mean()).max()
     for surplus, is_refused in ((1.1, False), (1.3, True)):
@@ -466,7 +472,7 @@ def test_a_position_that_moves_further_than_stated_is_refused(linear_response: t
 
 
 class FallingStage:
-    """A run of the step experiment on a stage whose position is `sign` times that of a ringing one."""
+    """Stand-in for a run of the step experiment on a stage whose position rings, multiplied by `sign`."""
 
     rate_hz, model = 10_000.0, None
     axis_options = SimpleNamespace(limits=SimpleNamespace(drive_v=10.0))

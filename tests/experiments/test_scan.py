@@ -1,4 +1,4 @@
-"""Scans that are learned, what the recordings say, and that they replay."""
+"""Scans are learned from cycle to cycle; their errors are recomputed from the recordings, which replay."""
 
 from __future__ import annotations
 
@@ -21,13 +21,14 @@ CYCLES = 1
 
 
 def run(config: Path, folder: Path, *settings: str) -> Result:
-    sets = [part for one in settings for part in ("--set", f"scan.{one}")]
+    """Run the experiment `scan` with settings of its options, and recordings in a folder."""
+    sets = [part for setting in settings for part in ("--set", f"scan.{setting}")]
     return CliRunner().invoke(main, ["experiment", "run", "scan", str(config), *sets, "--json", "--out", str(folder)])
 
 
 @pytest.fixture(scope="module")
-def made(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any]]:
-    """Folder and JSON of a scan that a slow integrator learns."""
+def learned_scan(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any]]:
+    """Folder and JSON report of a scan that a slow integrator learns."""
     folder = tmp_path_factory.mktemp("scan")
     text = PAPER.read_text()
     begin, end = text.index("[axis.controller]"), text.index("[axis.model]")
@@ -35,70 +36,72 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any]
     config.write_text(
         (text[:begin] + SLOW + text[end:]).replace("paper-spec.toml", str(PAPER.with_name("paper-spec.toml")))
     )
-    ran = run(config, folder, "frequencies_hz=[50.0]", f"cycles={CYCLES}", "amplitude_um=10.0", "resonance_percent=5.0")
-    assert ran.exit_code == 0, ran.stderr
-    return folder, json.loads(ran.stdout)["experiments"][0]
+    result = run(
+        config, folder, "frequencies_hz=[50.0]", f"cycles={CYCLES}", "amplitude_um=10.0", "resonance_percent=5.0"
+    )
+    assert result.exit_code == 0, result.stderr
+    return folder, json.loads(result.stdout)["experiments"][0]
 
 
-def test_a_scan_is_learned_from_recording_to_recording(made):
-    folder, section = made
+def test_a_scan_is_learned_from_recording_to_recording(learned_scan):
+    folder, section = learned_scan
     (row,) = section["tables"][0]["rows"]
     percent = [float(value) for value in row[1 : CYCLES + 2]]
     assert percent[0] > 10.0
     assert percent[-1] < percent[0] / 5
     assert len(section["recordings"]) == CYCLES + 1
-    for cycle, (name, said) in enumerate(zip(section["recordings"], percent, strict=True)):
+    for cycle, (name, percent_error) in enumerate(zip(section["recordings"], percent, strict=True)):
         recording = load(folder / name)
         position = recording["x_position_um"][-2000:].reshape(-1, 200).mean(axis=0)
-        turns = np.arange(200) / 200
-        wanted = 10.0 * 2 / np.pi * np.arcsin(np.sin(2 * np.pi * turns))
-        assert 100 * np.sqrt(np.mean((wanted - position) ** 2)) / 20 == pytest.approx(said, abs=1e-3)
+        cycle_shares = np.arange(200) / 200
+        reference_um = 10.0 * 2 / np.pi * np.arcsin(np.sin(2 * np.pi * cycle_shares))
+        assert 100 * np.sqrt(np.mean((reference_um - position) ** 2)) / 20 == pytest.approx(percent_error, abs=1e-3)
         assert np.any(recording["x_feed_um"]) == (cycle > 0)
 
 
-def test_a_learned_scan_replays(made):
-    folder, section = made
+def test_a_learned_scan_replays(learned_scan):
+    folder, section = learned_scan
     assert replay(load(folder / section["recordings"][-1])).identical
 
 
 def test_a_loop_that_may_be_unstable_learns_nothing(tmp_path):
-    """The paper's, at a resonance 2 % higher."""
-    ran = run(PAPER, tmp_path)
-    assert ran.exit_code == 1
-    assert "the loop is unstable with resonance +2 %; learning needs a loop" in ran.stderr
+    """The paper's loop is unstable if its resonance is 2 % higher."""
+    result = run(PAPER, tmp_path)
+    assert result.exit_code == 1
+    assert "the loop is unstable with resonance +2 %; learning needs a loop" in result.stderr
     assert not list(tmp_path.glob("*.mcap"))
 
 
-def test_a_table_that_cannot_be_written_leaves_the_report_of_the_recorded_runs(made, tmp_path: Path):
-    """Of the next cycle: a folder has its name."""
-    config = made[0] / "slow.toml"
+def test_a_table_that_cannot_be_written_leaves_the_report_of_the_recorded_runs(learned_scan, tmp_path: Path):
+    """The table of the next cycle cannot be written, as a folder has its name."""
+    config = learned_scan[0] / "slow.toml"
     (tmp_path / "slow" / "scan-1-50Hz.npy").mkdir(parents=True)
-    ran = run(config, tmp_path, "frequencies_hz=[50.0]", "cycles=1", "amplitude_um=10.0", "resonance_percent=5.0")
-    assert ran.exit_code == 1
-    assert "scan-1-50Hz.npy: Is a directory" in ran.stderr
+    result = run(config, tmp_path, "frequencies_hz=[50.0]", "cycles=1", "amplitude_um=10.0", "resonance_percent=5.0")
+    assert result.exit_code == 1
+    assert "scan-1-50Hz.npy: Is a directory" in result.stderr
     (recording,) = tmp_path.rglob("*.mcap")
-    (section,) = json.loads(ran.stdout)["experiments"]
+    (section,) = json.loads(result.stdout)["experiments"]
     assert section["recordings"] == [recording.name]
     assert recording.name in (tmp_path / "report.html").read_text(encoding="utf-8")
 
 
-def test_a_cycle_in_which_the_loop_trips_is_the_last(made, tmp_path: Path):
+def test_a_cycle_in_which_the_loop_trips_is_the_last(learned_scan, tmp_path: Path):
     """The integrator is slow, and its error trips the loop."""
-    config, text = tmp_path / "slow.toml", (made[0] / "slow.toml").read_text()
+    config, text = tmp_path / "slow.toml", (learned_scan[0] / "slow.toml").read_text()
     limits = ("tracking_error_um = 10.0", "tracking_error_um = 3.0"), ("tracking_ticks = 500", "tracking_ticks = 50")
     for old, new in limits:
         assert text.count(old) == 1
         text = text.replace(old, new)
     config.write_text(text)
-    ran = run(config, tmp_path, "frequencies_hz=[50.0]", "cycles=1", "amplitude_um=10.0", "resonance_percent=5.0")
-    assert ran.exit_code == 1
-    assert re.search(r"the loop tripped at tick \d+ \(tracking\)", ran.stderr)
+    result = run(config, tmp_path, "frequencies_hz=[50.0]", "cycles=1", "amplitude_um=10.0", "resonance_percent=5.0")
+    assert result.exit_code == 1
+    assert re.search(r"the loop tripped at tick \d+ \(tracking\)", result.stderr)
     (recording,) = tmp_path.rglob("*.mcap")
-    (section,) = json.loads(ran.stdout)["experiments"]
+    (section,) = json.loads(result.stdout)["experiments"]
     assert section["recordings"] == [recording.name]
 
 
 def test_a_frequency_that_the_ticks_do_not_divide(tmp_path):
-    ran = run(PAPER, tmp_path, "frequencies_hz=[30.0]")
-    assert ran.exit_code == 78
-    assert "scan.frequencies_hz: 30 Hz; allowed: periods of 4 or more whole ticks of 0.0001 s" in ran.stderr
+    result = run(PAPER, tmp_path, "frequencies_hz=[30.0]")
+    assert result.exit_code == 78
+    assert "scan.frequencies_hz: 30 Hz; allowed: periods of 4 or more whole ticks of 0.0001 s" in result.stderr

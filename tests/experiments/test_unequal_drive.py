@@ -1,4 +1,4 @@
-"""Experiments on a drive of -2 … 10 V: its whole range, defaults that are not clipped, and what is said of them."""
+"""Experiments on a drive of -2 … 10 V: the whole range is used, defaults are not clipped, reductions are reported."""
 
 from __future__ import annotations
 
@@ -27,25 +27,26 @@ BASE = parse(STAGE, "stage", Path(), "stage")
 
 
 def setting(is_virgin: bool = True, **limits: float) -> Setting:
+    """Return the setting of the stage with changed limits."""
     axis = BASE.axes[0]
     changed = LimitsOptions.model_validate(axis.limits.model_dump() | limits)
     return Setting(RATE_HZ, axis.model_copy(update={"limits": changed}), is_virgin)
 
 
-def recorded(name: str, folder: Path, **options: Any) -> Path:
-    """The recording of an experiment with its defaults, but for the `options`."""
+def record_experiment(name: str, folder: Path, **options: Any) -> Path:
+    """Record an experiment with its defaults, but for `options`. Returns the path."""
     experiment = EXPERIMENTS[name]
-    asked = experiment.options.model_validate(options)
-    fitted = experiment.fit_options(asked, setting())
+    given_options = experiment.options.model_validate(options)
+    fitted = experiment.fit_options(given_options, setting())
     (run,) = experiment.runs(fitted, setting())
-    reductions = experiment.reductions(asked, setting())
+    reductions = experiment.reductions(given_options, setting())
     text = derive_configuration(BASE, "x", name, fitted.model_dump(mode="json"), run, 1, {}, reductions=reductions).text
     (path,) = record(folder / f"{name}.mcap", text, run.timeline.ticks)
     return path
 
 
-def drive(timeline: Timeline) -> np.ndarray:
-    """The drive in V at every tick of a timeline in mode raw, by the formulas of its references."""
+def timeline_drive_v(timeline: Timeline) -> np.ndarray:
+    """Return the drive (V) at every tick of a timeline in mode raw, by the formulas of its references."""
     parts = []
     for segment, reference in zip(timeline.segments, timeline.references, strict=True):
         assert segment.mode == "raw"
@@ -59,8 +60,8 @@ def drive(timeline: Timeline) -> np.ndarray:
 
 
 def test_characterise_takes_the_drive_from_end_to_end_and_names_the_volts(tmp_path: Path) -> None:
-    """h/H and H are those of plays that move sample by sample; no figure of another range is called the whole one."""
-    path = recorded("characterise", tmp_path, frequency_hz=4.0)
+    """h/H and H agree with plays that move sample by sample; no figure of a part of the range is called `whole`."""
+    path = record_experiment("characterise", tmp_path, frequency_hz=4.0)
     drive_v = load_recording(path)["x_drive_v"]
     assert (drive_v.min(), drive_v.max()) == pytest.approx((LOWEST_V, HIGHEST_V), abs=0.01)
     runs = load_runs([path])
@@ -83,10 +84,10 @@ def test_characterise_takes_the_drive_from_end_to_end_and_names_the_volts(tmp_pa
 )  # fmt: skip
 @pytest.mark.parametrize("cycles", [1.5, 2.0])
 def test_the_drive_of_characterise_reaches_both_ends_and_never_jumps(limits, ends, cycles) -> None:
-    """Also while an actuator with a memory is depolarised; a sine of 25 Hz over the whole drive is the fastest part."""
+    """The fastest part is the sine of 25 Hz over the whole drive, by which an actuator with a memory is depolarised."""
     experiment = EXPERIMENTS["characterise"]
     (run,) = experiment.runs(experiment.options(cycles=cycles), setting(is_virgin=False, **limits))
-    drive_v = drive(run.timeline)
+    drive_v = timeline_drive_v(run.timeline)
     assert (drive_v.min(), drive_v.max()) == pytest.approx(ends, abs=1e-6)
     assert np.abs(np.diff(drive_v, prepend=0.0)).max() < 1.01 * np.pi * 25.0 * np.ptp(ends) / RATE_HZ
     major = next(segment for segment in run.timeline.segments if segment.label == "major")
@@ -95,7 +96,7 @@ def test_the_drive_of_characterise_reaches_both_ends_and_never_jumps(limits, end
 
 
 def test_interlocks_of_position_and_sensor_shorten_the_drive() -> None:
-    """36 µm trip, or 20 µm of the sensor on one side and 4 on the other: by plays, the drives for them."""
+    """The interlock is at 36 µm, or the sensor ends at −4 and 20 µm; the oracle is the drive that moves plays there."""
     axis = BASE.axes[0].model_copy(
         update={"interlocks": BASE.axes[0].interlocks.model_copy(update={"position_um": 36.0})}
     )
@@ -107,8 +108,8 @@ def test_interlocks_of_position_and_sensor_shorten_the_drive() -> None:
 
 
 def test_the_default_amplitude_of_compensation_is_not_clipped(tmp_path: Path) -> None:
-    """Its first run on this stage was: 4 µm/V, the gain over the whole drive, hold 8 µm at -2 V, the plays 6.2 µm."""
-    path = recorded("compensation", tmp_path, frequency_hz=5.0)
+    """A default from the gain over the whole drive, 4 µm/V, would be clipped: 8 µm at -2 V; the plays reach 6.2 µm."""
+    path = record_experiment("compensation", tmp_path, frequency_hz=5.0)
     (section,) = make_report(load_runs([path])).content["experiments"]
     assert section["problem"] is None
     assert section["parameters"]["amplitude_um"] == pytest.approx(-curve([LOWEST_V])[0] / 1.02, rel=0.05)
@@ -120,7 +121,7 @@ def test_the_default_amplitude_of_compensation_is_not_clipped(tmp_path: Path) ->
 
 
 def test_default_steps_use_the_longer_side_without_being_clipped(tmp_path: Path) -> None:
-    (run,) = load_runs([recorded("steps", tmp_path, dwell_s=0.05)])
+    (run,) = load_runs([record_experiment("steps", tmp_path, dwell_s=0.05)])
     run.require_complete()
     levels_um = run.parameters["levels_um"]
     low_um = curve([HIGHEST_V, LOWEST_V])[1]
@@ -130,7 +131,7 @@ def test_default_steps_use_the_longer_side_without_being_clipped(tmp_path: Path)
 
 
 def test_a_step_has_room_for_its_commands_and_those_of_the_step_back() -> None:
-    """Both limits by plays: a step up to the largest height, its overshoot, the step back and its undershoot."""
+    """The oracle is plays that follow the largest steps up and down, with overshoot, step back and undershoot."""
     stage = setting()
     model = stage.model
     assert model is not None
@@ -146,7 +147,7 @@ def test_a_step_has_room_for_its_commands_and_those_of_the_step_back() -> None:
 
 
 def test_the_step_back_limits_a_step_where_the_other_side_is_short() -> None:
-    """At -0.5 V: by plays, the command of the step back needs all of it, and the step itself less than 10 V."""
+    """The drive ends at -0.5 V: plays need all of it for the step back, and less than 10 V for the step itself."""
     stage = setting(drive_min_v=-0.5)
     up_um = largest_step_up(stage).magnitude
     plays = Plays()
@@ -167,8 +168,8 @@ def test_equal_sides_scale_all_levels_by_one_factor() -> None:
 
 def test_values_beyond_one_side_are_refused_with_its_limit() -> None:
     steps = EXPERIMENTS["steps"]
-    kept = steps.options(levels_um=(30.0, 0.0, -4.0))
-    assert steps.fit_options(kept, setting()) == kept
+    allowed = steps.options(levels_um=(30.0, 0.0, -4.0))
+    assert steps.fit_options(allowed, setting()) == allowed
     with pytest.raises(
         ConfigError,
         match=r"steps\.levels_um: 6 µm; allowed: up to 4\.\d+ µm, limited by axis\.x\.limits\.drive_min_v = -2",
@@ -195,12 +196,12 @@ ONE_SIDED = STAGE.replace(f"drive_min_v = {LOWEST_V}", "drive_min_v = 0.0")
 
 
 def middle_um() -> float:
-    """Middle of the positions that the plays reach again and again between 0 and 10 V."""
+    """Return the middle of the positions that the plays reach in every cycle between 0 and 10 V."""
     return float(np.mean(curve([HIGHEST_V, 0.0])))
 
 
-def recorded_one_sided(name: str, folder: Path, **options: Any) -> Path:
-    """The recording of an experiment on a drive of 0 … 10 V, fitted and planned as the command does."""
+def record_one_sided(name: str, folder: Path, **options: Any) -> Path:
+    """Record an experiment on a drive of 0 … 10 V, fitted and planned as the command does. Returns the path."""
     (folder / "stage.toml").write_text(ONE_SIDED, encoding="utf-8")
     stage, experiment = load_stage(folder / "stage.toml", None), EXPERIMENTS[name]
     (planned,), skipped = plan_runs([experiment], {name: experiment.options.model_validate(options)}, stage, folder)
@@ -211,7 +212,7 @@ def recorded_one_sided(name: str, folder: Path, **options: Any) -> Path:
 
 @pytest.mark.parametrize("name", [name for name in EXPERIMENTS if name != "characterise"])
 def test_every_experiment_moves_within_a_drive_of_one_sign(name: str) -> None:
-    """By plays: each reference in µm needs a drive of 0 … 10 V, and those in V lie within it."""
+    """Each reference in V, and the drive that plays need for each reference in µm, lies within 0 … 10 V."""
     experiment, stage = EXPERIMENTS[name], setting(drive_min_v=0.0)
     options = experiment.options(**({"resonance_percent": 0.0} if name == "scan" else {}))
     run = experiment.runs(experiment.fit_options(options, stage), stage)[-1]
@@ -237,14 +238,14 @@ def test_the_way_to_the_middle_is_slow_and_ends_there() -> None:
     timeline = Timeline(RATE_HZ)
     count = next(k for k, segment in enumerate(run.timeline.segments) if segment.mode != "raw")
     timeline.segments, timeline.references = run.timeline.segments[:count], run.timeline.references[:count]
-    drive_v = drive(timeline)
+    drive_v = timeline_drive_v(timeline)
     assert drive_v[0] == pytest.approx(0.0, abs=1e-9)
     assert np.abs(np.diff(drive_v)).max() < 0.01
     assert drive_v.max() < 2 * stage.middle.v
 
 
 def test_steps_on_a_drive_of_one_sign_are_analysed_about_the_middle(tmp_path: Path) -> None:
-    path = recorded_one_sided("steps", tmp_path, dwell_s=0.05)
+    path = record_one_sided("steps", tmp_path, dwell_s=0.05)
     signals = load_recording(path)
     assert signals["x_drive_v"].min() >= 0.0
     (section,) = make_report(load_runs([path])).content["experiments"]
@@ -263,8 +264,8 @@ def test_steps_on_a_drive_of_one_sign_are_analysed_about_the_middle(tmp_path: Pa
 
 
 def test_compensation_on_a_drive_of_one_sign_agrees_with_its_model(tmp_path: Path) -> None:
-    """The rig has the plays of the inverse: no hysteresis is left, and the model says so, with the plays' memory."""
-    path = recorded_one_sided("compensation", tmp_path, frequency_hz=4.0)
+    """The rig has the plays of the inverse, so that neither the rig nor the model has hysteresis left."""
+    path = record_one_sided("compensation", tmp_path, frequency_hz=4.0)
     (section,) = make_report(load_runs([path])).content["experiments"]
     assert section["problem"] is None
     rows = {row["quantity"]: row for row in section["rows"]}
@@ -276,7 +277,7 @@ def test_compensation_on_a_drive_of_one_sign_agrees_with_its_model(tmp_path: Pat
 
 
 def test_the_model_of_a_compensation_remembers_how_an_actuator_was_depolarised(tmp_path: Path) -> None:
-    """By the plays of the rig, whose inverse is exact; a model that begins at the rest has an error of 0.7 µm."""
+    """The inverse of the rig's plays is exact; a model that begins at rest has an error of 0.7 µm."""
     base, experiment = parse(ONE_SIDED, "stage", Path(), "stage"), EXPERIMENTS["compensation"]
     stage = Setting(RATE_HZ, base.axes[0], is_virgin=False)
     options = experiment.fit_options(experiment.options(amplitude_um=5.0, frequency_hz=4.0), stage)

@@ -1,6 +1,6 @@
-"""Files like those of the public MCAP conformance suite: six contents, each with any set of ten features.
+"""Files like the public MCAP conformance suite: six contents, each with any set of ten features.
 
-The files are made here by the stock writer. Two kinds of messages are tried: bytes of an unknown encoding, as in the
+The stock writer makes the files. Two kinds of messages are tried: bytes of an unknown encoding, as in the
 public suite, and JSON with numbers, which can be imported.
 """
 
@@ -28,12 +28,12 @@ FEATURES = (CHUNKS, *INDEXES, *REPEATED, PADDING)
 MAGIC = b"\x89MCAP0\r\n"
 EXTRA = b"\x01\x02\x03"
 EXTENSIBLE = (Opcode.HEADER, Opcode.SCHEMA, Opcode.CHANNEL, Opcode.METADATA, Opcode.ATTACHMENT, Opcode.DATA_END)
-"""Records behind whose fields more data may stand; that of a message or a chunk reaches to the record's end."""
+"""Records that may have more data behind their fields; the payload of a message or a chunk ends with its record."""
 STEP_NS = 1_000_000
 
 
 class Variant(NamedTuple):
-    """One file of the suite. `numbers`: its messages are JSON with a number, else three bytes of encoding "a"."""
+    """A file of the suite. `numbers`: the messages are JSON with a number, else three bytes of the encoding "a"."""
 
     content: str
     features: frozenset[str]
@@ -41,14 +41,14 @@ class Variant(NamedTuple):
 
     @property
     def messages(self) -> int:
-        """How many the file holds."""
+        """Number of messages in the file."""
         return 10 if self.content == "TenMessages" else int(self.content.endswith("Message"))
 
     def __str__(self) -> str:
         return "-".join([self.content, *sorted(self.features), "json" if self.numbers else "bytes"])
 
     def data(self) -> bytes:
-        """The file."""
+        """Return the bytes of the file."""
         stream = io.BytesIO()
         indexes = [index for name, index in INDEXES.items() if name in self.features]
         writer = Writer(
@@ -67,6 +67,7 @@ class Variant(NamedTuple):
         return _padded(stream.getvalue()) if PADDING in self.features else stream.getvalue()
 
     def _write(self, writer: Writer) -> None:
+        """Write the attachment, the metadata or the messages."""
         if self.content == "OneAttachment":
             writer.add_attachment(2, 1, "myFile", "application/octet-stream", EXTRA)
         if self.content == "OneMetadata":
@@ -81,18 +82,22 @@ class Variant(NamedTuple):
             writer.add_message(channel, number * STEP_NS, payload, number * STEP_NS, number)
 
 
-def variants(most: int = len(FEATURES)) -> Iterator[Variant]:
-    """All variants with up to `most` features, or without up to so many of all."""
-    few: Iterable[tuple[str, ...]] = chain.from_iterable(combinations(FEATURES, n) for n in range(most + 1))
-    chosen = dict.fromkeys(chain.from_iterable((frozenset(one), frozenset(FEATURES) - set(one)) for one in few))
+def variants(max_features: int = len(FEATURES)) -> Iterator[Variant]:
+    """Yield all variants with at most `max_features` features, or with all features but at most `max_features`."""
+    small_sets: Iterable[tuple[str, ...]] = chain.from_iterable(
+        combinations(FEATURES, n) for n in range(max_features + 1)
+    )
+    feature_sets = dict.fromkeys(
+        chain.from_iterable((frozenset(names), frozenset(FEATURES) - set(names)) for names in small_sets)
+    )
     for content in CONTENTS:
-        for features in chosen:
+        for features in feature_sets:
             for numbers in (False, True) if content.endswith(("Message", "Messages")) else (False,):
                 yield Variant(content, features, numbers)
 
 
 def _padded(data: bytes) -> bytes:
-    """The data section with more data behind the fields of records; without the summary, whose offsets were moved."""
+    """Return the data section with EXTRA behind the fields of records; no summary, whose offsets would be wrong."""
     out, position = bytearray(MAGIC), len(MAGIC)
     while True:
         opcode, length = struct.unpack_from("<BQ", data, position)

@@ -1,4 +1,4 @@
-"""ControlDesk's layout, written and read by what knows nothing else, and nothing of rtloop."""
+"""MAT files in ControlDesk's layout, written and read by scipy, without code of rtloop."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ Array = np.ndarray[Any, Any]
 
 
 def write_controldesk(path: Path, time_s: Array, signals: dict[str, tuple[Array, str]]) -> None:
-    """`signals` by their path in the model: values and unit."""
+    """Write a MAT file; `signals` are (values, unit) by their path in the model."""
     fields = ("Name", "Type", "Data", "Unit", "XIndex", "Path", "Raster")
     y = np.zeros(len(signals), [(field, "O") for field in fields])
     for k, (name, (values, unit)) in enumerate(signals.items()):
@@ -23,11 +23,11 @@ def write_controldesk(path: Path, time_s: Array, signals: dict[str, tuple[Array,
 
 
 def read_v5(path: Path) -> tuple[Array, dict[str, Array], dict[str, str]]:
-    """X.Data, Y(k).Data by Y(k).Name, Y(k).Unit: as a script of MATLAB takes them, rows all of them."""
+    """Return time (s), values and units by name: X.Data, Y(k).Data and Y(k).Unit, which must be rows, as in MATLAB."""
     variable = loadmat(path, struct_as_record=False)[path.stem][0, 0]
-    signals = {one.Name[0]: one.Data for one in variable.Y[0]}
-    units = {one.Name[0]: "".join(one.Unit) for one in variable.Y[0]}
+    signals = {signal.Name[0]: signal.Data for signal in variable.Y[0]}
+    units = {signal.Name[0]: "".join(signal.Unit) for signal in variable.Y[0]}
     time_s = variable.X[0, 0].Data
     assert all(values.shape == time_s.shape == (1, time_s.size) for values in signals.values())
-    assert all(one.XIndex[0, 0] == 1 and one.Raster[0] == variable.X[0, 0].Raster[0] for one in variable.Y[0])
+    assert all(signal.XIndex[0, 0] == 1 and signal.Raster[0] == variable.X[0, 0].Raster[0] for signal in variable.Y[0])
     return time_s[0], {name: values[0] for name, values in signals.items()}, units

@@ -13,12 +13,12 @@ from rtloop.recording.load import load
 from tests.interchange.conformance import CONTENTS, Variant, variants
 
 NO_RECORDING, NOT_SUITABLE, LISTED = 66, 1, 2
-"""Exit codes: of `info`, and of `import` where it cannot read the messages, or waits to hear which columns to take."""
+"""Exit codes: of `info`; of `import` for unreadable messages; of `import` that lists the columns to select from."""
 REASONS = ("an MCAP file without messages", "messages are encoded as a")
 
 
 def invoke(*arguments: str | Path) -> Result:
-    """The command in this process; nothing but an exit may come out of it."""
+    """Run a command in this process. Its only exception may be SystemExit."""
     result = CliRunner().invoke(main, [*map(str, arguments)])
     assert result.exception is None or isinstance(result.exception, SystemExit), (arguments, result.exc_info)
     assert "Traceback" not in result.output
@@ -26,7 +26,7 @@ def invoke(*arguments: str | Path) -> Result:
 
 
 def check(variant: Variant, folder: Path) -> None:
-    """`info` and `import` of a variant say what it is."""
+    """Require the outcome of `info` and `import` that fits the content of a variant."""
     path, output = folder / "other.mcap", folder / "imported.mcap"
     path.write_bytes(variant.data())
     info = invoke("info", path)
@@ -48,6 +48,6 @@ def check(variant: Variant, folder: Path) -> None:
 
 @pytest.mark.parametrize("content", CONTENTS)
 def test_a_file_of_the_conformance_suite_is_opened_or_refused_with_a_reason(content: str, tmp_path: Path):
-    for variant in variants(most=0):
+    for variant in variants(max_features=0):
         if variant.content == content:
             check(variant, tmp_path)

@@ -1,4 +1,4 @@
-"""Tables in text as programs write them: every number is column, exactly, and what is none is said."""
+"""Text tables as programs write them: numbers are read exactly; a bad table is refused with the place of its fault."""
 
 from __future__ import annotations
 
@@ -15,11 +15,13 @@ VOLTS = np.sin(2 * np.pi * 50 * TIME)
 
 
 def rows(delimiter: str, decimal: str = ".") -> str:
+    """Return the lines of TIME and VOLTS."""
     lines = (f"{t!r}{delimiter}{v!r}" for t, v in zip(TIME.tolist(), VOLTS.tolist(), strict=True))
     return "\n".join(lines).replace(".", decimal) + "\n"
 
 
 def german() -> bytes:
+    """Return a file of a German spreadsheet, with a column of text."""
     body = rows(";", ",").replace("\n", ";gut\r\n")
     return ("\ufeffZeit;Piezo Out;Bemerkung\r\ns;V;\r\n" + body).encode()
 
@@ -69,11 +71,11 @@ def test_missing_numbers_are_nan(tmp_path: Path):
 
 
 def test_an_empty_last_column_is_read_to_the_end_of_a_long_file(tmp_path: Path):
-    """Of several blocks of rows; a row that is short where the next block begins is column there."""
-    whole = "0,1,\n" * (2 * ROWS_AT_ONCE)
-    (tmp_path / "scan.csv").write_text("t,u,w\n" + whole)
+    """The file has several blocks of rows; a row that lacks a column behind the second block is an error."""
+    full_rows = "0,1,\n" * (2 * ROWS_AT_ONCE)
+    (tmp_path / "scan.csv").write_text("t,u,w\n" + full_rows)
     assert read_csv(tmp_path / "scan.csv").columns["u"].size == 2 * ROWS_AT_ONCE
-    (tmp_path / "scan.csv").write_text("t,u,w\n" + whole + "0,1\n" * 200)
+    (tmp_path / "scan.csv").write_text("t,u,w\n" + full_rows + "0,1\n" * 200)
     with pytest.raises(UnreadableData, match=f"line {2 * ROWS_AT_ONCE + 2} has 2 columns"):
         read_csv(tmp_path / "scan.csv")
 

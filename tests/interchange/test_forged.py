@@ -1,4 +1,4 @@
-"""Headers of imported recordings that nobody's import wrote."""
+"""Recordings that claim to be imported, with headers that no import writes, are refused by name."""
 
 from __future__ import annotations
 
@@ -21,7 +21,8 @@ GOOD: dict[str, Any] = {
 }  # fmt: skip
 
 
-def written(folder: Path, **changes: Any) -> Path:
+def write_file(folder: Path, **changes: Any) -> Path:
+    """Write an imported recording of five ticks with changes to its header. Returns its path."""
     header = make_header(**{**GOOD, **changes})
     writer = Writer(folder / "a.mcap", header, 0)
     writer.write_ticks(np.column_stack([np.arange(5.0)] * len(header["columns"])))
@@ -30,7 +31,7 @@ def written(folder: Path, **changes: Any) -> Path:
 
 
 def test_a_valid_header_is_accepted(tmp_path: Path):
-    recording = load(written(tmp_path))
+    recording = load(write_file(tmp_path))
     assert recording["u"].tolist() == [0.0, 1.0, 2.0, 3.0, 4.0]
     assert recording.units == {"tick": "1", "deadline_ns": "ns", "u": "V"}
 
@@ -49,4 +50,4 @@ def test_a_valid_header_is_accepted(tmp_path: Path):
 )
 def test_a_forged_header_is_refused(changes: dict[str, Any], message: str, tmp_path: Path):
     with pytest.raises(RecordingError, match=message):
-        load(written(tmp_path, **changes))
+        load(write_file(tmp_path, **changes))

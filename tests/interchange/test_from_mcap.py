@@ -1,4 +1,4 @@
-"""Numbers of topics that other programs wrote, against what was given to the stock writers."""
+"""Numbers of topics that other programs wrote are read exactly: the oracle is the array given to the stock writers."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ SECONDS = np.arange(ROWS) * STEP_NS * 1e-9
 
 @contextmanager
 def stock_writer(path: Path, **options: Any) -> Iterator[Writer]:
-    """A started writer of the mcap library, which is finished behind the block."""
+    """Yield a started writer of the mcap library, and finish its file afterwards."""
     with path.open("wb") as file:
         writer = Writer(file, **options)
         writer.start()
@@ -39,8 +39,8 @@ def stock_writer(path: Path, **options: Any) -> Iterator[Writer]:
         writer.finish()
 
 
-def written(path: Path, messages: list[Any], encoding: str = "json", schema: Any = None, **options: Any) -> Path:
-    """Write messages, as bytes or as values for JSON, to one topic, `/imu`."""
+def write_messages(path: Path, messages: list[Any], encoding: str = "json", schema: Any = None, **options: Any) -> Path:
+    """Write messages (bytes, or values for JSON) to the topic `/imu`. Returns the path."""
     with stock_writer(path, **options) as writer:
         channel = writer.register_channel("/imu", encoding, writer.register_schema(*schema) if schema else 0)
         for place, message in enumerate(messages):
@@ -50,6 +50,7 @@ def written(path: Path, messages: list[Any], encoding: str = "json", schema: Any
 
 
 def samples() -> list[dict[str, Any]]:
+    """Return ROWS messages with the numbers of TRUTH, a text, a bool and a count."""
     return [
         {"name": "a", "on": bool(place % 2), "accel": {"x": row[0], "yz": [row[1], row[2]]}, "counts": place}
         for place, row in enumerate(TRUTH.tolist())
@@ -57,12 +58,13 @@ def samples() -> list[dict[str, Any]]:
 
 
 def require_truth(path: Path, topic: str | None = None) -> None:
+    """Require that a file is read as the table of TRUTH, with its times, counts and bools."""
     table = read_mcap(path, topic)
     assert table.time == "log_time_s"
     assert table.units["log_time_s"] == "s"
     np.testing.assert_allclose(table.columns["log_time_s"], SECONDS, rtol=0, atol=1e-15)
-    for name, truth in (("accel.x", 0), ("accel.yz.0", 1), ("accel.yz.1", 2)):
-        assert table.columns[name].tobytes() == TRUTH[:, truth].tobytes()
+    for name, column in (("accel.x", 0), ("accel.yz.0", 1), ("accel.yz.1", 2)):
+        assert table.columns[name].tobytes() == TRUTH[:, column].tobytes()
     assert table.columns["counts"].tolist() == list(range(ROWS))
     assert table.columns["on"].tolist() == [place % 2 for place in range(ROWS)]
 
@@ -70,13 +72,13 @@ def require_truth(path: Path, topic: str | None = None) -> None:
 @pytest.mark.parametrize("schema", [None, ("Imu", "jsonschema", b'{"type": "object"}')])
 @pytest.mark.parametrize("compression", list(CompressionType))
 def test_json(tmp_path: Path, schema: Any, compression: CompressionType):
-    path = written(tmp_path / "a.mcap", samples(), schema=schema, compression=compression, chunk_size=9_000)
+    path = write_messages(tmp_path / "a.mcap", samples(), schema=schema, compression=compression, chunk_size=9_000)
     require_truth(path)
     require_truth(path, "/imu")
 
 
-def imu() -> Any:
-    """A class of protobuf messages: nested, repeated, with a time of protobuf's own."""
+def imu_class() -> Any:
+    """Return a class of protobuf messages with a nested, a repeated and a Timestamp field."""
     file = FileDescriptorProto(name="imu.proto", package="lab", syntax="proto3")
     file.dependency.append("google/protobuf/timestamp.proto")
     xyz = file.message_type.add(name="Accel")
@@ -94,7 +96,7 @@ def imu() -> Any:
 
 
 def test_protobuf(tmp_path: Path):
-    path, kind = tmp_path / "a.mcap", imu()
+    path, kind = tmp_path / "a.mcap", imu_class()
     with path.open("wb") as file, ProtobufWriter(file) as writer:
         for place, row in enumerate(TRUTH.tolist()):
             message = kind(on=bool(place % 2), counts=place, accel={"x": row[0], "yz": row[1:]})
@@ -156,6 +158,7 @@ def test_several_topics_are_named(tmp_path: Path):
 
 
 def descriptors(*files: FileDescriptorProto) -> bytes:
+    """Return the bytes of a FileDescriptorSet, which is the data of a protobuf schema."""
     return FileDescriptorSet(file=files).SerializeToString()
 
 
@@ -163,7 +166,7 @@ B = descriptors(FileDescriptorProto(name="b", package="lab", message_type=[Descr
 CIRCLE = descriptors(FileDescriptorProto(name="a", dependency=["b"]), FileDescriptorProto(name="b", dependency=["a"]))
 RECURSIVE = ("a/msg/A", "ros2msg", b"a/A inner\n" + b"=" * 80 + b"\nMSG: a/A\na/A inner\n")
 EMPTY_ITEMS = ("a/msg/A", "ros2msg", b"a/E[] all\n" + b"=" * 80 + b"\nMSG: a/E\n# nothing\n")
-BAD: list[tuple[Any, str, Any, str]] = [
+UNREADABLE: list[tuple[Any, str, Any, str]] = [
     (b"\x93NUMPY", "cbor", None, r"messages are encoded as cbor; allowed: json, protobuf and cdr \(ros2msg\)"),
     (b"", "ros1", ("a/A", "ros1msg", b"float64 x"), r"messages are encoded as ros1 \(ros1msg\)"),
     (b"", "protobuf", None, "messages are encoded as protobuf;"),
@@ -182,22 +185,22 @@ BAD: list[tuple[Any, str, Any, str]] = [
 ]  # fmt: skip
 
 
-@pytest.mark.parametrize(("data", "encoding", "schema", "why"), BAD)
+@pytest.mark.parametrize(("data", "encoding", "schema", "why"), UNREADABLE)
 def test_unreadable_messages_are_refused_with_a_reason(
     tmp_path: Path, data: bytes, encoding: str, schema: Any, why: str
 ):
-    path = written(tmp_path / "a.mcap", [data], encoding, schema)
+    path = write_messages(tmp_path / "a.mcap", [data], encoding, schema)
     with pytest.raises(UnreadableData, match=rf"a\.mcap: '/imu': .*({why})"):
         read_mcap(path)
 
 
 def test_long_lists_are_left_out(tmp_path: Path):
-    table = read_mcap(written(tmp_path / "a.mcap", [{"picture": [0] * 5_000, "x": 1.5}]))
+    table = read_mcap(write_messages(tmp_path / "a.mcap", [{"picture": [0] * 5_000, "x": 1.5}]))
     assert set(table.columns) == {"log_time_s", "x"}
 
 
 def test_messages_without_common_fields_are_no_table(tmp_path: Path):
-    path = written(tmp_path / "a.mcap", [{f"f{place % 3000}": 1} for place in range(9_000)])
+    path = write_messages(tmp_path / "a.mcap", [{f"f{place % 3000}": 1} for place in range(9_000)])
     with pytest.raises(UnreadableData, match="not a table: 9000 messages have more than"):
         read_mcap(path)
 
@@ -210,7 +213,7 @@ def test_no_mcap_file(tmp_path: Path, make: Callable[[Path], Any]):
 
 
 def test_a_truncated_file_gives_its_complete_part(tmp_path: Path):
-    path = written(tmp_path / "a.mcap", samples(), chunk_size=4_000, compression=CompressionType.NONE)
+    path = write_messages(tmp_path / "a.mcap", samples(), chunk_size=4_000, compression=CompressionType.NONE)
     data = path.read_bytes()
     path.write_bytes(data[: len(data) // 2])
     table = read_mcap(path)

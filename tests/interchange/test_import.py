@@ -1,4 +1,4 @@
-"""`rtloop import` as a laboratory meets it: what is shown, what is told, and what a recording of it is good for."""
+"""`rtloop import`: its output, its messages, and the use of an imported recording by the other commands."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ VOLTS = np.sin(2 * np.pi * 50 * TIME)
 
 @pytest.fixture(autouse=True)
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Where the commands run; files are read in this process, to be quick."""
+    """The working folder of the commands. Files are read in this process, which is faster."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("rtloop.interchange.isolated_reader.read_table", read_in_process)
     return tmp_path
@@ -34,7 +34,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 @pytest.fixture
 def scan(folder: Path) -> Path:
-    """Drive in mV, position in nm."""
+    """A MAT file of t (s), drive (mV), position (nm) and temperature."""
     savemat(folder / "scan.mat", {"t": TIME, "drive_mV": 1e3 * VOLTS, "pos_nm": 500 * VOLTS, "T": VOLTS + 21})
     return folder / "scan.mat"
 
@@ -68,7 +68,7 @@ def test_a_recording_of_it_is_one_that_the_other_commands_take(scan: Path, folde
     assert (summary["ticks_logged"], summary["ticks_lost"], summary["complete"]) == (COUNT, 0, True)
     (axis,) = summary["axes"]
     assert (axis["name"], axis["rms_error_um"], axis["max_abs_drive_v"]) == ("x", None, pytest.approx(1.0))
-    assert [one["name"] for one in summary["ranges"]] == ["x_drive_v", "x_position_um", "T"]
+    assert [signal_range["name"] for signal_range in summary["ranges"]] == ["x_drive_v", "x_position_um", "T"]
     assert "from scan.mat" in run("info", "scan.mcap").stdout
     assert run("plot", "scan.mcap").exit_code == run("plot", "scan.mcap", "--html").exit_code == 0
     assert answer("cut", "scan.mcap", "--from", 0.1, "--until", 0.2, "--out", "cut.mcap")["ticks"] == 1000
@@ -119,7 +119,7 @@ def test_a_recording_that_vanishes_during_an_identification_is_one_message(scan:
 
 
 def test_all_columns_under_their_own_names(scan: Path):
-    names = [one["name"] for one in answer("import", scan, "--all", "--map", "x_drive_v=drive_mV")["signals"]]
+    names = [signal["name"] for signal in answer("import", scan, "--all", "--map", "x_drive_v=drive_mV")["signals"]]
     assert names == ["x_drive_v", "pos_nm", "T"]
     assert load("scan.mcap").units["pos_nm"] == "nm"
     assert run("plot", "scan.mcap").exit_code == 0
@@ -130,15 +130,14 @@ def test_jitter_and_missing_samples_are_reported_and_kept(folder: Path):
     times = np.delete(TIME + random.uniform(-5e-6, 5e-6, COUNT) + 1e-5, np.arange(1000, 1004))
     savemat(folder / "scan.mat", {"time": times, "u": np.delete(VOLTS, np.arange(1000, 1004))})
     notes = answer("import", "scan.mat", "--map", "x_drive_v=u [V]", "--time", "time [s]")["notes"]
-    found = re.fullmatch(
+    match = re.fullmatch(
         r"sample times jitter: the periods deviate by ([\d.]+) µs rms, ([\d.]+) µs at most, from the median of .*",
         notes[0],
     )
-    assert found
-    assert float(found[1]) == pytest.approx(
-        10 / 6**0.5, rel=0.05
-    )  # the difference of two that are spread evenly over 10
-    assert 9 < float(found[2]) <= 10.1
+    assert match
+    # The deviation is the difference of two offsets, each uniform over 10 µs.
+    assert float(match[1]) == pytest.approx(10 / 6**0.5, rel=0.05)
+    assert 9 < float(match[2]) <= 10.1
     assert re.match(r"about 4 samples missing, in 1 gap, the first after 0.09", notes[1])
     recording = load("scan.mcap")
     assert np.array_equal(recording["deadline_ns"], np.rint(times * 1e9))
@@ -152,7 +151,7 @@ def test_a_file_that_is_not_there_ends_as_with_every_command(folder: Path):
 
 
 def test_a_column_that_counts_is_not_offered_as_a_position(folder: Path):
-    """Neither a clock in seconds since 1970 nor a counter, where no unit says what they are."""
+    """The columns have no units: a clock in seconds since 1970 and a counter must not be suggested."""
     rows = "".join(f"{1_700_000_000 + k},{k},{k % 3},{k % 5}\n" for k in range(100))
     (folder / "scan.csv").write_text("stamp,count,out,gap\n" + rows)
     offered = run("import", "scan.csv").stdout.partition("for example:")[2]
@@ -161,10 +160,10 @@ def test_a_column_that_counts_is_not_offered_as_a_position(folder: Path):
 
 
 def test_a_column_with_infinite_values_is_no_clock():
-    """And no warning (each is an error here)."""
+    """Nor does it give a warning, which pytest turns into an error."""
     assert grows_evenly(np.arange(9.0))
-    for endless in ([0, np.inf, np.inf], [-np.inf, 1, np.inf], [0, 1, np.inf], [0, np.nan, 2]):
-        assert not grows_evenly(np.array(endless))
+    for values in ([0, np.inf, np.inf], [-np.inf, 1, np.inf], [0, 1, np.inf], [0, np.nan, 2]):
+        assert not grows_evenly(np.array(values))
 
 
 def test_a_given_rate_replaces_an_unusable_time(folder: Path):
@@ -174,7 +173,7 @@ def test_a_given_rate_replaces_an_unusable_time(folder: Path):
     assert "time 'time' does not grow from row 1 (0 s) to row 2 (0 s)" in result.stderr
     report = answer("import", "scan.mat", "--all", "--rate", 44_100)
     assert report["rate_hz"] == 44_100
-    assert [one["name"] for one in report["signals"]] == ["u"]
+    assert [signal["name"] for signal in report["signals"]] == ["u"]
     assert np.array_equal(load("scan.mcap")["deadline_ns"], np.rint(np.arange(COUNT) / 44_100 * 1e9))
 
 
@@ -216,7 +215,7 @@ def test_a_time_is_converted_as_its_mapping_says(
 def test_an_option_replaces_the_signal_of_a_mapping_file_under_its_short_name(scan: Path, folder: Path):
     (folder / "lab.toml").write_text('[signals]\ndrive_v = "drive_mV"\nx_position_um = "pos_nm"\n')
     report = answer("import", scan, "--mapping", "lab.toml", "--map", "x_drive_v=T [V]")
-    assert {one["name"]: one["from"] for one in report["signals"]} == {
+    assert {signal["name"]: signal["from"] for signal in report["signals"]} == {
         "x_position_um": "pos_nm [nm]", "x_drive_v": "T [V]"
     }  # fmt: skip
 
@@ -269,7 +268,7 @@ def test_an_output_that_exists_stays_as_it_is(scan: Path, folder: Path):
 
 
 def test_the_commands_of_the_document_work(folder: Path, monkeypatch: pytest.MonkeyPatch):
-    """From dSPACE and back: the commands of docs/data.md, with its mapping, on a file in ControlDesk's layout."""
+    """The commands of docs/data.md, with its mapping, import a file in ControlDesk's layout and export it again."""
     monkeypatch.setattr("rtloop.interchange.isolated_reader.read_table", read_table)
     text = DOCUMENT.read_text()
     (folder / "map.toml").write_text(re.search(r"```toml\n(.*?)```", text, re.DOTALL)[1])  # type: ignore[index]

@@ -1,4 +1,4 @@
-"""Files that are damaged, lie, or are much too large: one line that says so, and no memory to speak of."""
+"""Files that are damaged, contradict themselves or are much too large get a message of one line, in little memory."""
 
 from __future__ import annotations
 
@@ -19,35 +19,35 @@ from rtloop.interchange.reading import read_in_process
 
 HUGE = 2 << 30
 MEMORY_MIB = 400
-"""Of a process that refuses all of these files; the libraries alone take 200."""
+"""Limit of the memory of a process that refuses all bad files; the libraries alone take 200 MiB."""
 
 
-def sparse(path: Path, head: bytes = b"") -> None:
-    """A file of 2 GiB that takes no room."""
+def write_sparse_file(path: Path, head: bytes = b"") -> None:
+    """Write a file of 2 GiB that takes no disk space behind `head`."""
     with path.open("wb") as file:
         file.write(head)
         file.truncate(HUGE)
 
 
 @pytest.fixture
-def bad(tmp_path: Path) -> dict[str, str]:
-    """What is to be said, by the name of the file."""
+def bad_files(tmp_path: Path) -> dict[str, str]:
+    """A folder of bad files: the expected messages by file name."""
     savemat(tmp_path / "good.mat", {"t": np.arange(1000.0), "u": np.arange(1000.0)})
     valid = (tmp_path / "good.mat").read_bytes()
     (tmp_path / "good.mat").unlink()
     (tmp_path / "cut.mat").write_bytes(valid[:5000])
     (tmp_path / "junk.mat").write_bytes(valid[:128] + b"\x07" * 500)
     (tmp_path / "words.mat").write_bytes(b"hello there")
-    sparse(tmp_path / "zeros.mat")
-    sparse(tmp_path / "hole.mat", valid[:128])
-    sparse(tmp_path / "claim.mat", valid[:128] + np.array([14, HUGE - 136], "<u4").tobytes())
-    sparse(tmp_path / "zeros.csv")
-    sparse(tmp_path / "hole.csv", b"t,u\n" + b"0,1\n" * 1000)
-    sparse(tmp_path / "zeros.h5", b"\x89HDF\r\n\x1a\n")
+    write_sparse_file(tmp_path / "zeros.mat")
+    write_sparse_file(tmp_path / "hole.mat", valid[:128])
+    write_sparse_file(tmp_path / "claim.mat", valid[:128] + np.array([14, HUGE - 136], "<u4").tobytes())
+    write_sparse_file(tmp_path / "zeros.csv")
+    write_sparse_file(tmp_path / "hole.csv", b"t,u\n" + b"0,1\n" * 1000)
+    write_sparse_file(tmp_path / "zeros.h5", b"\x89HDF\r\n\x1a\n")
     with h5py.File(tmp_path / "claim.h5", "w") as file:
         file.create_dataset("x", (1 << 28,), "f8", chunks=(1 << 16,))
-    sparse(tmp_path / "zeros.npz", b"PK\x03\x04")
-    sparse(tmp_path / "zeros.parquet", b"PAR1")
+    write_sparse_file(tmp_path / "zeros.npz", b"PK\x03\x04")
+    write_sparse_file(tmp_path / "zeros.parquet", b"PAR1")
     (tmp_path / "empty.csv").write_bytes(b"")
     (tmp_path / "folder.mat").mkdir()
     return {
@@ -68,13 +68,13 @@ def bad(tmp_path: Path) -> dict[str, str]:
     }
 
 
-def test_each_damaged_file_is_refused_in_a_line_and_in_bounded_memory(bad: dict[str, str], tmp_path: Path):
-    command = [sys.executable, "-W", "error", "-m", __name__, *(str(tmp_path / name) for name in bad)]
+def test_each_damaged_file_is_refused_in_a_line_and_in_bounded_memory(bad_files: dict[str, str], tmp_path: Path):
+    command = [sys.executable, "-W", "error", "-m", __name__, *(str(tmp_path / name) for name in bad_files)]
     result = subprocess.run(command, capture_output=True, text=True, check=False)
     assert result.stderr == ""
     *lines, memory = result.stdout.splitlines()
-    assert len(lines) == len(bad)
-    for line, (name, message) in zip(lines, bad.items(), strict=True):
+    assert len(lines) == len(bad_files)
+    for line, (name, message) in zip(lines, bad_files.items(), strict=True):
         assert line.startswith(f"{tmp_path / name}: ")
         assert message in line
     assert int(memory) < MEMORY_MIB
@@ -119,15 +119,14 @@ def test_an_isolated_process_reads_the_same(tmp_path: Path):
 
 
 def main() -> None:
-    """Say what is wrong with each file, and then the memory that this process had at most, in MiB."""
+    """Print the error of each file given, and then the peak memory of this process in MiB."""
     for name in sys.argv[1:]:
         try:
             read_in_process(Path(name))
-        except UnreadableData as fault:
-            print(str(fault).replace("\n", "⏎"))
-    status = Path(
-        "/proc/self/status"
-    ).read_text()  # ru_maxrss would begin with that of the process that started this one
+        except UnreadableData as error:
+            print(str(error).replace("\n", "⏎"))
+    # ru_maxrss would begin with the value of the parent process.
+    status = Path("/proc/self/status").read_text()
     print(int(status.partition("VmHWM:")[2].split()[0]) >> 10)
 
 

@@ -1,4 +1,4 @@
-"""A file that points to others: what these hold, which only the user may read, gets into no recording."""
+"""A file with pointers to other files: values that only the user may read get into no recording."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ HEADER = b"MATLAB 7.3 MAT-file, written by a stranger"
 
 @pytest.fixture
 def canary(tmp_path: Path) -> Path:
-    """A file of numbers that is somebody's own, as HDF5 and, beside it, raw."""
+    """A private file of CANARY values in HDF5, with the same values beside it as raw bytes."""
     path = tmp_path / "private" / "canary.h5"
     path.parent.mkdir()
     with h5py.File(path, "w") as file:
@@ -35,6 +35,7 @@ def canary(tmp_path: Path) -> Path:
     return path
 
 
+# Each function below writes one pointer to the canary under a name of a group.
 def external_storage(place: Any, name: str, canary: Path) -> Any:
     raw = [(str(canary.with_suffix(".raw")), 0, ROWS * 8)]
     return place.create_dataset(name, (ROWS,), "<f8", external=raw)
@@ -66,6 +67,7 @@ def linked_group(place: Any, name: str, canary: Path) -> None:
 
 
 def reference(place: Any, name: str, canary: Path) -> None:
+    """Write references to a good dataset and to two datasets whose values are in the canary."""
     cells = place.file.require_group("#refs#")
     cells["a"] = DRIVE
     b, c = external_storage(cells, "b", canary), virtual(cells, "c", canary)
@@ -76,8 +78,8 @@ POINTERS = [external_storage, virtual, external_link, soft_link, soft_link_to_a_
 Pointer = Callable[[Any, str, Path], Any]
 
 
-def made(path: Path, canary: Path, *pointers: Pointer) -> Path:
-    """A file with two columns of its own, and whatever points elsewhere; a MAT file of version 7.3 by its name."""
+def write_scan(path: Path, canary: Path, *pointers: Pointer) -> Path:
+    """Write a file with two columns and pointers to the canary; version 7.3 of MAT if its name ends in .mat."""
     is_mat = path.suffix == ".mat"
     with h5py.File(path, "w", userblock_size=512 if is_mat else 0) as file:
         scan = file.create_group("scan")
@@ -96,12 +98,12 @@ def made(path: Path, canary: Path, *pointers: Pointer) -> Path:
 @pytest.mark.parametrize("ending", ["h5", "mat"])
 @pytest.mark.parametrize("pointer", [*POINTERS, reference])
 def test_data_in_another_file_are_skipped_and_named(tmp_path: Path, canary: Path, ending: str, pointer: Pointer):
-    table = read_in_process(made(tmp_path / f"scan.{ending}", canary, pointer), "scan")
+    table = read_in_process(write_scan(tmp_path / f"scan.{ending}", canary, pointer), "scan")
     columns = {name.rpartition("/")[2]: values for name, values in table.columns.items()}
     assert (columns["time"].tobytes(), columns["drive"].tobytes()) == (TIME.tobytes(), DRIVE.tobytes())
     assert not any(np.any(values == CANARY) for values in table.columns.values())
-    named = "#refs#" if pointer is reference and ending == "h5" else pointer.__name__
-    assert any(named in one for one in table.in_other_files), table.in_other_files
+    expected_name = "#refs#" if pointer is reference and ending == "h5" else pointer.__name__
+    assert any(expected_name in text for text in table.in_other_files), table.in_other_files
 
 
 def test_links_within_a_file_are_followed(tmp_path: Path):
@@ -132,14 +134,14 @@ def test_a_file_of_pointers_alone_is_refused(tmp_path: Path, canary: Path):
 
 @pytest.mark.parametrize("ending", ["h5", "mat"])
 def test_an_import_names_skipped_columns(tmp_path: Path, canary: Path, ending: str):
-    path = made(tmp_path / f"scan.{ending}", canary, *POINTERS, reference)
+    path = write_scan(tmp_path / f"scan.{ending}", canary, *POINTERS, reference)
     out = tmp_path / "scan.mcap"
     arguments = [str(path), "--all", "--group", "scan", "--rate", "1000", "--out", str(out), "--json"]
     result = CliRunner().invoke(import_command, arguments)
     assert result.exit_code == 0, result.output
-    left = json.loads(result.stdout)["in_other_files"]
+    skipped = json.loads(result.stdout)["in_other_files"]
     for pointer in POINTERS:
-        assert any(pointer.__name__ in one for one in left), left
+        assert any(pointer.__name__ in text for text in skipped), skipped
         assert f"scan/{pointer.__name__}" in result.stderr
     recording = load(out)
     assert not any(np.any(recording[name] == CANARY) for name in recording.columns)

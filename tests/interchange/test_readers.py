@@ -1,4 +1,4 @@
-"""Files of MATLAB, Simulink, ControlDesk, h5py, numpy and pandas, each made by its own library."""
+"""Files of MATLAB, Simulink, ControlDesk, HDF5, numpy and pandas, written by other libraries, are read exactly."""
 
 from __future__ import annotations
 
@@ -20,76 +20,76 @@ DRIVE = np.sin(2 * np.pi * 50 * TIME)
 PLACE = 1.3 * DRIVE + 0.01
 
 
-def same(table: Table, **expected: Any) -> bool:
-    """Whether the columns are these, in bytes; names with / are written with __."""
-    named = {name.replace("__", "/"): values for name, values in expected.items()}
+def has_columns(table: Table, **expected: Any) -> bool:
+    """Return whether the columns are exactly the expected ones; `__` in a name stands for /."""
+    renamed = {name.replace("__", "/"): values for name, values in expected.items()}
     return {name: values.tobytes() for name, values in table.columns.items()} == {
-        name: np.asarray(values, float).tobytes() for name, values in named.items()
+        name: np.asarray(values, float).tobytes() for name, values in renamed.items()
     }
 
 
-def structures(fields: tuple[str, ...], *rows: tuple[Any, ...]) -> np.ndarray[Any, Any]:
-    """A structure array of MATLAB."""
-    found = np.zeros(len(rows), [(field, "O") for field in fields])
+def structure_array(fields: tuple[str, ...], *rows: tuple[Any, ...]) -> np.ndarray[Any, Any]:
+    """Return a structure array as MATLAB has it, with one element for each row."""
+    array = np.zeros(len(rows), [(field, "O") for field in fields])
     for k, row in enumerate(rows):
-        found[k] = row
-    return found
+        array[k] = row
+    return array
 
 
 def test_controldesk(tmp_path: Path):
     path = tmp_path / "scan.mat"
     write_controldesk(path, TIME, {"Model Root/Piezo/Out1": (DRIVE, "mV"), "Model Root/Sensor/In1": (PLACE, "")})
     table = read_in_process(path)
-    assert same(table, **{"Time": TIME, "Model Root__Piezo__Out1": DRIVE, "Model Root__Sensor__In1": PLACE})
+    assert has_columns(table, **{"Time": TIME, "Model Root__Piezo__Out1": DRIVE, "Model Root__Sensor__In1": PLACE})
     assert (table.time, table.units["Model Root/Piezo/Out1"]) == ("Time", "mV")
     assert table.about["description"] == "scan of 12 April"
 
 
 def test_rasters_are_named_and_selected(tmp_path: Path):
-    x = structures(("Name", "Data", "Raster"), ("", TIME[None], "fast"), ("", TIME[None, ::10], "slow"))
-    y = structures(("Name", "Data", "XIndex"), ("u", DRIVE[None], 1.0), ("T", PLACE[None, ::10], 2.0))
+    x = structure_array(("Name", "Data", "Raster"), ("", TIME[None], "fast"), ("", TIME[None, ::10], "slow"))
+    y = structure_array(("Name", "Data", "XIndex"), ("u", DRIVE[None], 1.0), ("T", PLACE[None, ::10], 2.0))
     savemat(tmp_path / "scan.mat", {"scan": {"X": x, "Y": y}})
     table = read_in_process(tmp_path / "scan.mat")
-    assert same(table, Time=TIME, u=DRIVE)
+    assert has_columns(table, Time=TIME, u=DRIVE)
     assert (table.about["group"], table.about["other groups"]) == ("fast", "'slow' (50 rows, 2 columns)")
-    assert same(read_in_process(tmp_path / "scan.mat", "slow"), Time=TIME[::10], T=PLACE[::10])
+    assert has_columns(read_in_process(tmp_path / "scan.mat", "slow"), Time=TIME[::10], T=PLACE[::10])
     with pytest.raises(UnreadableData, match="no group 'middle'; there are 'fast', 'slow'"):
         read_in_process(tmp_path / "scan.mat", "middle")
 
 
 def test_rasters_of_one_length_keep_apart(tmp_path: Path):
-    x = structures(("Name", "Data", "Raster"), ("", TIME[None], "fast"), ("", 10 * TIME[None], "slow"))
-    y = structures(("Name", "Data", "XIndex"), ("u", DRIVE[None], 1.0), ("T", PLACE[None], 2.0))
+    x = structure_array(("Name", "Data", "Raster"), ("", TIME[None], "fast"), ("", 10 * TIME[None], "slow"))
+    y = structure_array(("Name", "Data", "XIndex"), ("u", DRIVE[None], 1.0), ("T", PLACE[None], 2.0))
     savemat(tmp_path / "scan.mat", {"scan": {"X": x, "Y": y}})
-    assert same(read_in_process(tmp_path / "scan.mat", "fast"), Time=TIME, u=DRIVE)
-    assert same(read_in_process(tmp_path / "scan.mat", "slow"), Time=10 * TIME, T=PLACE)
+    assert has_columns(read_in_process(tmp_path / "scan.mat", "fast"), Time=TIME, u=DRIVE)
+    assert has_columns(read_in_process(tmp_path / "scan.mat", "slow"), Time=10 * TIME, T=PLACE)
 
 
 def test_simulink(tmp_path: Path):
     both = np.column_stack([PLACE, 2 * PLACE])
-    signals = structures(("values", "label"), (DRIVE[:, None], "drive"), (both, "place"))
+    signals = structure_array(("values", "label"), (DRIVE[:, None], "drive"), (both, "place"))
     savemat(tmp_path / "a.mat", {"simout": {"time": TIME[:, None], "signals": signals, "blockName": "m/Scope"}})
     table = read_in_process(tmp_path / "a.mat")
-    assert same(table, time=TIME, drive=DRIVE, place_1=PLACE, place_2=2 * PLACE)
+    assert has_columns(table, time=TIME, drive=DRIVE, place_1=PLACE, place_2=2 * PLACE)
     assert table.time == "time"
     savemat(tmp_path / "b.mat", {"ts": {"Time": TIME, "Data": DRIVE, "Name": "drive", "DataInfo": {"Units": "V"}}})
     table = read_in_process(tmp_path / "b.mat")
-    assert same(table, Time=TIME, drive=DRIVE)
+    assert has_columns(table, Time=TIME, drive=DRIVE)
     assert (table.time, table.units) == ("Time", {"drive": "V"})
     savemat(tmp_path / "c.mat", {"ans": np.vstack([TIME, DRIVE, PLACE])})
-    assert same(read_in_process(tmp_path / "c.mat"), ans_1=TIME, ans_2=DRIVE, ans_3=PLACE)
+    assert has_columns(read_in_process(tmp_path / "c.mat"), ans_1=TIME, ans_2=DRIVE, ans_3=PLACE)
 
 
 @pytest.mark.parametrize("version", ["5", "4"])
 def test_plain_arrays(version: str, tmp_path: Path):
     savemat(tmp_path / "a.mat", {"t": TIME, "u": DRIVE, "slow": np.arange(7.0), "fs": 1e4}, format=version)
     table = read_in_process(tmp_path / "a.mat")
-    assert same(table, t=TIME, u=DRIVE)
+    assert has_columns(table, t=TIME, u=DRIVE)
     assert table.about["other groups"] == "'7 rows' (7 rows, 1 column)"
 
 
 def test_matlab_73(tmp_path: Path):
-    """As MATLAB writes it: arrays transposed, structure arrays and cells as references."""
+    """MATLAB stores arrays transposed, and structure arrays and cells as references."""
     with h5py.File(tmp_path / "a.mat", "w", userblock_size=512) as file:
         file["t"], file["both"] = TIME[:, None], np.stack([DRIVE, PLACE])
         cells = file.create_group("#refs#")
@@ -127,14 +127,14 @@ def test_hdf5_in_groups_with_links_that_lead_back(tmp_path: Path):
         file["loop"], file["run/back"], file["self"] = file["/"], h5py.SoftLink("/run"), h5py.SoftLink("/self")
         file["text"], file["steps"] = "words", np.zeros(9, "i2")
     table = read_in_process(tmp_path / "a.h5")
-    assert same(table, time=TIME, u=DRIVE)
+    assert has_columns(table, time=TIME, u=DRIVE)
     assert table.units == {"u": "V"}
     assert table.about["left out"] == (
         "loop (a link to an object that is already included), run/back (a link to an object that is already "
         "included), "
         "self (a link without a target)"
     )
-    assert same(read_in_process(tmp_path / "a.h5", "run/2"), time=TIME, u=PLACE)
+    assert has_columns(read_in_process(tmp_path / "a.h5", "run/2"), time=TIME, u=PLACE)
 
 
 def test_hdf5_of_nothing_but_a_loop(tmp_path: Path):
@@ -150,7 +150,7 @@ def test_numpy_and_pandas(tmp_path: Path):
     records["t"], records["n"] = TIME, np.arange(500)
     np.savez(tmp_path / "a.npz", log=records, pickled=np.array([{}], object))
     table = read_in_process(tmp_path / "a.npz")
-    assert same(table, t=TIME, n=np.arange(500))
+    assert has_columns(table, t=TIME, n=np.arange(500))
     assert table.about["left out"] == "pickled (pickled objects)"
     times = pandas.date_range("2024-03-01", periods=500, freq="100us", name="when")
     pandas.DataFrame({"u": DRIVE, "note": "a"}, index=times).to_parquet(tmp_path / "a.parquet")

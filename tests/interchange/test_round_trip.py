@@ -1,4 +1,4 @@
-"""What is exported is exact: read by libraries that know nothing of rtloop, and by the import, byte for byte."""
+"""Exported numbers are exact: independent libraries, and rtloop's import, read the recorded bytes."""
 
 from __future__ import annotations
 
@@ -28,27 +28,29 @@ ODD = (-0.0, 5e-324, -np.inf, 1.7976931348623157e308, 1 / 3, np.nan)
 
 @pytest.fixture(scope="module")
 def recording(tmp_path_factory: pytest.TempPathFactory) -> Recording:
-    """In virtual time, so that what was not measured is NaN."""
+    """A recording in virtual time, where unmeasured times are NaN, with the doubles of ODD."""
     rows = make_rows(COUNT, paced=False)
     rows[100 : 100 + len(ODD), COLUMNS.index("x_error_um")] = ODD
     path = tmp_path_factory.mktemp("run") / "run.mcap"
     return load(write_recording(path, rows, paced=False))
 
 
-def exported(recording: Recording, to: str, folder: Path, selection: Selection | None = None) -> Path:
+def export_recording(recording: Recording, to: str, folder: Path, selection: Selection | None = None) -> Path:
+    """Export a recording, or a selection of it, to the file `back` of a folder. Returns its path."""
     return Path(
         export(recording.paths[0], to, folder / f"back{EXPORT_SUFFIXES[to]}", None, selection or Selection())["output"]
     )
 
 
-def imported(path: Path) -> Recording:
+def import_file(path: Path) -> Recording:
+    """Import a file with the default selection of columns. Returns the new recording."""
     report = import_data(path, ColumnSelection(), path.with_suffix(".mcap"), table=read_in_process(path))
     return load(report["output"])
 
 
 @pytest.mark.parametrize("to", EXPORT_SUFFIXES)
 def test_import_of_export_is_the_recording(to: str, recording: Recording, tmp_path: Path):
-    back = imported(exported(recording, to, tmp_path))
+    back = import_file(export_recording(recording, to, tmp_path))
     assert set(back) == set(recording)
     assert [name for name in recording if back[name].tobytes() != recording[name].tobytes()] == []
     assert back.problems == []
@@ -57,7 +59,7 @@ def test_import_of_export_is_the_recording(to: str, recording: Recording, tmp_pa
 
 
 def test_mat_is_what_a_script_for_controldesk_reads(recording: Recording, tmp_path: Path):
-    time_s, signals, units = read_v5(exported(recording, "mat", tmp_path))
+    time_s, signals, units = read_v5(export_recording(recording, "mat", tmp_path))
     assert np.array_equal(time_s, recording.time_s)
     assert list(signals) == list(COLUMNS)
     assert [name for name in signals if signals[name].tobytes() != recording[name].tobytes()] == []
@@ -68,19 +70,19 @@ def test_a_recording_too_large_for_a_mat_file_is_refused_with_the_remedy(
     recording: Recording, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     numbers = 8 * COUNT * (len(COLUMNS) + 1)
-    monkeypatch.setattr(to_mat, "LARGEST_BYTES", numbers)  # the texts are beyond it
+    monkeypatch.setattr(to_mat, "LARGEST_BYTES", numbers)  # the texts exceed this limit
     with pytest.raises(RtloopError, match=r"back\.mat: .* allowed in a MAT file: 2 GiB\. Use --to hdf5"):
-        exported(recording, "mat", tmp_path)
+        export_recording(recording, "mat", tmp_path)
     assert list(tmp_path.iterdir()) == []
     monkeypatch.setattr(to_mat, "LARGEST_BYTES", 2 * numbers)
-    assert exported(recording, "mat", tmp_path).stat().st_size > numbers
+    assert export_recording(recording, "mat", tmp_path).stat().st_size > numbers
 
 
 def test_mat_names_its_origin(recording: Recording, tmp_path: Path):
-    found = loadmat(exported(recording, "mat", tmp_path), simplify_cells=True)["back"]
-    assert found["Description"]["General"] == "test, recorded by rtloop at 10000 Hz"
-    assert json.loads(found["Info"]["Header"])["rate_hz"] == 10_000.0
-    assert json.loads(found["Info"]["Events"]) == recording.events
+    struct = loadmat(export_recording(recording, "mat", tmp_path), simplify_cells=True)["back"]
+    assert struct["Description"]["General"] == "test, recorded by rtloop at 10000 Hz"
+    assert json.loads(struct["Info"]["Header"])["rate_hz"] == 10_000.0
+    assert json.loads(struct["Info"]["Events"]) == recording.events
 
 
 @pytest.mark.parametrize(
@@ -92,7 +94,7 @@ def test_the_matlab_variable_follows_the_file_name(stem: str, variable: str):
 
 
 def test_hdf5_has_a_dataset_a_signal(recording: Recording, tmp_path: Path):
-    with h5py.File(exported(recording, "hdf5", tmp_path)) as file:
+    with h5py.File(export_recording(recording, "hdf5", tmp_path)) as file:
         assert set(file) == {*COLUMNS, "header_json", "events_json"}
         assert all(file[name][()].tobytes() == recording[name].tobytes() for name in COLUMNS)
         assert file["x_drive_v"].attrs["unit"] == "V"
@@ -102,24 +104,24 @@ def test_hdf5_has_a_dataset_a_signal(recording: Recording, tmp_path: Path):
 @pytest.mark.parametrize("to", EXPORT_SUFFIXES)
 def test_an_export_selects_time_signals_and_every_nth_tick(to: str, recording: Recording, tmp_path: Path):
     selection = Selection(("x_*_v", "mode"), 0.1, 0.3, 7)
-    table = read_in_process(exported(recording, to, tmp_path, selection))
-    kept = slice(1000, 3001, 7)
+    table = read_in_process(export_recording(recording, to, tmp_path, selection))
+    selected = slice(1000, 3001, 7)
     expected = ["tick", "deadline_ns", "mode", "x_adc_v", "x_demand_v", "x_drive_v"]
     assert sorted(set(table.columns) - {"Time"}) == sorted(expected)
-    assert all(table.columns[name].tobytes() == recording[name][kept].tobytes() for name in expected)
+    assert all(table.columns[name].tobytes() == recording[name][selected].tobytes() for name in expected)
 
 
 def test_an_impossible_selection_writes_no_file(recording: Recording, tmp_path: Path):
     with pytest.raises(RtloopError, match=r"no signal 'y_\*'; there are tick, deadline_ns, "):
-        exported(recording, "csv", tmp_path, Selection(("y_*",)))
+        export_recording(recording, "csv", tmp_path, Selection(("y_*",)))
     for to in EXPORT_SUFFIXES:
         with pytest.raises(RtloopError, match="holds no tick from 7 s to 8 s"):
-            exported(recording, to, tmp_path, Selection((), 7.0, 8.0))
+            export_recording(recording, to, tmp_path, Selection((), 7.0, 8.0))
     assert list(tmp_path.iterdir()) == []
 
 
 def test_every_tenth_tick_comes_back_as_a_slower_recording(recording: Recording, tmp_path: Path):
-    back = imported(exported(recording, "npz", tmp_path, Selection(every=10)))
+    back = import_file(export_recording(recording, "npz", tmp_path, Selection(every=10)))
     assert back.header["rate_hz"] == 1000.0
     assert np.array_equal(back["tick"], np.arange(COUNT // 10))
     assert np.array_equal(back["deadline_ns"], recording["deadline_ns"][::10])
@@ -129,7 +131,7 @@ def test_every_tenth_tick_comes_back_as_a_slower_recording(recording: Recording,
 def test_lost_ticks_stay_lost(tmp_path: Path):
     ticks = np.delete(np.arange(500.0, 4000.0), np.arange(700, 720))
     np.savez(tmp_path / "run.npz", tick=ticks, deadline_ns=ticks * 1e5, x_drive_v=ticks)
-    back = imported(tmp_path / "run.npz")
+    back = import_file(tmp_path / "run.npz")
     assert np.array_equal(back["tick"], ticks)
     assert (summarise(back.paths).ticks_lost, back.problems) == (20, [])
     assert back.header["imported"]["notes"] == ["about 20 samples missing, in 1 gap, the first after 0.1199 s"]
@@ -150,7 +152,7 @@ def test_frames(recording: Recording, tmp_path: Path):
 
 
 def test_a_kept_column_of_ticks_replaces_neither_ticks_nor_deadlines(recording: Recording, tmp_path: Path):
-    path = exported(recording, "npz", tmp_path)
+    path = export_recording(recording, "npz", tmp_path)
     selection = ColumnSelection(keep=("tick", "deadline_ns", "x_drive_v"), rate_hz=1_000.0)
     back = load(import_data(path, selection, tmp_path / "kept.mcap", table=read_in_process(path))["output"])
     assert np.array_equal(back["deadline_ns"], 1e6 * np.arange(COUNT))

@@ -18,7 +18,7 @@ LSB_V = 20.48 / 65536
 
 
 def frame(sequence: int, signal: np.ndarray, format_number: int = 1) -> bytes:
-    """Three batches of eight samples: `signal` (24,) at adc0, its negative at dac0."""
+    """Return a frame of three batches of eight samples: `signal` (24,) at adc0, its negative at dac0."""
     data = struct.pack("<HBBI", 0x057B, format_number, SAMPLES, sequence % 2**32)
     for batch in signal.reshape(BATCHES, SAMPLES):
         data += struct.pack("<8h", *batch) + struct.pack("<8h", *[7] * SAMPLES)
@@ -28,21 +28,21 @@ def frame(sequence: int, signal: np.ndarray, format_number: int = 1) -> bytes:
 
 @pytest.fixture
 def signal() -> np.ndarray:
-    """Codes of ten frames."""
+    """Codes (10 frames, 24 samples) of a converter, drawn at random."""
     return np.random.default_rng(5).integers(-32000, 32000, (10, BATCHES * SAMPLES))
 
 
 def test_codes_become_volts_and_lost_frames_leave_a_gap_in_time(tmp_path: Path, signal):
     first = 2**32 - 3 * BATCHES  # The sequence begins again at 0 within the file.
-    sent = [i for i in range(10) if i not in (4, 5)]
+    present_frames = [i for i in range(10) if i not in (4, 5)]
     path = tmp_path / "stream.bin"
-    path.write_bytes(b"".join(frame(first + i * BATCHES, signal[i]) for i in sent) + b"\x7b\x05\x01")
+    path.write_bytes(b"".join(frame(first + i * BATCHES, signal[i]) for i in present_frames) + b"\x7b\x05\x01")
     table = read_in_process(path)
-    np.testing.assert_array_equal(table.columns["adc0"], signal[sent].reshape(-1) * LSB_V)
-    np.testing.assert_array_equal(table.columns["dac0"], -signal[sent].reshape(-1) * LSB_V)
+    np.testing.assert_array_equal(table.columns["adc0"], signal[present_frames].reshape(-1) * LSB_V)
+    np.testing.assert_array_equal(table.columns["dac0"], -signal[present_frames].reshape(-1) * LSB_V)
     np.testing.assert_array_equal(table.columns["adc1"], 7 * LSB_V)
     assert not table.columns["dac1"].any()
-    expected = np.concatenate([np.arange(24) + 24 * i for i in sent])
+    expected = np.concatenate([np.arange(24) + 24 * i for i in present_frames])
     np.testing.assert_array_equal(table.columns["sample"], expected)
     np.testing.assert_allclose(table.columns["time"], expected * 1.28e-6, rtol=1e-12)
     assert table.about["lost frames"] == "2"

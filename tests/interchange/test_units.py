@@ -1,4 +1,4 @@
-"""Units by name, and the words of a mapping."""
+"""Units are converted by name, and mappings of columns to signals are read and checked."""
 
 from __future__ import annotations
 
@@ -154,8 +154,8 @@ def test_the_mapping_beside_the_data(tmp_path: Path):
     assert find_mapping(data) is None
     (tmp_path / "map.toml").write_text('rate_hz = 100.0\nkeep = ["T"]\n[signals]\nx_drive_v = "U [V]"\n')
     assert find_mapping(data) == tmp_path / "map.toml"
-    found = read_mapping(tmp_path / "map.toml")
-    assert found == ColumnSelection(signals={"x_drive_v": "U [V]"}, keep=("T",), rate_hz=100.0)
+    selection = read_mapping(tmp_path / "map.toml")
+    assert selection == ColumnSelection(signals={"x_drive_v": "U [V]"}, keep=("T",), rate_hz=100.0)
     (tmp_path / "scan.map.toml").write_text("all = true\n")
     assert find_mapping(data) == tmp_path / "scan.map.toml"
     assert extend_selection(["x_drive_v=a=b", "A = 1", "T"], ColumnSelection()) == ColumnSelection(
