@@ -1,4 +1,4 @@
-"""Reference scope in plain Python that looks at one tick after the other: the sweeps that triggers must find."""
+"""Reference trigger in plain Python that examines one tick after the other: the sweeps that triggers must find."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ Record = dict[str, float]
 TRIP_BITS = 0xFFFFFF00
 
 
-class Wanted(NamedTuple):
-    """What is looked for: `kind` edge, window, trip, mode, late or step, and its figures."""
+class ConditionSpec(NamedTuple):
+    """Trigger condition: kind (edge, window, trip, mode, late or step) and figures, of which each kind uses some."""
 
     kind: str
     level: float = 0.0
@@ -21,20 +21,22 @@ class Wanted(NamedTuple):
     threshold: float = 0.0
 
 
-class Eye:
-    """Looks at one tick after the other; `see` says whether the condition is met there."""
+class ConditionMonitor:
+    """Examines consecutive records for one condition, with a method for each kind."""
 
-    def __init__(self, wanted: Wanted) -> None:
-        self.wanted, self.before = wanted, None
+    def __init__(self, spec: ConditionSpec) -> None:
+        self.spec, self.previous = spec, None
         self.low_seen = self.high_seen = self.inside_seen = False
 
-    def see(self, record: Record, after_gap: bool) -> bool:
-        before, self.before = self.before, record
-        return getattr(self, f"_{self.wanted.kind}")(record["s"], record, before, after_gap)
+    def is_met(self, record: Record, after_gap: bool) -> bool:
+        """Return whether the next record meets the condition; `after_gap` tells that ticks were lost before it."""
+        previous, self.previous = self.previous, record
+        return getattr(self, f"_{self.spec.kind}")(record["s"], record, previous, after_gap)
 
-    def _edge(self, s: float, _r: Record, _b: Record | None, after_gap: bool) -> bool:
-        w = self.wanted
-        up, down = s >= w.level, s <= w.level
+    def _edge(self, s: float, _record: Record, _previous: Record | None, after_gap: bool) -> bool:
+        """Return whether s reaches the level after it was beyond the hysteresis on the other side."""
+        spec = self.spec
+        up, down = s >= spec.level, s <= spec.level
         if after_gap:
             self.low_seen, self.high_seen = self.low_seen and up, self.high_seen and down
         rising, falling = self.low_seen and up, self.high_seen and down
@@ -42,58 +44,69 @@ class Eye:
             self.low_seen = False
         if down:
             self.high_seen = False
-        if s < w.level - w.hysteresis:
+        if s < spec.level - spec.hysteresis:
             self.low_seen = True
-        if s > w.level + w.hysteresis:
+        if s > spec.level + spec.hysteresis:
             self.high_seen = True
-        return (rising and w.slope != "falling") or (falling and w.slope != "rising")
+        return (rising and spec.slope != "falling") or (falling and spec.slope != "rising")
 
-    def _window(self, s: float, _r: Record, _b: Record | None, after_gap: bool) -> bool:
-        inside, outside = self.wanted.low <= s <= self.wanted.high, s < self.wanted.low or s > self.wanted.high
+    def _window(self, s: float, _record: Record, _previous: Record | None, after_gap: bool) -> bool:
+        """Return whether s leaves the window after it was inside."""
+        inside, outside = self.spec.low <= s <= self.spec.high, s < self.spec.low or s > self.spec.high
         if after_gap and not outside:
             self.inside_seen = False
-        left = outside and self.inside_seen
+        has_left = outside and self.inside_seen
         if inside or outside:
             self.inside_seen = inside
-        return left
+        return has_left
 
-    def _trip(self, _s: float, record: Record, before: Record | None, _gap: bool) -> bool:
-        had = int(record["flags"] if before is None else before["flags"]) & TRIP_BITS
-        return any(int(record["flags"]) >> bit & 1 and not had >> bit & 1 for bit in range(8, 32))
+    def _trip(self, _s: float, record: Record, previous: Record | None, _after_gap: bool) -> bool:
+        """Return whether a trip flag is set that was not set at the previous record."""
+        previous_trips = int(record["flags"] if previous is None else previous["flags"]) & TRIP_BITS
+        return any(int(record["flags"]) >> bit & 1 and not previous_trips >> bit & 1 for bit in range(8, 32))
 
-    def _mode(self, _s: float, record: Record, before: Record | None, _gap: bool) -> bool:
-        return before is not None and before["mode"] != record["mode"]
+    def _mode(self, _s: float, record: Record, previous: Record | None, _after_gap: bool) -> bool:
+        """Return whether the mode differs from the mode of the previous record."""
+        return previous is not None and previous["mode"] != record["mode"]
 
-    def _late(self, _s: float, record: Record, _b: Record | None, _gap: bool) -> bool:
+    def _late(self, _s: float, record: Record, _previous: Record | None, _after_gap: bool) -> bool:
+        """Return whether periods were missed."""
         return record["periods_missed"] > 0
 
-    def _step(self, s: float, _r: Record, before: Record | None, after_gap: bool) -> bool:
-        if before is None or after_gap or math.isnan(s) or math.isnan(before["s"]):
+    def _step(self, s: float, _record: Record, previous: Record | None, after_gap: bool) -> bool:
+        """Return whether s changes by more than the threshold from one tick to the next."""
+        if previous is None or after_gap or math.isnan(s) or math.isnan(previous["s"]):
             return False
-        return abs(s - before["s"]) > self.wanted.threshold
+        return abs(s - previous["s"]) > self.spec.threshold
 
 
-def sweeps(wanted: Wanted, settings: Any, records: dict[int, Record], force_at: int | None = None) -> list[tuple]:
-    """(first, trigger, end, cause, uncertain) of the sweeps that end; `records` by tick, without lost ones."""
-    ticks, eye = sorted(records), Eye(wanted)
-    pre = round((settings.ticks - 1) * settings.pre_percent / 100)
-    found: list[tuple] = []
-    free = ready = ticks[0]
-    taken, forced = False, False
-    for place, tick in enumerate(ticks):
-        lost = tick - ticks[place - 1] - 1 if place else 0
+def expected_sweeps(
+    spec: ConditionSpec, settings: Any, records: dict[int, Record], force_at: int | None = None
+) -> list[tuple]:
+    """Return (first, trigger, end, cause, uncertain ticks) of each sweep that ends with the records or before.
+
+    `records` has the record of each tick that is not lost; a sweep is forced from tick `force_at` on.
+    """
+    ticks, monitor = sorted(records), ConditionMonitor(spec)
+    pre_ticks = round((settings.ticks - 1) * settings.pre_percent / 100)
+    sweeps: list[tuple] = []
+    free_tick = ready_tick = ticks[0]
+    has_swept, forced = False, False
+    for index, tick in enumerate(ticks):
+        lost_ticks = tick - ticks[index - 1] - 1 if index else 0
         forced = forced or tick == force_at
-        met = eye.see(records[tick], lost > 0)
+        is_met = monitor.is_met(records[tick], lost_ticks > 0)
         cause = None
-        if met and tick >= ready and not (settings.mode == "single" and taken):
+        if is_met and tick >= ready_tick and not (settings.mode == "single" and has_swept):
             cause = "trigger"
-        elif forced and tick >= free:
+        elif forced and tick >= free_tick:
             cause = "forced"
-        elif settings.mode == "auto" and tick >= ready + settings.auto_ticks:
+        elif settings.mode == "auto" and tick >= ready_tick + settings.auto_ticks:
             cause = "auto"
         if cause is not None:
-            end = tick - pre + settings.ticks
-            found.append((tick - pre, tick, end, cause, lost if cause == "trigger" and wanted.kind != "late" else 0))
-            taken = taken or cause != "auto"
-            free, ready, forced = end, max(end, tick + settings.holdoff_ticks), False
-    return [sweep for sweep in found if sweep[2] <= ticks[-1] + 1]
+            end = tick - pre_ticks + settings.ticks
+            uncertain_ticks = lost_ticks if cause == "trigger" and spec.kind != "late" else 0
+            sweeps.append((tick - pre_ticks, tick, end, cause, uncertain_ticks))
+            has_swept = has_swept or cause != "auto"
+            free_tick, ready_tick, forced = end, max(end, tick + settings.holdoff_ticks), False
+    return [sweep for sweep in sweeps if sweep[2] <= ticks[-1] + 1]

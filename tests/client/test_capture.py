@@ -31,21 +31,21 @@ Loop = tuple[Bench, Connection]
 
 @pytest.fixture(scope="module")
 def loop(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Loop]:
-    """In closed loop, recorded into a new file every two seconds."""
+    """Yield a bench whose loop is closed and recorded into a new file every two seconds, and a connection as ada."""
     recording = ("[recording]", "[recording]\nrotate_s = 2.0")
     with Bench(tmp_path_factory.mktemp("capture"), recording) as bench:
         bench.await_drive()
         yield bench, rtloop.connect(bench.client.path, as_="ada")
 
 
-def asked(run: Recording) -> dict[str, np.ndarray]:
-    """The ticks and references of the stretch that was asked for, once the whole replays."""
-    report = replay(run)
-    assert (report.identical, report.gaps, run.problems) == (True, [], [])
-    said, tick = run.header["cut"], run["tick"]
-    there = (tick >= said["first"]) & (tick < said["end"])
-    assert tick[there].tolist() == list(range(said["first"], said["end"]))
-    return {"tick": tick[there], "x_reference_um": run["x_reference_um"][there]}
+def requested_rows(capture: Recording) -> dict[str, np.ndarray]:
+    """Return the requested ticks of a capture and their references (µm); check that the whole capture replays."""
+    report = replay(capture)
+    assert (report.identical, report.gaps, capture.problems) == (True, [], [])
+    cut, tick = capture.header["cut"], capture["tick"]
+    is_requested = (tick >= cut["first"]) & (tick < cut["end"])
+    assert tick[is_requested].tolist() == list(range(cut["first"], cut["end"]))
+    return {"tick": tick[is_requested], "x_reference_um": capture["x_reference_um"][is_requested]}
 
 
 def test_a_capture_about_a_tick_spans_changes_of_gains_and_modes(loop: Loop):
@@ -55,26 +55,26 @@ def test_a_capture_about_a_tick_spans_changes_of_gains_and_modes(loop: Loop):
     tick = connection.setpoint("x", 12.5)
     connection.start()
     connection.tune("x", "controller", gain=0.011)
-    stretch = asked(connection.capture(0.5, at=tick, pre_percent=20))
-    place = int(np.flatnonzero(stretch["tick"] == tick)[0])
+    rows = requested_rows(connection.capture(0.5, at=tick, pre_percent=20))
+    index = int(np.flatnonzero(rows["tick"] == tick)[0])
     rate_hz = bench.client.get("/configuration")["rate_hz"]
-    assert len(stretch["tick"]) == round(0.5 * rate_hz)
-    assert place == round((len(stretch["tick"]) - 1) * 0.2)
-    assert stretch["x_reference_um"][place - 1 : place + 1].tolist() == [2.0, 12.5]
+    assert len(rows["tick"]) == round(0.5 * rate_hz)
+    assert index == round((len(rows["tick"]) - 1) * 0.2)
+    assert rows["x_reference_um"][index - 1 : index + 1].tolist() == [2.0, 12.5]
 
 
 def test_changes_of_a_running_loop_are_previewed_made_and_undone(loop: Loop):
     _, connection = loop
-    controller = lambda: connection.configuration["values"]["axis"][0]["controller"]
-    before = controller()
+    read_controller = lambda: connection.configuration["values"]["axis"][0]["controller"]
+    before = read_controller()
     connection.preview("x", "controller", gain=0.012)
-    assert controller() == before
+    assert read_controller() == before
     tick = connection.tune("x", "controller", gain=0.012)
-    assert controller()["gain"] == 0.012
+    assert read_controller()["gain"] == 0.012
     assert connection.undo("x")["tick"] > tick
-    assert controller() == before
+    assert read_controller() == before
     assert connection.controller("x", before | {"gain": 0.013}) > tick
-    assert controller()["gain"] == 0.013
+    assert read_controller()["gain"] == 0.013
     connection.undo("x")
     connection.setpoint("x", 12.0)
     connection.waveform("x", np.linspace(12.0, 13.0, 50), hold_ticks=4)
@@ -91,18 +91,18 @@ def test_a_capture_about_a_trigger_has_it_at_its_place(loop: Loop, pre_percent: 
     mover = threading.Timer(0.3, lambda: moves.append(connection.setpoint("x", 6.0)))
     mover.start()
     edge = rtloop.Edge("x_reference_um", 3.0, "rising")
-    stretch = asked(connection.capture(0.05, edge, pre_percent=pre_percent))
+    rows = requested_rows(connection.capture(0.05, edge, pre_percent=pre_percent))
     mover.join()
-    crossed = np.flatnonzero(stretch["tick"] == moves[0])
-    assert crossed.tolist() == [round((len(stretch["tick"]) - 1) * pre_percent / 100)]
+    crossed = np.flatnonzero(rows["tick"] == moves[0])
+    assert crossed.tolist() == [round((len(rows["tick"]) - 1) * pre_percent / 100)]
 
 
 def test_a_capture_without_a_tick_begins_now(loop: Loop, tmp_path: Path):
     bench, connection = loop
     before = bench.ticks
-    run = connection.capture(0.1, folder=tmp_path)
-    assert [path.parent for path in run.paths] == [tmp_path]
-    assert asked(run)["tick"][0] >= before
+    capture = connection.capture(0.1, folder=tmp_path)
+    assert [path.parent for path in capture.paths] == [tmp_path]
+    assert requested_rows(capture)["tick"][0] >= before
 
 
 def test_a_capture_lies_beside_the_recording_and_overwrites_none(loop: Loop):
@@ -110,29 +110,30 @@ def test_a_capture_lies_beside_the_recording_and_overwrites_none(loop: Loop):
     tick = bench.ticks
     paths = [connection.capture(0.01, at=tick, pre_percent=0).paths[0] for _ in range(3)]
     stem = current_run(bench.client).file.stem
-    assert [path.name for path in paths] == [f"{stem}.capture-{tick}{more}.mcap" for more in ("", "-2", "-3")]
+    assert [path.name for path in paths] == [f"{stem}.capture-{tick}{suffix}.mcap" for suffix in ("", "-2", "-3")]
     assert len({b"".join(rows.tobytes() for rows in rtloop.load(path).blocks()) for path in paths}) == 1
     assert rtloop.load(paths[0]).header["cut"]["files"][0].startswith(stem)
 
 
 def test_a_capture_begins_at_tick_0_at_the_earliest(loop: Loop):
-    """It reads no later file: the recorder gives the newest one another name every two seconds."""
+    """The capture reads the first file alone: the recorder renames the newest file every two seconds."""
     _, connection = loop
-    run = connection.capture(0.02, at=0)
-    assert asked(run)["tick"][0] == 0
-    assert len(run.header["cut"]["files"]) == 1
+    capture = connection.capture(0.02, at=0)
+    assert requested_rows(capture)["tick"][0] == 0
+    assert len(capture.header["cut"]["files"]) == 1
 
 
 def test_a_capture_in_a_separate_process_prints_its_report(loop: Loop):
     bench, _ = loop
     run = current_run(bench.client)
     command = [sys.executable, "-m", "rtloop.client.capture.tick_capture", bench.client.path, run.file]
-    for first, ends in ((run.tick, ["identical"]), (1 << 40, [])):
-        done = subprocess.run(
-            [*map(str, command), str(first), str(first + 20) if ends else "7"], capture_output=True, text=True
+    for first, expected in ((run.tick, ["identical"]), (1 << 40, [])):
+        result = subprocess.run(
+            [*map(str, command), str(first), str(first + 20) if expected else "7"], capture_output=True, text=True
         )
-        said = json.loads(done.stdout)
-        assert (done.returncode, [said[key] for key in said if key == "replay"]) == (not ends, ends), done
+        report = json.loads(result.stdout)
+        verdicts = [report[key] for key in report if key == "replay"]
+        assert (result.returncode, verdicts) == (not expected, expected), result
 
 
 def test_invalid_captures_raise_and_leave_no_file(loop: Loop):
@@ -158,29 +159,29 @@ def test_invalid_captures_raise_and_leave_no_file(loop: Loop):
 
 
 def test_a_capture_of_a_tick_ahead_comes_within_its_time(loop: Loop):
-    """Half a second ahead at a known rate: refused within 0.1 s, captured within 60 s."""
+    """A tick half a second ahead is refused with a time-out of 0.1 s and captured with the default of 60 s."""
     bench, connection = loop
     tick = bench.ticks + round(0.5 * bench.client.get("/configuration")["rate_hz"])
     with pytest.raises(RtloopError, match=rf"reaches tick {tick} in 0\.\d s; allowed: within timeout_s = 0\.1 s"):
         connection.capture(0.02, at=tick, timeout_s=0.1)
-    assert tick in asked(connection.capture(0.02, at=tick))["tick"]
+    assert tick in requested_rows(connection.capture(0.02, at=tick))["tick"]
 
 
 def test_a_capture_across_two_recorders_replays(loop: Loop):
-    """The stretch begins behind the place, and the last state of the law before it is in the dead one's file."""
+    """A capture after the death of a recorder replays, though it needs a snapshot from the file of that recorder."""
     bench, connection = loop
-    dead = bench.pid("recorder")
-    os.kill(dead, signal.SIGKILL)
-    wait_for(lambda: bench.pid("recorder") != dead, "another recorder")
-    wait_for(lambda: bench.status()["recording"]["state"] == "recording", "ticks that are taken")
+    dead_pid = bench.pid("recorder")
+    os.kill(dead_pid, signal.SIGKILL)
+    wait_for(lambda: bench.pid("recorder") != dead_pid, "another recorder")
+    wait_for(lambda: bench.status()["recording"]["state"] == "recording", "a recording by the new recorder")
     for _ in range(3):
         run = connection.capture(0.1, at=bench.ticks)
-        asked(run)
+        requested_rows(run)
     assert run.paths[0].parent == bench.folder / "recordings"
 
 
 def test_the_notebook_runs(loop: Loop, monkeypatch: pytest.MonkeyPatch):
-    """Its cells in order, in one namespace, as a kernel executes them; pictures are drawn and not shown."""
+    """Execute the notebook's cells in order in one namespace, as a kernel does; figures are drawn and not shown."""
     bench, connection = loop
     connection.release()
     monkeypatch.setattr("rtloop.supervision.paths.client_folders", lambda: [bench.client.path.parent])
@@ -192,44 +193,46 @@ def test_the_notebook_runs(loop: Loop, monkeypatch: pytest.MonkeyPatch):
         if cell["cell_type"] == "code":
             assert (cell["outputs"], cell["execution_count"]) == ([], None)
             exec(compile("".join(cell["source"]), f"{NOTEBOOK}: {cell['id']}", "exec"), names)
-    assert asked(names["step"])["x_reference_um"][[0, -1]].tolist() == [0.0, 12.5]
+    assert requested_rows(names["step"])["x_reference_um"][[0, -1]].tolist() == [0.0, 12.5]
     assert abs(names["position"][-1] - 12.5) < 0.2
-    assert asked(names["period"])["x_reference_um"].max() == pytest.approx(3.0, abs=0.01)
+    assert requested_rows(names["period"])["x_reference_um"].max() == pytest.approx(3.0, abs=0.01)
     assert len(names["upper"].lines) == 2
-    said = connection.status
-    assert (said["lock"], said["mode"]) == (None, "off")
+    status = connection.status
+    assert (status["lock"], status["mode"]) == (None, "off")
     assert "notebook" in {event["who"] for event in names["step"].events}
 
 
-class Unrecorded:
-    """What a service says that cannot write."""
+class ClientOfUnrecordedLoop:
+    """Client of a service whose loop runs unrecorded; `recording` is the value of this key in its status."""
 
     path = Path("lab.sock")
 
     def __init__(self, **recording: Any) -> None:
-        self.said = {"state": "running", "tick": 9, "rate_hz": 1e4, "recording": recording}
+        self.status = {"state": "running", "tick": 9, "rate_hz": 1e4, "recording": recording}
 
     def get(self, _: str) -> dict[str, Any]:
-        return self.said
+        return self.status
 
 
 def test_a_capture_without_a_recording_is_refused():
-    full = Unrecorded(state="not recording", reason="No space left on device", since_tick=7, file="a", written_ticks=7)
+    full_disk = ClientOfUnrecordedLoop(
+        state="not recording", reason="No space left on device", since_tick=7, file="a", written_ticks=7
+    )
     for client, words in (
-        (full, "not recorded from tick 7 on: No space left on device"),
-        (Unrecorded(), "no loop is recorded now; the state of the service is running"),
+        (full_disk, "not recorded from tick 7 on: No space left on device"),
+        (ClientOfUnrecordedLoop(), "no loop is recorded now; the state of the service is running"),
     ):
         with pytest.raises(UnavailableError, match=words):
             Connection(client).capture(1.0)  # type: ignore[arg-type]
 
 
 def test_a_capture_after_the_end_of_the_run_is_complete(loop: Loop):
-    """Last in this file: the service ends. Its captures are no parts of its recording."""
+    """This test is the last of the file, for it stops the service. Captures do not count as files of the recording."""
     bench, _ = loop
     run = current_run(bench.client)
     bench.stop()
     report = capture_ticks(bench.client, run.file, run.tick - 50, run.tick)
-    assert asked(rtloop.load(report["output"]))["tick"][-1] == run.tick - 1
-    wait_for(lambda: not [*run.file.parent.glob("*.part")], "the end of the files")
-    parts = replay(rtloop.load(str(run.file.with_name(f"{run.file.stem}-*.mcap"))))
-    assert parts.identical
+    assert requested_rows(rtloop.load(report["output"]))["tick"][-1] == run.tick - 1
+    wait_for(lambda: not [*run.file.parent.glob("*.part")], "the end of the recording")
+    verdict = replay(rtloop.load(str(run.file.with_name(f"{run.file.stem}-*.mcap"))))
+    assert verdict.identical

@@ -56,14 +56,14 @@ REQUESTS: dict[str, tuple[Any, dict[str, Any]]] = {
         {"axis": "x", "samples": [0.0] * 4, "cycles": 2, "resonance_percent": 2.0, "keep": False},
     ),
 }
-"""Call of a method and the body that it sends, by resource."""
+"""Call of the connection's method and the body that this method sends, for each resource."""
 SERVED = {request.path: request for request in SERVICE_REQUESTS if request.method == "POST" and request.path != "/lock"}
-BY_ANOTHER_NAME = {"lock": "take", "resonance": "response"}
-"""Commands of `rtloop ctl` whose method has another name: `resonance` is a response with `resonance_only`."""
+METHOD_NAMES = {"lock": "take", "resonance": "response"}
+"""Method of each command of `rtloop ctl` that has another name: `resonance` is a response with `resonance_only`."""
 
 
 class RecordingClient:
-    """A client that records requests and answers each."""
+    """Client that appends each request to `requests` and answers it with tick 7."""
 
     def __init__(self) -> None:
         self.requests: list[tuple[str, dict[str, Any]]] = []
@@ -91,7 +91,7 @@ def test_the_client_waits_longest_for_the_requests_that_build_a_law():
 
 def test_each_command_of_ctl_is_a_member_of_the_connection():
     ctl: Any = main.commands["ctl"]
-    names = {BY_ANOTHER_NAME.get(name, name) for name in ctl.commands}
+    names = {METHOD_NAMES.get(name, name) for name in ctl.commands}
     assert names <= set(dir(Connection)), names - set(dir(Connection))
     assert {"configuration", "capture", "swap"} <= set(dir(Connection))
 
@@ -121,31 +121,31 @@ def test_a_retuning_proposes_taps_that_only_a_swap_puts_in_force(tmp_path: Path)
 
 @pytest.mark.parametrize("has_note", [True, False])
 def test_who_finds_a_dead_service_is_told_the_name_to_park(tmp_path: Path, has_note: bool) -> None:
-    """The socket of a service that was killed, beside its note of the hardware; a socket may have another name."""
+    """A killed service leaves its socket and its file `.hardware`; a socket without this file may have any name."""
     path = tmp_path / "bench1.sock"
     with socket.socket(socket.AF_UNIX) as dead:
         dead.bind(str(path))
     if has_note:
         path.with_suffix(".hardware").touch()
-    named = " --name bench1" if has_note else ""
+    option = " --name bench1" if has_note else ""
     remedy = (
-        f"`rtloop park CONFIG{named}`, unless that was done since, then start the service with "
-        f"`rtloop serve CONFIG{named}`"
+        f"`rtloop park CONFIG{option}`, unless that was done since, then start the service with "
+        f"`rtloop serve CONFIG{option}`"
     )
     with pytest.raises(UnavailableError, match=f"the service has died.* {remedy}$"):
         Client(path).get("/status")
 
 
 def test_the_documentation_tells_properties_from_methods():
-    """Each name in the table of the page on the service, in a row for properties or in one for methods."""
+    """The table in docs/service.md has each name in a row of its kind: properties or methods, as the class has it."""
     page = (Path(__file__).parents[2] / "docs" / "service.md").read_text(encoding="utf-8")
     table = page[page.index("| name | use |") :].split("\n\n")[0]
     rows = [line.strip("|").split("|")[:2] for line in table.splitlines()[2:]]
-    named = {
+    is_property = {
         name: use.strip().startswith(("property", "properties"))
         for names, use in rows
         for name in re.findall(r"`(\w+)", names)
     }
     public = {name: value for name, value in vars(Connection).items() if not name.startswith("_")}
-    assert {"status", "configuration", "metrics", "watch", "swap"} <= named.keys() <= public.keys()
-    assert named == {name: isinstance(public[name], property) for name in named}
+    assert {"status", "configuration", "metrics", "watch", "swap"} <= is_property.keys() <= public.keys()
+    assert is_property == {name: isinstance(public[name], property) for name in is_property}

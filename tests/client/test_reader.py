@@ -1,6 +1,6 @@
-"""The reader delivers whole records once and in order, counts lost ones, follows a restarted service, writes nothing.
+"""The reader delivers whole records once and in order, counts lost ones, follows a restarted service, and never writes.
 
-Against a ring that the test fills, and against a real service and its recording.
+The expected records are those of a ring that the test fills, and those of the recording of a real service.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ from tests.faults.evidence import wait_for
 COLUMNS = ("tick", "deadline_ns", "x_position_um")
 
 
-class Loop:
-    """What a loop's process does to its block at `path`, in place of an old one."""
+class LoopBlock:
+    """Shared block of a loop at `path`, in place of an earlier one; the test writes its ticks as a loop does."""
 
     def __init__(self, path: Path) -> None:
         path.unlink(missing_ok=True)
@@ -34,9 +34,11 @@ class Loop:
         self.tick = 0
 
     def begin(self) -> None:
+        """Create the block's contents with an empty ring of ticks."""
         self.ring = SharedBlock.create(Sizes(len(COLUMNS), 1, 400.0, 64, 1), self._fd).ring("ticks")
 
     def run(self, ticks: int) -> None:
+        """Publish the records of the next `ticks` ticks; the position of tick n is −n µm."""
         for tick in range(self.tick, self.tick + ticks):
             self.ring.slots[claim(self.ring, np.uint64(tick))] = tick, tick * 2.5e6, -tick
             publish(self.ring, np.uint64(tick))
@@ -47,25 +49,27 @@ class Loop:
 
 
 @pytest.fixture
-def started(tmp_path: Path) -> Iterator[Callable[[], Loop]]:
-    loops = []
+def make_block(tmp_path: Path) -> Iterator[Callable[[], LoopBlock]]:
+    """Yield a function that replaces the block by the block of a new loop; all blocks are closed at the end."""
+    blocks = []
 
-    def start() -> Loop:
-        loops.append(Loop(tmp_path / "lab.block"))
-        return loops[-1]
+    def make() -> LoopBlock:
+        blocks.append(LoopBlock(tmp_path / "lab.block"))
+        return blocks[-1]
 
-    yield start
-    for loop in loops:
-        loop.close()
+    yield make
+    for block in blocks:
+        block.close()
 
 
 @pytest.fixture
 def reader(tmp_path: Path) -> Reader:
+    """Return a reader of the block, which need not exist yet."""
     return Reader(tmp_path / "lab.block", lambda: COLUMNS)
 
 
-def told(stretch: Stretch | None) -> tuple[int, int, int, int]:
-    """(first, end, lost, run), once the rows are those of these ticks."""
+def span(stretch: Stretch | None) -> tuple[int, int, int, int]:
+    """Return (first, end, lost, run) of a stretch after checking the values of its rows."""
     assert stretch is not None
     ticks = np.arange(stretch.first, stretch.end, dtype=float)
     np.testing.assert_array_equal(stretch["tick"], ticks)
@@ -74,43 +78,45 @@ def told(stretch: Stretch | None) -> tuple[int, int, int, int]:
     return stretch.first, stretch.end, stretch.lost, stretch.run
 
 
-def test_the_reader_reads_each_tick_once_and_changes_to_another_run(reader: Reader, started: Callable[[], Loop]):
+def test_the_reader_reads_each_tick_once_and_changes_to_another_run(
+    reader: Reader, make_block: Callable[[], LoopBlock]
+):
     assert reader.read() is None
-    loop = started()
-    assert reader.read() is None  # a file with nothing in it yet
+    loop = make_block()
+    assert reader.read() is None  # The file is still empty.
     loop.begin()
     assert reader.read() is None
     loop.run(10)
-    assert told(reader.read()) == (0, 10, 0, 0)
+    assert span(reader.read()) == (0, 10, 0, 0)
     assert reader.read() is None
     loop.run(5)
-    other = started()
-    other.begin()
-    assert told(reader.read()) == (10, 15, 0, 0)
+    new_loop = make_block()
+    new_loop.begin()
+    assert span(reader.read()) == (10, 15, 0, 0)
     assert reader.read() is None
     assert reader.run == 1
-    other.run(3)
-    assert told(reader.read()) == (0, 3, 0, 1)
+    new_loop.run(3)
+    assert span(reader.read()) == (0, 3, 0, 1)
     assert reader.lost_ticks == 0
 
 
-def test_overwritten_ticks_are_counted_as_lost(reader: Reader, started: Callable[[], Loop]):
-    """A full ring is read from about its beginning on, which is no loss; what is overwritten afterwards is one."""
-    loop = started()
+def test_overwritten_ticks_are_counted_as_lost(reader: Reader, make_block: Callable[[], LoopBlock]):
+    """Reading starts near the oldest tick of a full ring, without a loss; ticks overwritten afterwards are lost."""
+    loop = make_block()
     loop.begin()
     capacity = len(loop.ring.slots)
     loop.run(2 * capacity)
-    first, end, lost, _ = told(reader.read())
+    first, end, lost, _ = span(reader.read())
     assert (end, lost) == (2 * capacity, 0)
     assert capacity < first < 1.1 * capacity
     loop.run(capacity + 7)
-    assert told(reader.read()) == (2 * capacity + 7, 3 * capacity + 7, 7, 0)
+    assert span(reader.read()) == (2 * capacity + 7, 3 * capacity + 7, 7, 0)
     assert reader.lost_ticks == 7
     assert capacity < MAX_TICKS
 
 
-def test_the_mapping_is_read_only(tmp_path: Path, started: Callable[[], Loop]):
-    started().begin()
+def test_the_mapping_is_read_only(tmp_path: Path, make_block: Callable[[], LoopBlock]):
+    make_block().begin()
     mapping = open_mapping(tmp_path / "lab.block")
     assert mapping is not None
     assert not any(array.flags.writeable for array in mapping.tick_ring())
@@ -118,15 +124,15 @@ def test_the_mapping_is_read_only(tmp_path: Path, started: Callable[[], Loop]):
         if line.endswith("lab.block") and line.split()[1] == "r--s":
             break
     else:
-        raise AssertionError("no mapping that can only be read")
+        raise AssertionError("the block is not mapped read-only")
     with pytest.raises(ValueError, match="cannot set WRITEABLE"):
         mapping.tick_ring().head.setflags(write=True)
 
 
 def test_wrong_names_and_a_block_that_others_may_write_are_refused(
-    tmp_path: Path, reader: Reader, started: Callable[[], Loop]
+    tmp_path: Path, reader: Reader, make_block: Callable[[], LoopBlock]
 ):
-    started().begin()
+    make_block().begin()
     with pytest.raises(UnavailableError, match="ticks have 3 signals, but the service names 2"):
         Reader(tmp_path / "lab.block", lambda: COLUMNS[:2]).read()
     (tmp_path / "lab.block").chmod(0o666)
@@ -135,14 +141,15 @@ def test_wrong_names_and_a_block_that_others_may_write_are_refused(
 
 
 def test_ticks_from_the_reader_equal_the_recording(tmp_path: Path):
-    """Of a service on a board, byte by byte, from its first second on to its end; and it is no claim on the block."""
+    """The ticks are compared byte by byte, from the first second to the end; the reader does not own the block."""
     with Bench(tmp_path) as bench:
-        path = next((tmp_path / "recordings").glob("*.mcap*"))
-        wait_for(lambda: path.exists() and path.stat().st_size, "a recording")
-        reader = Reader(tmp_path / "run" / "lab.block", lambda: load(path).columns)
+        recorded_file = next((tmp_path / "recordings").glob("*.mcap*"))
+        wait_for(lambda: recorded_file.exists() and recorded_file.stat().st_size, "a recording")
+        reader = Reader(tmp_path / "run" / "lab.block", lambda: load(recorded_file).columns)
         parts = [wait_for(reader.read, "ticks")]
 
         def read_on() -> int:
+            """Read the next ticks into `parts`; return the tick after the last one."""
             if (stretch := reader.read()) is not None:
                 parts.append(stretch)
             return parts[-1].end

@@ -1,4 +1,4 @@
-"""A service, and `rtloop epics` beside it on ports of its own, read and written by caproto's client."""
+"""A service and `rtloop epics` beside it on free ports; caproto's client reads and writes the channels."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ from tests.faults.evidence import wait_for
 
 HOST, TIMEOUT_S = "127.0.0.1", 120.0
 SEARCHES = 240
-"""How often a client asks for a channel within the time-out. caproto asks twice, and a lost datagram costs a minute."""
+"""Searches of a client for a channel within the time-out; with caproto's two, a lost datagram costs a minute."""
 client.search = functools.partial(client.search, max_retries=SEARCHES)
 UM_PER_V = 4.3
-"""Of the simulated actuator, which has no hysteresis."""
+"""Gain of the simulated actuator, which has no hysteresis."""
 CONFIGURATION = f"""
 [loop]
 rate_hz = 1000
@@ -63,11 +63,11 @@ arm = true
 folder = "FOLDER/recordings"
 min_free_mib = 0.0
 """
-"""A mode at 100 Hz and a slow integrator: cheap, and settled after a quarter of a second."""
+"""A resonance at 100 Hz and a slow integrator: little computation, and settled after a quarter of a second."""
 
 
-class Reading(NamedTuple):
-    """What a client reads of a channel: numbers or text, the names of severity and status of its alarm."""
+class ChannelValue(NamedTuple):
+    """Value of a channel, a number or a text, and the names of its alarm's severity and status."""
 
     value: Any
     severity: str
@@ -75,7 +75,7 @@ class Reading(NamedTuple):
 
 
 def free_port() -> int:
-    """A port that is free for TCP and for UDP."""
+    """Return the number of a port that is free for TCP and for UDP."""
     while True:
         with socket.socket() as stream, socket.socket(type=socket.SOCK_DGRAM) as datagrams:
             stream.bind((HOST, 0))
@@ -88,12 +88,12 @@ def free_port() -> int:
 
 
 def make_bench(folder: Path) -> Bench:
-    """A service of CONFIGURATION that drives once it is armed and started."""
+    """Return the bench of a service with CONFIGURATION; its loop drives once a client has armed and started it."""
     return Bench(folder, board=False, text=CONFIGURATION.replace("FOLDER", str(folder)))
 
 
 class Adapter:
-    """`with Adapter(bench, "L:") as adapter`: the process, and a client that knows no other server."""
+    """`with Adapter(bench, "L:") as adapter`: a process `rtloop epics`, and a client that finds no other server."""
 
     def __init__(self, bench: Bench, prefix: str, *options: str) -> None:
         self.bench = bench
@@ -120,43 +120,46 @@ class Adapter:
         assert "Traceback" not in self.log()
 
     def end(self) -> int:
-        """The exit code after SIGTERM."""
+        """End the process with SIGTERM; return its exit code."""
         if self.process.poll() is None:
             self.process.send_signal(signal.SIGTERM)
         return self.process.wait(TIMEOUT_S)
 
     def log(self) -> str:
+        """Return the output of the process so far."""
         return self.log_file.read_text()
 
     def get(self, suffix: str, **options: Any) -> Any:
-        """The response of a read with time and alarm."""
+        """Return caproto's response to a read with time and alarm; `options` go to its client."""
         return self._call(client.read, suffix, **{"data_type": "time"} | options)
 
-    def read(self, suffix: str) -> Reading:
+    def read(self, suffix: str) -> ChannelValue:
+        """Return the value and the alarm of a channel."""
         response = self.get(suffix)
         value = bytes(response.data).decode() if response.data_type.name.endswith("CHAR") else response.data[0]
         alarm = response.metadata
         severity = AlarmSeverity(alarm.severity).name.removesuffix("_ALARM")
-        return Reading(value, severity, AlarmStatus(alarm.status).name)
+        return ChannelValue(value, severity, AlarmStatus(alarm.status).name)
 
     def write(self, suffix: str, value: Any, **options: Any) -> None:
-        """Write and wait for the end of the write; raises ErrorResponseReceived for a refusal."""
+        """Write a channel and wait until the write is done; raises ErrorResponseReceived if it is refused."""
         self._call(client.write, suffix, value, **{"notify": True} | options)
 
     def _call(self, function: Any, suffix: str, *arguments: Any, **options: Any) -> Any:
-        old = dict(os.environ)
+        """Call a function of caproto's client for a channel while the environment names this server alone."""
+        saved = dict(os.environ)
         os.environ.update(self.environment)
         try:
             return function(self.prefix + suffix, *arguments, timeout=TIMEOUT_S, repeater=False, **options)
         finally:
             os.environ.clear()
-            os.environ.update(old)
+            os.environ.update(saved)
 
     def await_alarm(self, suffix: str, severity: str, status: str) -> Any:
-        """The value of the first reading with this alarm."""
-        is_shown = lambda reading: reading[1:] == (severity, status)
+        """Wait until a channel has this alarm; return its value then."""
+        has_alarm = lambda reading: reading[1:] == (severity, status)
         return wait_for(
-            lambda: [reading.value] if is_shown(reading := self.read(suffix)) else None,
+            lambda: [reading.value] if has_alarm(reading := self.read(suffix)) else None,
             f"{suffix} {severity}", TIMEOUT_S, 0.05,
         )[0]  # fmt: skip
 

@@ -1,4 +1,4 @@
-"""Channels of caproto by themselves: long values, long texts, alarms."""
+"""Channels without a service: long values, long texts, alarms, and a mode that need not wait for a setpoint."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ TABLE = {variable.suffix: variable for variable in (*LOOP_VARIABLES, *axis_varia
 
 TIMEOUT_S = 60.0
 LOST = object()
-"""In place of a value: no service answers."""
+"""Stands for a value of a service that does not answer."""
 
 
-def shown(suffix: str, *values: Any) -> tuple[Any, str]:
-    """Value and severity that a client reads of a channel that showed `values`."""
+def read_after(suffix: str, *values: Any) -> tuple[Any, str]:
+    """Return the value and the severity of a channel that has shown `values` one after the other."""
 
-    async def show() -> tuple[Any, str]:
+    async def show_and_read() -> tuple[Any, str]:
         channel = make_channel(suffix, TABLE[suffix])
         for value in values:
             await (channel.show_lost(None) if value is LOST else channel.show(value, "closed_loop"))
@@ -35,35 +35,35 @@ def shown(suffix: str, *values: Any) -> tuple[Any, str]:
         assert metadata.severity == channel.alarm.severity
         return channel.value, channel.alarm.severity.name if data is not None else ""
 
-    return asyncio.run(show())
+    return asyncio.run(show_and_read())
 
 
 def test_a_tick_after_years_is_exact():
     """Five years at 20 kHz: beyond the 32 bits of an integer of Channel Access, within the 53 of a double."""
     ticks = 5 * 365 * 86_400 * 20_000 + 1
-    assert shown("TICK", ticks) == (ticks, "NO_ALARM")
+    assert read_after("TICK", ticks) == (ticks, "NO_ALARM")
 
 
 def test_a_long_text_is_cut_between_letters_and_put_on_one_line():
-    text, severity = shown("CAUSE", "refused:\n  " + "µ" * TEXT_BYTES)
+    text, severity = read_after("CAUSE", "refused:\n  " + "µ" * TEXT_BYTES)
     assert severity == "NO_ALARM"
     assert text == "refused: " + "µ" * ((TEXT_BYTES - len("refused: ")) // 2)
 
 
 def test_an_unknown_value_is_invalid_and_keeps_the_last_one():
-    assert shown("x:POSITION") == (0.0, "INVALID_ALARM"), "before the first value"
-    assert shown("x:POSITION", 12.5, None) == (12.5, "INVALID_ALARM")
-    assert shown("x:POSITION", 12.5, None, 13.0) == (13.0, "NO_ALARM")
-    assert shown("x:POSITION", 12.5, LOST, None) == (12.5, "INVALID_ALARM"), "a service without a loop is back"
+    assert read_after("x:POSITION") == (0.0, "INVALID_ALARM"), "before the first value"
+    assert read_after("x:POSITION", 12.5, None) == (12.5, "INVALID_ALARM")
+    assert read_after("x:POSITION", 12.5, None, 13.0) == (13.0, "NO_ALARM")
+    assert read_after("x:POSITION", 12.5, LOST, None) == (12.5, "INVALID_ALARM"), "a service without a loop is back"
 
 
 def test_a_trip_is_a_major_alarm():
-    assert shown("TRIPPED", "no", "yes") == ("yes", "MAJOR_ALARM")
-    assert shown("STATE", "tripped", "stopped") == ("stopped", "NO_ALARM")
+    assert read_after("TRIPPED", "no", "yes") == ("yes", "MAJOR_ALARM")
+    assert read_after("STATE", "tripped", "stopped") == ("stopped", "NO_ALARM")
 
 
 class SlowLoop:
-    """A connection whose setpoint stands still until `released`."""
+    """Connection whose method `setpoint` does not return before `released` is set."""
 
     def __init__(self) -> None:
         self.began, self.released = threading.Event(), threading.Event()
@@ -79,7 +79,7 @@ class SlowLoop:
 
 
 def test_mode_off_overtakes_a_setpoint_that_stands_still():
-    """Another mode waits behind the setpoint; mode off waits for neither, and withdraws the waiting one."""
+    """A write of mode raw waits for the setpoint; mode off waits for neither and withdraws mode raw."""
     loop = SlowLoop()
 
     async def write() -> list[Any]:

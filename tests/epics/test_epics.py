@@ -1,4 +1,4 @@
-"""`rtloop epics` beside a real service, as a client of Channel Access sees it."""
+"""Clients of Channel Access read and drive a real service through `rtloop epics`; its status is the reference."""
 
 from __future__ import annotations
 
@@ -28,19 +28,19 @@ REFUSED = caproto.ErrorResponseReceived
 AXIS_SUFFIXES = ("x:POSITION", "x:REFERENCE", "x:ERROR", "x:DRIVE", "x:SETPOINT")
 MODES = ("off", "raw", "feedforward", "closed_loop")
 NOISE_UM = 0.2
-"""Of the rig's sensor, many standard deviations."""
+"""Bound of the sensor's noise on the rig, many standard deviations."""
 
 
 @pytest.fixture(scope="module")
 def ioc(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Adapter]:
-    """Clients may write; it is started before the service."""
+    """Yield the EPICS server, which lets clients write and starts before the service."""
     with Adapter(make_bench(tmp_path_factory.mktemp("epics")), "LAB:LOOP:", "--allow-control") as adapter:
         yield adapter
 
 
 @pytest.fixture(scope="module")
 def bench(ioc: Adapter) -> Iterator[Bench]:
-    """The service, which starts after its channels said that there is none."""
+    """Yield the bench of the service, which starts after the channels have shown that there is no service."""
     assert ioc.await_alarm("CONNECTED", "INVALID", "COMM") == 0
     ioc.await_text("MESSAGE", "the service was stopped, or never started")
     with ioc.bench as bench:
@@ -50,7 +50,7 @@ def bench(ioc: Adapter) -> Iterator[Bench]:
 
 @pytest.fixture
 def running(bench: Bench, ioc: Adapter) -> Iterator[Adapter]:
-    """In closed loop at 20 µm, started over Channel Access."""
+    """Yield the EPICS server while the loop is closed at 20 µm, armed and started over Channel Access."""
     ioc.write("ARM", 1)
     ioc.write("START", 1)
     ioc.write("x:SETPOINT", 20.0)
@@ -98,7 +98,7 @@ def test_channels_have_units_and_words(running: Adapter):
 
 
 def test_a_written_setpoint_moves_the_position_and_is_the_clients(bench: Bench, running: Adapter):
-    """The shared block has the drive that the actuator needs for it; the service names the writer as lock holder."""
+    """The drive changes as the actuator's gain predicts; the service names the writing client as lock holder."""
     await_position(running, 20.0)
     drive_v = float(bench.blocks[-1]["last_drive_v"][0])
     running.write("x:SETPOINT", 27.5)
@@ -192,25 +192,26 @@ def test_a_trip_is_a_major_alarm_with_its_cause_until_it_is_reset(bench: Bench, 
 
 
 def test_without_allow_control_nothing_can_be_written(bench: Bench, running: Adapter):
-    """A client that ignores its rights sends the bytes of a write all the same, and is refused by the server."""
+    """The server also refuses a client that ignores its rights and sends the bytes of a write."""
     with Adapter(bench, "READ:") as ioc:
         assert ioc.read("x:SETPOINT").value == 20.0
         for suffix, value in (("x:SETPOINT", 25.0), ("STOP", 1), ("MODE", 0), ("x:POSITION", 1.0), ("CONNECTED", 0)):
             with pytest.raises(caproto.CaprotoError):
                 ioc.write(suffix, value)
-        rights, error = _write_against_rights(ioc, "x:SETPOINT", 25.0)
+        rights, error = _write_despite_rights(ioc, "x:SETPOINT", 25.0)
         assert (rights, error) == (1, True)
-        rights, error = _write_against_rights(running, "x:POSITION", 25.0)
-        assert (rights, error) == (1, True), "a measured value is read only for everybody"
-        assert _write_against_rights(running, "x:SETPOINT", 23.0) == (3, False)
+        rights, error = _write_despite_rights(running, "x:POSITION", 25.0)
+        assert (rights, error) == (1, True), "a measured value is read-only for all clients"
+        assert _write_despite_rights(running, "x:SETPOINT", 23.0) == (3, False)
     status = bench.status()
     assert (status["state"], status["axes"]["x"]["reference_um"]) == ("running", 23.0)
 
 
-def _write_against_rights(ioc: Adapter, suffix: str, value: float) -> tuple[int, bool]:
-    """Rights that the server grants (1 read, 2 write), and whether it answers a write of a double with an error.
+def _write_despite_rights(ioc: Adapter, suffix: str, value: float) -> tuple[int, bool]:
+    """Return the rights that the server grants (1 read + 2 write), and whether it answers a write with an error.
 
-    Written in bytes from the specification of the protocol: version, name of channel, write with acknowledgement.
+    The request is composed from the protocol's specification: version, name of the channel, acknowledged write of a
+    double.
     """
     name = (ioc.prefix + suffix).encode() + b"\0"
     name += bytes(-len(name) % 8)
@@ -234,15 +235,15 @@ def _write_against_rights(ioc: Adapter, suffix: str, value: float) -> tuple[int,
 
 
 def test_foreign_bytes_end_neither_the_server_nor_the_channels(running: Adapter):
-    noise = random.Random(1)
+    rng = random.Random(1)
     with socket.socket(type=socket.SOCK_DGRAM) as datagrams:
         for size in (0, 1, 15, 16, 17, 64, 1400, 9000):
-            datagrams.sendto(noise.randbytes(size), (HOST, running.port))
-        for command in range(30):  # A header of each command, with a payload that is none.
-            datagrams.sendto(struct.pack(">4H2I", command, 8, 5, 13, 1, 1) + noise.randbytes(8), (HOST, running.port))
-    texts = [b"GET / HTTP/1.1\r\n\r\n", b"", noise.randbytes(5000), b"\0" * 100, b"\xff" * 100]
-    texts += [struct.pack(">4H2I", command, 8, 6, 1, 77, 1) + noise.randbytes(8) for command in range(30)]
-    texts.append(struct.pack(">4H2I2I", 18, 0xFFFF, 0, 0, 1, 13, 0xFFFFFFF0, 0))  # Announces 4 GiB.
+            datagrams.sendto(rng.randbytes(size), (HOST, running.port))
+        for command in range(30):  # A header of each command, with a random payload.
+            datagrams.sendto(struct.pack(">4H2I", command, 8, 5, 13, 1, 1) + rng.randbytes(8), (HOST, running.port))
+    texts = [b"GET / HTTP/1.1\r\n\r\n", b"", rng.randbytes(5000), b"\0" * 100, b"\xff" * 100]
+    texts += [struct.pack(">4H2I", command, 8, 6, 1, 77, 1) + rng.randbytes(8) for command in range(30)]
+    texts.append(struct.pack(">4H2I2I", 18, 0xFFFF, 0, 0, 1, 13, 0xFFFFFFF0, 0))  # A header that announces 4 GiB.
     for text in texts:
         with socket.create_connection((HOST, running.port), TIMEOUT_S) as connection:
             connection.sendall(text)
@@ -262,7 +263,7 @@ def test_a_service_that_stands_still_makes_the_channels_invalid(bench: Bench, ru
 
 
 def kill_service(bench: Bench, ioc: Adapter) -> None:
-    """SIGKILL to the service and its loop; all channels become INVALID and keep their values."""
+    """Kill the service and its loop; check that all channels become INVALID and that the position keeps its value."""
     last_um, service = ioc.read("x:POSITION").value, bench.service
     assert service is not None
     for pid in (bench.pid("service"), bench.pid("rt")):
@@ -319,11 +320,11 @@ def test_an_option_that_cannot_be_used_is_named(options: tuple[str, ...], text: 
 def test_an_address_that_cannot_be_used_is_named(tmp_path: Path, options: tuple[str, ...], port: str, text: str):
     command = [sys.executable, "-m", "rtloop", "epics", "--socket", str(tmp_path / "x.sock"), *options]
     environment = os.environ | {"PYTHONPATH": str(ROOT), "EPICS_CA_SERVER_PORT": port}
-    ended = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=TIMEOUT_S, check=False)
-    assert (ended.returncode, text in ended.stderr) == (69, True), ended.stderr
-    assert "Traceback" not in ended.stderr
+    result = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=TIMEOUT_S, check=False)
+    assert (result.returncode, text in result.stderr) == (69, True), result.stderr
+    assert "Traceback" not in result.stderr
 
 
 def test_all_channels_are_invalid_after_the_death_of_the_service(bench: Bench, ioc: Adapter):
-    """The last test of this file, for it leaves no service behind."""
+    """This test is the last of the file, for it kills the service for good."""
     kill_service(bench, ioc)

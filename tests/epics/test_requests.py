@@ -1,4 +1,4 @@
-"""Requests of EPICS clients in order, and the table of channels, without a server and without caproto."""
+"""Requests of EPICS clients are executed in order; the table of channels reads a status. Neither needs caproto."""
 
 from __future__ import annotations
 
@@ -29,33 +29,34 @@ TRIPPED = {
 
 @pytest.fixture
 def requests() -> Iterator[Requests]:
+    """Yield an empty queue of requests, closed at the end."""
     requests = Requests()
     yield requests
     requests.close()
 
 
 def test_a_stop_waits_for_no_request_and_withdraws_those_that_wait(requests: Requests):
-    """The first request stands still in the service; two more wait behind it when the stop comes, one comes later."""
+    """The first request blocks; two more wait behind it when the stop comes, and a last one comes after the stop."""
     order: list[str] = []
     release, began = threading.Event(), threading.Event()
 
-    def stand_still() -> None:
+    def wait_for_release() -> None:
         began.set()
         release.wait()
         order.append("first")
 
     async def write() -> list[Any]:
-        first = asyncio.create_task(requests.execute(stand_still))
+        first = asyncio.create_task(requests.execute(wait_for_release))
         waiting = [asyncio.create_task(requests.execute(lambda: order.append("withdrawn"))) for _ in range(2)]
         await asyncio.to_thread(began.wait)
         await requests.stop(lambda: order.append("stop"))
-        later = asyncio.create_task(requests.execute(lambda: order.append("later")))
+        last = asyncio.create_task(requests.execute(lambda: order.append("last")))
         release.set()
-        return await asyncio.gather(first, *waiting, later, return_exceptions=True)
+        return await asyncio.gather(first, *waiting, last, return_exceptions=True)
 
-    first, *withdrawn, later = asyncio.run(write())
-    assert order == ["stop", "first", "later"]
-    assert [type(outcome) for outcome in (first, *withdrawn, later)] == [type(None), LoopFault, LoopFault, type(None)]
+    first, *withdrawn, last = asyncio.run(write())
+    assert order == ["stop", "first", "last"]
+    assert [type(outcome) for outcome in (first, *withdrawn, last)] == [type(None), LoopFault, LoopFault, type(None)]
 
 
 def test_requests_beyond_the_limit_are_refused_until_others_end(requests: Requests):
@@ -82,11 +83,11 @@ def test_a_service_without_a_loop_leaves_values_unknown():
 
 
 def test_the_cause_has_the_trip_and_the_latched_faults():
-    read = TABLE["CAUSE"].read
-    assert read(TRIPPED) == "position 61 µm; the loop died"
-    assert read(TRIPPED | {"trip_reason": None}) == "position; the loop died"
-    assert read(TRIPPED | {"faults": ["position 61 µm"]}) == "position 61 µm"
-    assert read(STATUS) == ""
+    read_cause = TABLE["CAUSE"].read
+    assert read_cause(TRIPPED) == "position 61 µm; the loop died"
+    assert read_cause(TRIPPED | {"trip_reason": None}) == "position; the loop died"
+    assert read_cause(TRIPPED | {"faults": ["position 61 µm"]}) == "position 61 µm"
+    assert read_cause(STATUS) == ""
 
 
 def test_only_the_reference_changes_its_unit_in_mode_raw():
