@@ -1,4 +1,4 @@
-"""Texts of events."""
+"""Events have texts, and changes of reference, mode and law show the old and the new value."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from rtloop.signals import Flag, Mode
 
 
 @pytest.mark.parametrize(
-    ("kind", "values", "said"),
+    ("kind", "values", "text"),
     [
         (Kind.SET_REFERENCE, (Generator.HOLD, 12.5), "12.5"),
         (Kind.SET_REFERENCE, (Generator.SINE, 9.0, 1.0, 0.0), "sine of 9 at 1 Hz"),
@@ -32,45 +32,45 @@ from rtloop.signals import Flag, Mode
         (Kind.PARKED, (), ""),
     ],
 )  # fmt: skip
-def test_each_kind_of_event_has_its_text(kind: Kind, values: tuple[float, ...], said: str) -> None:
+def test_each_kind_of_event_has_its_text(kind: Kind, values: tuple[float, ...], text: str) -> None:
     record = np.zeros((), MESSAGE)
     record["kind"] = kind
     record["values"][: len(values)] = values
-    assert event_text(event_from_message(record, ["x"], 0)) == said  # type: ignore[arg-type]
+    assert event_text(event_from_message(record, ["x"], 0)) == text  # type: ignore[arg-type]
 
 
-def changes(configured: dict, *messages: tuple[Kind, tuple[float, ...]]) -> list[str]:
-    """Words of the events of a run that begins with a configured reference of x."""
-    in_force = RunState({"x": {"reference": configured}})
+def change_texts(configured: dict, *messages: tuple[Kind, tuple[float, ...]]) -> list[str]:
+    """Return the text of each event of a run of axis x, which begins with the reference `configured`."""
+    run = RunState({"x": {"reference": configured}})
     records = np.zeros(len(messages), MESSAGE)
     for record, (kind, values) in zip(records, messages, strict=True):
         record["kind"] = kind
         record["values"][: len(values)] = values
-    return [in_force.describe_change(event_from_message(record, ["x"], 0)) for record in records]  # type: ignore[arg-type]
+    return [run.describe_change(event_from_message(record, ["x"], 0)) for record in records]  # type: ignore[arg-type]
 
 
 def test_a_change_shows_the_old_and_the_new_value() -> None:
     sine = {"kind": "sine", "amplitude": 8.0, "offset": 20.0, "frequency_hz": 5.0}
     set_to = lambda value: (Kind.SET_REFERENCE, (Generator.HOLD, value))
     mode = lambda mode: (Kind.SET_MODE, (mode,))
-    assert changes(sine, mode(Mode.CLOSED_LOOP), set_to(12.5), set_to(-3.0), mode(Mode.OFF)) == [
+    assert change_texts(sine, mode(Mode.CLOSED_LOOP), set_to(12.5), set_to(-3.0), mode(Mode.OFF)) == [
         "closed loop",
         "sine of 8 µm at 5 Hz about 20 µm → 12.5 µm",
         "12.5 µm → -3 µm",
         "closed loop → off",
     ]
     trip = (Kind.TRIPPED, (float(Flag.TRIP_POSITION), 61.0, 60.0, float(Flag.TRIP_POSITION)))
-    assert changes({}, set_to(1.0), mode(Mode.CLOSED_LOOP), trip, mode(Mode.CLOSED_LOOP))[::3] == [
+    assert change_texts({}, set_to(1.0), mode(Mode.CLOSED_LOOP), trip, mode(Mode.CLOSED_LOOP))[::3] == [
         "0 µm → 1 µm",
         "off → closed loop",
     ]
 
 
 def test_references_in_raw_mode_are_in_volts_and_unknown_ones_are_left_out() -> None:
-    """Into and out of mode raw the loop holds the value in force, which no event says."""
+    """A change to or from mode raw makes the loop hold the value in force, which no event contains."""
     set_to = lambda value: (Kind.SET_REFERENCE, (Generator.HOLD, value))
     raw, closed = (Kind.SET_MODE, (Mode.RAW,)), (Kind.SET_MODE, (Mode.CLOSED_LOOP,))
-    assert changes({}, raw, set_to(2.0), set_to(3.0), closed, set_to(1.0)) == [
+    assert change_texts({}, raw, set_to(2.0), set_to(3.0), closed, set_to(1.0)) == [
         "raw", "2 V", "2 V → 3 V", "raw → closed loop", "1 µm",
     ]  # fmt: skip
 
@@ -79,7 +79,8 @@ def test_the_reference_of_each_axis_is_the_one_that_was_started_last() -> None:
     sine = {"kind": "sine", "amplitude": 8.0, "offset": 20.0, "frequency_hz": 5.0}
     run = RunState({"x": {"reference": sine}, "y": {}, "z": {"reference": {"kind": "steps", "levels": [1.0, 2.0]}}})
 
-    def after(kind: Kind, *values: float, axis: int = 0) -> dict[str, Any]:
+    def references_after(kind: Kind, *values: float, axis: int = 0) -> dict[str, Any]:
+        """Return the reference of each axis after an event of this kind; axis −1 stands for all axes."""
         record = np.zeros((), MESSAGE)
         record["kind"], record["axis"] = kind, axis
         record["values"][: len(values)] = values
@@ -91,17 +92,19 @@ def test_the_reference_of_each_axis_is_the_one_that_was_started_last() -> None:
         "y": ("hold", "0 µm", 0.0),
         "z": ("steps", "", None),
     }
-    assert after(Kind.SET_MODE, Mode.CLOSED_LOOP) == first
-    assert after(Kind.SET_REFERENCE, Generator.HOLD, 12.5) == first | {"x": ("hold", "12.5 µm", 12.5)}
-    assert after(Kind.SET_REFERENCE, Generator.TRIANGLE, 2.0, 3.0, 0.0, axis=1)["y"][0] == "triangle"
-    assert after(Kind.SET_MODE, Mode.RAW) == dict.fromkeys("xyz", ("hold", "", None)), "the present drive"
-    assert after(Kind.SET_REFERENCE, Generator.HOLD, 1.5, axis=-1) == dict.fromkeys("xyz", ("hold", "1.5 V", 1.5))
+    assert references_after(Kind.SET_MODE, Mode.CLOSED_LOOP) == first
+    assert references_after(Kind.SET_REFERENCE, Generator.HOLD, 12.5) == first | {"x": ("hold", "12.5 µm", 12.5)}
+    assert references_after(Kind.SET_REFERENCE, Generator.TRIANGLE, 2.0, 3.0, 0.0, axis=1)["y"][0] == "triangle"
+    assert references_after(Kind.SET_MODE, Mode.RAW) == dict.fromkeys("xyz", ("hold", "", None)), "the present drive"
+    assert references_after(Kind.SET_REFERENCE, Generator.HOLD, 1.5, axis=-1) == dict.fromkeys(
+        "xyz", ("hold", "1.5 V", 1.5)
+    )
 
 
 def test_a_table_of_samples_has_no_unit() -> None:
     table = (Kind.SET_REFERENCE, (Generator.TABLE, 0.0, 300.0, 1.0, 0.0))
     back = (Kind.SET_REFERENCE, (Generator.HOLD, 5.0))
-    assert changes({"value": 5.0}, table, back) == ["5 µm → 300 samples, once", "300 samples, once → 5 µm"]
+    assert change_texts({"value": 5.0}, table, back) == ["5 µm → 300 samples, once", "300 samples, once → 5 µm"]
 
 
 def test_a_change_of_a_law_has_the_text_of_the_service() -> None:

@@ -1,4 +1,4 @@
-"""Rows of events: operators that a slow service names later, and late ticks in one row."""
+"""Rows of events: the names of operators, which a slow service sends later, and late ticks in one row."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ LOOP: Any = SimpleNamespace(rate_hz=1000.0, axes={"x": {}}, values={})
 
 
 def test_a_silent_service_is_asked_once_and_again_when_it_answers() -> None:
-    asked: list[str] = []
+    resources: list[str] = []
 
     def exchange(_: str, resource: str, *__: object) -> tuple[int, str, bytes]:
-        asked.append(resource)
-        if len(asked) == 2:
+        resources.append(resource)
+        if len(resources) == 2:
             raise UnavailableError("no answer")
         return 200, "application/json", b'{"name": "ada"}'
 
@@ -31,20 +31,20 @@ def test_a_silent_service_is_asked_once_and_again_when_it_answers() -> None:
     service: Any = SimpleNamespace(client=SimpleNamespace(exchange=exchange, path=Path("none")))
     events = Events(service)
     events.append(messages, LOOP, 0)
-    assert asked == ["/asked_by?identity=0", "/asked_by?identity=1"]
-    told = [event["who"] for _, event in events.events_after(0)]
-    assert (told[0], set(told[1:]), len(told)) == ("ada", {"operator"}, 50)
+    assert resources == ["/asked_by?identity=0", "/asked_by?identity=1"]
+    names = [event["who"] for _, event in events.events_after(0)]
+    assert (names[0], set(names[1:]), len(names)) == ("ada", {"operator"}, 50)
     number = events.newest
     events.append(messages[:0], LOOP, 0)
-    assert asked[2:] == [f"/asked_by?identity={identity}" for identity in range(1, 50)]
-    again = events.events_after(number)
-    assert ([event["who"] for _, event in again], len(events.events_after(0))) == (["ada"] * 49, 50)
+    assert resources[2:] == [f"/asked_by?identity={identity}" for identity in range(1, 50)]
+    updated = events.events_after(number)
+    assert ([event["who"] for _, event in updated], len(events.events_after(0))) == (["ada"] * 49, 50)
     events.append(messages[:0], LOOP, 0)
-    assert len(asked) == 51
+    assert len(resources) == 51
 
 
-def late(text: str, first: int = 0) -> np.ndarray:
-    """Messages such as "m3 o9,2,6 t": kind and values of each, a tick apart."""
+def make_messages(text: str, first: int = 0) -> np.ndarray:
+    """Return a message for each word of, say, "m3 o9,2,6 t", a letter of KINDS and values, from tick `first` on."""
     messages = np.zeros(len(text.split()), MESSAGE)
     for place, word in enumerate(text.split()):
         values = [float(value) for value in word[1:].split(",") if value]
@@ -53,41 +53,41 @@ def late(text: str, first: int = 0) -> np.ndarray:
     return messages
 
 
-def shown(events: Events, behind: int = 0) -> list[tuple[int, str]]:
-    """Tick and words of what was told behind a number."""
-    return [(event["tick"], event["what"]["text"]) for _, event in events.events_after(behind)]
+def rows_after(events: Events, number: int = 0) -> list[tuple[int, str]]:
+    """Return tick and text of each row that is new or has changed since the row number `number`."""
+    return [(event["tick"], event["what"]["text"]) for _, event in events.events_after(number)]
 
 
 def test_late_ticks_are_one_row_until_something_else_happens() -> None:
     events = Events(SimpleNamespace())  # type: ignore[arg-type]
-    events.append(late("m3"), LOOP, 0)
-    assert shown(events) == [(0, "1 late tick, worst 3 ms")]
-    events.append(late("o9,2,6 m1 m2", 1), LOOP, 0)
-    assert shown(events) == [(0, "4 late ticks, worst 6 ms")]
-    assert shown(events, 1) == shown(events), "it grew, and is told again"
-    assert shown(events, events.newest) == []
-    events.append(late("t o20,12,8 m1", 4), LOOP, 0)
-    assert [tick for tick, _ in shown(events)] == [0, 4, 6], "in the order in which they happened"
-    assert shown(events)[::2] == [(0, "15 late ticks, worst 8 ms"), (6, "1 late tick, worst 1 ms")]
-    events.append(late("m1", 7), LOOP, 1)
-    assert shown(events)[-1] == (7, "1 late tick, worst 1 ms"), "another run"
+    events.append(make_messages("m3"), LOOP, 0)
+    assert rows_after(events) == [(0, "1 late tick, worst 3 ms")]
+    events.append(make_messages("o9,2,6 m1 m2", 1), LOOP, 0)
+    assert rows_after(events) == [(0, "4 late ticks, worst 6 ms")]
+    assert rows_after(events, 1) == rows_after(events), "the row has grown, and is sent again"
+    assert rows_after(events, events.newest) == []
+    events.append(make_messages("t o20,12,8 m1", 4), LOOP, 0)
+    assert [tick for tick, _ in rows_after(events)] == [0, 4, 6], "in the order in which they happened"
+    assert rows_after(events)[::2] == [(0, "15 late ticks, worst 8 ms"), (6, "1 late tick, worst 1 ms")]
+    events.append(make_messages("m1", 7), LOOP, 1)
+    assert rows_after(events)[-1] == (7, "1 late tick, worst 1 ms"), "another run"
 
 
 def test_late_ticks_push_off_no_trip() -> None:
     events = Events(SimpleNamespace())  # type: ignore[arg-type]
-    events.append(late("t"), LOOP, 0)
+    events.append(make_messages("t"), LOOP, 0)
     for tick in range(1, 2 * MAX_ROWS, 2):
-        events.append(late("m3 o9,2,6", tick), LOOP, 0)
+        events.append(make_messages("m3 o9,2,6", tick), LOOP, 0)
     assert [event["kind"] for _, event in events.events_after(0)] == ["tripped", "periods_missed"]
     assert events.events_after(0)[-1][1]["what"]["late_ticks"] == 2 * MAX_ROWS
 
 
 def test_a_stop_names_its_operator_and_a_change_of_a_law_its_keys() -> None:
-    """As the service answers, at once or after it was silent; a run without a schedule begins with the outputs off."""
-    silent = [False]
+    """The names come from the service, at once or after a silence; a run without a schedule starts in mode off."""
+    is_silent = [False]
 
     def exchange(_: str, resource: str, *__: object) -> tuple[int, str, bytes]:
-        if silent[0]:
+        if is_silent[0]:
             raise UnavailableError("no answer")
         change = '"controller.gain 0.016 → 0.012"' if resource.endswith("=3") else "null"
         return 200, "application/json", f'{{"name": "bob", "change": {change}}}'.encode()
@@ -97,11 +97,11 @@ def test_a_stop_names_its_operator_and_a_change_of_a_law_its_keys() -> None:
     messages["origin"], messages["identity"] = Origin.OPERATOR, (1, 2, 3)
     messages["values"][:, 0] = Mode.CLOSED_LOOP, Mode.OFF, 0.0
     service: Any = SimpleNamespace(client=SimpleNamespace(exchange=exchange, path=Path("none")))
-    for silent[0] in (False, True):
+    for is_silent[0] in (False, True):
         events = Events(service)
         events.append(messages, LOOP, 0)
-        silent[0] = False
+        is_silent[0] = False
         events.append(messages[:0], LOOP, 0)
-        told = [(event["who"], event["what"]["text"]) for _, event in events.events_after(0)]
+        rows = [(event["who"], event["what"]["text"]) for _, event in events.events_after(0)]
         texts = ["off → closed loop", "closed loop → off", "controller.gain 0.016 → 0.012"]
-        assert told == [("bob", text) for text in texts]
+        assert rows == [("bob", text) for text in texts]

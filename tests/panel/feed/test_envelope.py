@@ -1,4 +1,4 @@
-"""The envelope against a loop over pixels and samples."""
+"""The envelope has the extremes that a loop over pixels and samples finds."""
 
 from __future__ import annotations
 
@@ -20,17 +20,17 @@ def test_every_pixel_holds_its_samples_extremes(samples: list[float], pixels: in
     points: dict[int, list[float]] = {}
     for i, sample in enumerate(samples):
         points.setdefault(i if count <= pixels else i * pixels // count, []).append(sample)
-    found = envelope(np.array([samples, samples[::-1]]), pixels)
-    assert len(found.sample) == len(points)
+    result = envelope(np.array([samples, samples[::-1]]), pixels)
+    assert len(result.sample) == len(points)
     begin = 0
-    for number, (_, held) in enumerate(sorted(points.items())):
-        numbers = [value for value in held if not math.isnan(value)]
-        assert found.sample[number] == begin
-        begin += len(held)
-        np.testing.assert_equal(found.low[0, number], min(numbers, default=math.nan))
-        np.testing.assert_equal(found.high[0, number], max(numbers, default=math.nan))
-        assert found.gap[0, number] == (len(numbers) < len(held))
-    assert found.low.shape == (2, len(points))
+    for number, (_, point_samples) in enumerate(sorted(points.items())):
+        numbers = [value for value in point_samples if not math.isnan(value)]
+        assert result.sample[number] == begin
+        begin += len(point_samples)
+        np.testing.assert_equal(result.low[0, number], min(numbers, default=math.nan))
+        np.testing.assert_equal(result.high[0, number], max(numbers, default=math.nan))
+        assert result.gap[0, number] == (len(numbers) < len(point_samples))
+    assert result.low.shape == (2, len(points))
 
 
 def test_a_peak_of_one_sample_is_never_left_out():

@@ -1,4 +1,4 @@
-"""Points of long screens hold the extremes of exactly their ticks."""
+"""Each point of a long screen has the minimum and the maximum of exactly its ticks."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from rtloop.panel.feed.tick_history import BLOCK, TickHistory, history_ticks, lo
 COLUMNS = ("tick", "a", "b")
 
 
-def fed(random: np.random.Generator, ticks: int, kept: int, gaps: bool) -> tuple[TickHistory, np.ndarray]:
-    """A past that was fed random values in random lengths, and all of them; NaN where they were lost."""
+def make_history(random: np.random.Generator, ticks: int, capacity: int, gaps: bool) -> tuple[TickHistory, np.ndarray]:
+    """Return a history after `ticks` random ticks in random stretches, and their values (ticks, 2); NaN if lost."""
     values = random.normal(size=(ticks, 2))
-    past, tick = TickHistory(COLUMNS, kept), 0
+    history, tick = TickHistory(COLUMNS, capacity), 0
     while tick < ticks:
         lost = int(random.integers(0, 70)) if gaps and random.random() < 0.2 else 0
         values[tick : tick + lost] = np.nan
@@ -24,42 +24,42 @@ def fed(random: np.random.Generator, ticks: int, kept: int, gaps: bool) -> tuple
         end = min(first + int(random.integers(1, 200)), ticks)
         if end > first:
             rows = np.column_stack([np.arange(first, end, dtype=float), values[first:end]])
-            past.append(Stretch(COLUMNS, first, rows, lost, 0))
+            history.append(Stretch(COLUMNS, first, rows, lost, 0))
         tick = end
-    return past, values
+    return history, values
 
 
 @pytest.mark.parametrize("gaps", [False, True])
 @pytest.mark.parametrize("seed", range(4))
 def test_points_are_the_extremes_of_their_ticks(seed: int, gaps: bool):
     random = np.random.default_rng(seed)
-    kept = 40 * BLOCK
-    past, values = fed(random, 5000, kept, gaps)
-    assert past.end == 5000
+    capacity = 40 * BLOCK
+    history, values = make_history(random, 5000, capacity, gaps)
+    assert history.end == 5000
     for _ in range(60):
-        first = int(random.integers(5000 - 2 * kept, 5100))
+        first = int(random.integers(5000 - 2 * capacity, 5100))
         end = first + int(random.integers(1, 2500))
-        points = past.points(["b", "a"], first, end, int(random.integers(1, 60)))
+        points = history.points(["b", "a"], first, end, int(random.integers(1, 60)))
         bounds = [*points.tick.tolist(), max(end, int(points.tick[-1]) + 1)]
         assert points.tick[0] <= first < points.tick[0] + BLOCK
         for column, row in enumerate((1, 0)):
             for i, (begin, beyond) in enumerate(pairwise(bounds)):
                 if i == points.tick.size - 1:
-                    continue  # of blocks, the last one may reach beyond
-                wanted = values[max(begin, past.begin, 0) : max(min(beyond, 5000), 0), row]
-                wanted = wanted[np.isfinite(wanted)]
+                    continue  # the last block may reach beyond the screen
+                expected = values[max(begin, history.begin, 0) : max(min(beyond, 5000), 0), row]
+                expected = expected[np.isfinite(expected)]
                 low, high = points.low[column, i], points.high[column, i]
-                if begin < past.begin + BLOCK:
-                    continue  # at the end of what is kept, a block may be there or not
-                assert (low, high) == (wanted.min(), wanted.max()) if wanted.size else np.isnan(low)
+                if begin < history.begin + BLOCK:
+                    continue  # the oldest block may be overwritten in part
+                assert (low, high) == (expected.min(), expected.max()) if expected.size else np.isnan(low)
 
 
 def test_another_run_replaces_all():
-    past = TickHistory(COLUMNS, 4 * BLOCK)
-    past.append(Stretch(COLUMNS, 0, np.ones((100, 3)), 0, 0))
-    past.append(Stretch(COLUMNS, 0, np.full((10, 3), 2.0), 0, 1))
-    points = past.points(["a"], 0, 4 * BLOCK, 1)
-    assert (past.run, past.end) == (1, 10)
+    history = TickHistory(COLUMNS, 4 * BLOCK)
+    history.append(Stretch(COLUMNS, 0, np.ones((100, 3)), 0, 0))
+    history.append(Stretch(COLUMNS, 0, np.full((10, 3), 2.0), 0, 1))
+    points = history.points(["a"], 0, 4 * BLOCK, 1)
+    assert (history.run, history.end) == (1, 10)
     assert points.low.tolist() == points.high.tolist() == [[2.0]]
 
 

@@ -1,4 +1,4 @@
-"""A panel serves viewers of a real loop: access, and values against the recording."""
+"""A panel serves viewers of a real loop: only with the token, and with the values of the recording."""
 
 from __future__ import annotations
 
@@ -18,26 +18,27 @@ import rtloop
 from rtloop.client.capture.tick_capture import capture_ticks, current_run
 from tests.faults.bench import Bench
 from tests.faults.evidence import wait_for
-from tests.panel.foxglove.test_foxglove import begun, decoded, subscribe
+from tests.panel.foxglove.test_foxglove import decode_message, read_channels, subscribe
 
 Panel = tuple[Bench, str]
-SPOKEN = [Subprotocol("foxglove.websocket.v1")]
+OFFERED_PROTOCOLS = [Subprotocol("foxglove.websocket.v1")]
 
 
 @pytest.fixture(scope="module")
 def panel(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Panel]:
-    """A loop, and the address that its panel gives viewers."""
+    """Yield the bench of a running loop, and the address at which its panel serves viewers."""
     with Bench(tmp_path_factory.mktemp("viewers")) as bench:
         bench.await_drive()
         bench.rtloop("panel", bench.client.path, "--port", "0", "--foxglove")
-        found = wait_for(lambda: re.search(r"ws://127\.0\.0\.1:\d+/foxglove\?token=\w+", bench.log()), "an address")
-        wait_for(lambda: reached(found[0]), "a panel")
-        yield bench, found[0]
+        address = wait_for(lambda: re.search(r"ws://127\.0\.0\.1:\d+/foxglove\?token=\w+", bench.log()), "an address")
+        wait_for(lambda: is_admitted(address[0]), "a panel")
+        yield bench, address[0]
 
 
-def reached(address: str, **headers: Any) -> bool:
+def is_admitted(address: str, **options: Any) -> bool:
+    """Return whether the panel accepts a viewer at this address; `options` go to the client."""
     try:
-        with connect(address, subprotocols=SPOKEN, **headers):
+        with connect(address, subprotocols=OFFERED_PROTOCOLS, **options):
             return True
     except (InvalidStatus, OSError):
         return False
@@ -47,20 +48,20 @@ def test_only_viewers_with_the_token_are_admitted(panel: Panel):
     bench, address = panel
     (token,) = re.findall(r"#token=(\S+)", bench.log())
     start, viewers = address.split("?token=")
-    assert reached(address, origin=Origin("https://viewer.example"))
-    for other in (start, f"{start}?token=", f"{start}?token={token}", f"{start}?token={viewers}x"):
-        assert not reached(other)
-        assert not reached(other, origin=Origin("https://viewer.example"))
-    assert not reached(address, additional_headers={"Host": "rebound.example"})
+    assert is_admitted(address, origin=Origin("https://viewer.example"))
+    for wrong_address in (start, f"{start}?token=", f"{start}?token={token}", f"{start}?token={viewers}x"):
+        assert not is_admitted(wrong_address)
+        assert not is_admitted(wrong_address, origin=Origin("https://viewer.example"))
+    assert not is_admitted(address, additional_headers={"Host": "rebound.example"})
     for path in ("live", "api/status"):
-        assert not reached(address.replace("/foxglove", f"/{path}"))
+        assert not is_admitted(address.replace("/foxglove", f"/{path}"))
 
 
 def test_viewers_receive_the_recorded_values(panel: Panel):
     bench, address = panel
     messages = []
-    with connect(address, subprotocols=SPOKEN) as viewer:
-        channels = begun(viewer, "rtloop")
+    with connect(address, subprotocols=OFFERED_PROTOCOLS) as viewer:
+        channels = read_channels(viewer, "rtloop")
         subscribe(viewer, (1, channels["/live"]["id"]), (2, channels["/events"]["id"]))
         tick = bench.client.post("/setpoint", {"axis": "x", "value": 3.0})["tick"]
         event: dict[str, Any] | None = None
@@ -69,19 +70,19 @@ def test_viewers_receive_the_recorded_values(panel: Panel):
             assert isinstance(data, bytes)
             _, number, _ = struct.unpack_from("<BIQ", data)
             if number == 1:
-                messages.append(decoded(channels["/live"]["schema"], data[13:]))
-            elif (said := decoded(channels["/events"]["schema"], data[13:]))["tick"] == tick:
-                event = said
+                messages.append(decode_message(channels["/live"]["schema"], data[13:]))
+            elif (message := decode_message(channels["/events"]["schema"], data[13:]))["tick"] == tick:
+                event = message
     assert (event["tick"], event["kind"], event["axis"]) == (tick, "set_reference", "x")
     assert json.loads(event["what"])["values"][1] == 3.0
     first, end = messages[0]["tick"] + 1 - messages[0]["ticks"], messages[-1]["tick"] + 1
     recording = rtloop.load(capture_ticks(bench.client, current_run(bench.client).file, first, end)["output"])
     begin = recording["tick"][0]
-    for said in messages:
-        place = slice(int(said["tick"] + 1 - said["ticks"] - begin), int(said["tick"] + 1 - begin))
+    for message in messages:
+        rows = slice(int(message["tick"] + 1 - message["ticks"] - begin), int(message["tick"] + 1 - begin))
         for name in recording.columns[1:]:
-            values = recording[name][place]
+            values = recording[name][rows]
             expected = np.fmin.reduce(values), np.fmax.reduce(values), values[-1]
-            np.testing.assert_array_equal([*said[name].values()], expected)
-    lost = sum(said["lost"] for said in messages[1:])  # those of the first message lie before its ticks
-    assert sum(said["ticks"] for said in messages) + lost == end - first
+            np.testing.assert_array_equal([*message[name].values()], expected)
+    lost = sum(message["lost"] for message in messages[1:])  # Ticks lost before the first message do not count.
+    assert sum(message["ticks"] for message in messages) + lost == end - first

@@ -1,4 +1,4 @@
-"""Debian's Chromium, driven by Playwright, on the panel of a service: actions and readings of an operator."""
+"""The panel's page in Debian's Chromium, driven by Playwright: actions of an operator, and waits for texts."""
 
 from __future__ import annotations
 
@@ -27,16 +27,16 @@ FLAGS = (
     "--disable-sync",
 )
 AXE = Path(sys.prefix) / "lib" / "node_modules" / "axe-core" / "axe.min.js"
-"""Where `make tools` puts it."""
+"""The script of axe-core, where `make tools` installs it."""
 WIDTH, HEIGHT = 1400, 900
 DRAW_LESS = "window.requestAnimationFrame = (draw) => setTimeout(() => draw(performance.now()), 100)"
-"""A page draws ten times a second in place of sixty: without a graphics card, drawing costs a processor."""
-PATIENCE_S = 150.0
-"""For whatever is waited for: it says nothing of how long it takes."""
+"""Script that lets a page draw ten times a second instead of sixty, for drawing without a graphics card is costly."""
+TIMEOUT_S = 150.0
+"""Time-out of each wait, far longer than a wait takes."""
 
 
-def chromium() -> str:
-    """Its path; skips where there is none, or no Playwright."""
+def chromium_path() -> str:
+    """Return the path of Chromium; skip the test if Chromium or Playwright is not installed."""
     pytest.importorskip("playwright.sync_api", reason="Playwright is not installed: make tools")
     path = shutil.which("chromium") or shutil.which("chromium-browser")
     if path is None:
@@ -46,8 +46,8 @@ def chromium() -> str:
 
 @contextmanager
 def launched() -> Iterator[Any]:
-    """A browser of one's own."""
-    path = chromium()
+    """Yield a new process of Chromium, which ends with the context."""
+    path = chromium_path()
     from playwright.sync_api import sync_playwright
 
     with sync_playwright() as playwright:
@@ -58,102 +58,97 @@ def launched() -> Iterator[Any]:
             browser.close()
 
 
-def panel_of(bench: Bench, service: str | None = None) -> tuple[str, subprocess.Popen[str]]:
-    """Start the panel of a service, of the bench's own or of another name; its address and its process."""
-    said = len(bench.log())
+def start_panel(bench: Bench, service: str | None = None) -> tuple[str, subprocess.Popen[str]]:
+    """Start the panel of the bench's service, or of one named `service`; return its address and its process."""
+    log_length = len(bench.log())
     process = bench.rtloop("panel", bench.folder / "run" / f"{service or bench.config.stem}.sock", "--port", "0")
-    found: list[str] = []
-
-    def told() -> bool:
-        found[:] = re.findall(r"http://127\.0\.0\.1:\d+/#token=\S+", bench.log()[said:])
-        return bool(found)
-
-    wait_for(told, "the panel's address", PATIENCE_S)
-    return found[0], process
+    find_addresses = lambda: re.findall(r"http://127\.0\.0\.1:\d+/#token=\S+", bench.log()[log_length:])
+    addresses = wait_for(find_addresses, "the panel's address", TIMEOUT_S)
+    return addresses[0], process
 
 
 def opened(browser: Any, address: str, width: int = WIDTH, height: int = HEIGHT, scheme: str = "dark") -> Any:
-    """The panel in a window of its own, showing what is now; what goes wrong in the page is noted in `page.faults`."""
+    """Return a new window with the panel once it shows present values; `page.faults` collects errors of the page."""
     context = browser.new_context(viewport={"width": width, "height": height}, color_scheme=scheme)
-    context.set_default_timeout(1000 * PATIENCE_S)
+    context.set_default_timeout(1000 * TIMEOUT_S)
     page = context.new_page()
     page.faults = []
     page.on("pageerror", lambda error: page.faults.append(f"{error}: {error.stack}"))
-    page.on("console", lambda said: page.faults.append(said.text) if "Content Security" in said.text else None)
+    page.on("console", lambda entry: page.faults.append(entry.text) if "Content Security" in entry.text else None)
     page.add_init_script(DRAW_LESS)
     page.goto(address)
-    page.wait_for_selector("body:not(.stale)", timeout=1000 * PATIENCE_S)
+    page.wait_for_selector("body:not(.stale)", timeout=1000 * TIMEOUT_S)
     return page
 
 
-def said(page: Any, selector: str, text: str) -> None:
-    """Wait until the text of an element matches the pattern `text`; fail with the text that it has."""
+def await_text(page: Any, selector: str, text: str) -> None:
+    """Wait until the text of an element matches the pattern `text`; fail with the text of the element."""
     from playwright.sync_api import TimeoutError
 
     try:
         page.wait_for_function(
             "([selector, text]) => new RegExp(text).test(document.querySelector(selector)?.textContent)",
             arg=[selector, text],
-            timeout=1000 * PATIENCE_S,
+            timeout=1000 * TIMEOUT_S,
         )
     except TimeoutError:
         errors = list(filter(None, page.locator(".error").all_text_contents()))
-        pytest.fail(f"{selector} says {page.text_content(selector)!r}; expected {text!r}; errors on the page: {errors}")
+        pytest.fail(f"{selector} has {page.text_content(selector)!r}; expected {text!r}; errors on the page: {errors}")
 
 
-def near(page: Any, selector: str, value: float, within: float = 0.1) -> None:
-    """Wait until an element shows a number."""
+def await_number(page: Any, selector: str, value: float, within: float = 0.1) -> None:
+    """Wait until an element shows a number that differs from `value` by less than `within`."""
     page.wait_for_function(
         """([selector, value, within]) => {
         const text = document.querySelector(selector).textContent.replace("−", "-").replace("≈", "");
         return Math.abs(parseFloat(text) - value) < within}""",
         arg=[selector, value, within],
-        timeout=1000 * PATIENCE_S,
+        timeout=1000 * TIMEOUT_S,
     )
 
 
-def number(page: Any, selector: str) -> float:
-    """What an element shows."""
+def read_number(page: Any, selector: str) -> float:
+    """Return the number that an element shows."""
     return float(page.inner_text(selector).replace("−", "-").replace("≈", ""))
 
 
-def hold(page: Any, selector: str) -> None:
-    """Press a button for longer than a second."""
+def hold_button(page: Any, selector: str) -> None:
+    """Hold a button until its action is done, after a second."""
     page.hover(selector)
     page.mouse.down()
-    held(page, selector)
+    await_hold(page, selector)
     page.mouse.up()
 
 
-def held(page: Any, selector: str) -> None:
-    """Wait until a button that is pressed has had its second."""
+def await_hold(page: Any, selector: str) -> None:
+    """Wait until a pressed button has been held for the second that its action needs."""
     page.wait_for_timeout(1000)
     page.wait_for_selector(f"{selector}:not(.holding)")
 
 
-def started(page: Any, name: str = "ada") -> None:
-    """Arm and start it under a name, as a person does."""
+def start_by_hand(page: Any, name: str = "ada") -> None:
+    """Arm and start the loop under a name with the button of the page."""
     page.fill("#who", name)
-    said(page, "#state-word", "stopped")
-    hold(page, "#go")
-    said(page, "#state-word", "armed")
-    hold(page, "#go")
-    said(page, "#state-word", "running")
+    await_text(page, "#state-word", "stopped")
+    hold_button(page, "#go")
+    await_text(page, "#state-word", "armed")
+    hold_button(page, "#go")
+    await_text(page, "#state-word", "running")
 
 
-def running(page: Any, bench: Bench, name: str = "ada") -> None:
-    """Have it run, driven under a name that is the page's as well, without the hand at its buttons."""
+def start_by_client(page: Any, bench: Bench, name: str = "ada") -> None:
+    """Arm and start the loop by requests, under the name that is entered in the page, so that the page may drive."""
     page.fill("#who", name)
     client = Client(bench.client.path, name)
     for command in ("/arm", "/start"):
         client.post(command)
-    said(page, "#state-word", "running")
+    await_text(page, "#state-word", "running")
 
 
-def stopped(page: Any) -> None:
-    """Stop it by the keyboard, and give the lock back."""
+def stop_by_keyboard(page: Any) -> None:
+    """Stop the loop by the keyboard and release the lock."""
     page.keyboard.press("Escape")
     page.keyboard.press("Space")
-    said(page, "#state-word", "stopped")
+    await_text(page, "#state-word", "stopped")
     page.click("#release")
-    said(page, "#drives", "Nobody")
+    await_text(page, "#drives", "Nobody")

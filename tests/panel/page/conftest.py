@@ -1,6 +1,6 @@
-"""A station for each file of this folder, and another one after each test that failed: no test can fail others.
+"""A station for each test file, and a new one after each failed test, so that no test makes others fail.
 
-One browser, in which each station has a window of its own; the folder is a package so that the browser ends with it.
+All stations have windows of one browser; this folder is a package so that the browser ends with its tests.
 """
 
 from __future__ import annotations
@@ -12,8 +12,8 @@ from typing import Any
 import pytest
 
 from tests.faults.bench import Bench
-from tests.panel.page.browser import HEIGHT, WIDTH, chromium, launched, said
-from tests.panel.page.parts import page_of_parts
+from tests.panel.page.browser import HEIGHT, WIDTH, await_text, chromium_path, launched
+from tests.panel.page.parts import open_parts_page
 from tests.panel.page.station import Station, Stations
 
 FAILED = pytest.StashKey[bool]()
@@ -21,7 +21,7 @@ FAILED = pytest.StashKey[bool]()
 
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_makereport(item: pytest.Item) -> Generator[None, pytest.TestReport, pytest.TestReport]:
-    """Note in a test that it failed, for the fixtures that end after it."""
+    """Store in a test whether it has failed, for the fixtures that end after it."""
     report = yield
     item.stash[FAILED] = item.stash.get(FAILED, False) or report.failed
     return report
@@ -29,28 +29,28 @@ def pytest_runtest_makereport(item: pytest.Item) -> Generator[None, pytest.TestR
 
 @pytest.fixture(scope="package")
 def browser() -> Iterator[Any]:
-    """Of these tests alone: Playwright has an event loop of its own."""
+    """Yield the browser of the tests in this folder; Playwright's event loop ends with it."""
     with launched() as browser:
         yield browser
 
 
 @pytest.fixture(scope="module")
 def parts_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The files behind the page of parts."""
+    """Return the folder of the files that the page of `parts` loads."""
     return tmp_path_factory.mktemp("parts")
 
 
 @pytest.fixture(scope="module")
 def parts(browser: Any, parts_folder: Path) -> Iterator[Any]:
-    """The page's elements and its parts, with no service behind them."""
-    with page_of_parts(browser, parts_folder) as page:
+    """Yield a page with the panel's elements and modules, but without a service."""
+    with open_parts_page(browser, parts_folder) as page:
         yield page
 
 
 @pytest.fixture(scope="module")
 def stations(browser: Any, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Stations]:
-    """Those of a file, one after the other."""
-    chromium()
+    """Yield the stations of a test file, of which one exists at a time."""
+    chromium_path()
     stations = Stations(lambda: Station(tmp_path_factory.mktemp("page"), browser))
     yield stations
     stations.discard()
@@ -58,32 +58,32 @@ def stations(browser: Any, tmp_path_factory: pytest.TempPathFactory) -> Iterator
 
 @pytest.fixture
 def station(stations: Stations, request: pytest.FixtureRequest) -> Iterator[Station]:
-    """A station in which no test has failed."""
-    yield stations.present()
+    """Yield a station in which no test has failed yet."""
+    yield stations.current()
     if request.node.stash[FAILED]:
         stations.discard()
 
 
 @pytest.fixture
 def bench(station: Station) -> Bench:
-    """Its service."""
+    """Return the bench of the station's service."""
     return station.bench
 
 
 @pytest.fixture
 def address(station: Station) -> str:
-    """Of its panel."""
+    """Return the address of the station's panel, with its token."""
     return station.address
 
 
 @pytest.fixture
-def shown(station: Station) -> Iterator[Any]:
-    """The panel as it is after it was opened, whatever was looked at before; no error was seen in it at its end."""
+def window(station: Station) -> Iterator[Any]:
+    """Yield the station's window, reset to the state after opening; fail if the page had an error during the test."""
     window = station.window
     window.set_viewport_size({"width": WIDTH, "height": HEIGHT})
     window.emulate_media(color_scheme="dark", reduced_motion="no-preference")
     window.evaluate("scrollTo(0, 0)")
-    for key in ("Escape", "Escape", "1"):  # a list or the help, then the field
+    for key in ("Escape", "Escape", "1"):  # Close a list or the help, leave the field, show the first view.
         window.keyboard.press(key)
     if window.get_attribute("#cursors", "aria-pressed") == "true":
         window.keyboard.press("m")
@@ -93,15 +93,15 @@ def shown(station: Station) -> Iterator[Any]:
 
 
 @pytest.fixture
-def page(shown: Any, bench: Bench) -> Iterator[Any]:
-    """The panel, outputs off."""
-    off(bench)
-    said(shown, "#state-word", "stopped")
-    yield shown
-    off(bench)
+def page(window: Any, bench: Bench) -> Iterator[Any]:
+    """Yield the station's window, reset, with the loop stopped and the outputs off."""
+    stop_loop(bench)
+    await_text(window, "#state-word", "stopped")
+    yield window
+    stop_loop(bench)
 
 
-def off(bench: Bench) -> None:
-    """Stop it."""
+def stop_loop(bench: Bench) -> None:
+    """Stop the loop of a service, which switches the outputs off."""
     bench.client.post("/stop")
     bench.await_state("stopped")

@@ -1,4 +1,4 @@
-"""Parts of the page in a browser without a panel: files and events stand for the server."""
+"""The modules of the page in a browser without a panel; files and events of the test replace the server."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from rtloop.panel.web.application import PAGE
-from tests.panel.page.browser import PATIENCE_S, said
+from tests.panel.page.browser import TIMEOUT_S, await_text
 
 SET_UP = """async () => {
   const names = ["scope/scope", "views/xy", "views/spectrum", "views/recordings", "palette", "strip"];
@@ -32,42 +32,44 @@ SET_UP = """async () => {
   }
   themes(document.getElementById("theme"), () => {});
   window.wishes = {};
-  window.tell = (kind, detail) => live.dispatchEvent(new CustomEvent(kind, {detail}));
-  window.sweep = (more) => tell("sweep", {run: 0, first: 0, trigger: 40, end: 200, cause: "auto", mode: "auto",
+  window.dispatch = (kind, detail) => live.dispatchEvent(new CustomEvent(kind, {detail}));
+  window.sweep = (more) => dispatch("sweep", {run: 0, first: 0, trigger: 40, end: 200, cause: "auto", mode: "auto",
     uncertain_ticks: 0, number: 3, complete: true, rate_hz: 1000, arrays, ...more});
-  window.state = (more) => tell("state", {state: "stopped", mode: "off", tick: 7, unix_s: 1000, axes: {},
+  window.state = (more) => dispatch("state", {state: "stopped", mode: "off", tick: 7, unix_s: 1000, axes: {},
     lock: {name: "ada", until_unix_s: 1042}, ...more});
-  window.freshness = (more) => tell("freshness", {connected: true, answered: true, fresh: true, age_s: 0,
+  window.freshness = (more) => dispatch("freshness", {connected: true, answered: true, fresh: true, age_s: 0,
     silence_s: 0, ...more});
-  window.asked = [];
-  const answering = {driving: async (_, {value}) => (asked.push(value), {tick: 100})};
+  window.setpoints = [];
+  const commands = {driving: async (_, {value}) => (setpoints.push(value), {tick: 100})};
   window.strip = new Strip(live);
   window.scope = new Scope(live, panel);
   window.drive = new Drive(live, {tell() {}});
   window.configuration = new Configuration(panel);
-  window.reference = new Reference(live, panel, configuration, answering, () => {});
+  window.reference = new Reference(live, panel, configuration, commands, () => {});
   window.xy = new Xy(live, panel);
   window.spectrum = new Spectrum(live, panel);
   window.recordings = new Recordings(scope);
   showDigits(live, panel, configuration);
   showEvents(live);
 }"""
+"""Script that creates the modules; `dispatch` simulates a message of the server, `setpoints` has all that were sent."""
 
 Y = {"name": "y", "limits": {"command_um": 25, "drive_min_v": 0}}
+"""Configuration of axis y, whose limits differ from the defaults."""
 
 
 @contextmanager
-def page_of_parts(browser: Any, folder: Path) -> Iterator[Any]:
-    """The page's elements and its parts, with the files of `folder`, such as `api/configuration`, behind them."""
+def open_parts_page(browser: Any, folder: Path) -> Iterator[Any]:
+    """Yield the page with its modules, served from `folder`, whose files such as `api/configuration` are the API."""
     (folder / "page").symlink_to(PAGE)
     (folder / "api").mkdir()
-    configure(folder, {"name": "x"}, Y)
+    write_configuration(folder, {"name": "x"}, Y)
     scriptless = (PAGE / "index.html").read_text(encoding="utf-8").replace('src="/page/main.js"', "")
     (folder / "index.html").write_text(scriptless, encoding="utf-8")
     server = ThreadingHTTPServer(("127.0.0.1", 0), partial(SimpleHTTPRequestHandler, directory=str(folder)))
     threading.Thread(target=server.serve_forever, daemon=True).start()
     page = browser.new_page()
-    page.set_default_timeout(1000 * PATIENCE_S)
+    page.set_default_timeout(1000 * TIMEOUT_S)
     page.goto(f"http://127.0.0.1:{server.server_address[1]}/")
     page.evaluate(SET_UP)
     yield page
@@ -76,17 +78,17 @@ def page_of_parts(browser: Any, folder: Path) -> Iterator[Any]:
     server.server_close()
 
 
-def configure(folder: Path, *axes: dict[str, Any]) -> None:
-    """Have the page read this configuration the next time."""
+def write_configuration(folder: Path, *axes: dict[str, Any]) -> None:
+    """Write the configuration of these axes, which the page reads the next time."""
     (folder / "api" / "configuration").write_text(json.dumps({"values": {"axis": axes}}))
 
 
 def choose(parts: Any, picker: str, text: str) -> None:
-    """Choose an entry of a list."""
+    """Choose the entry `text` of a picker by mouse."""
     parts.click(f"#{picker} button")
     parts.click(f"#{picker}-list li:text-is('{text}')")
 
 
-def says(parts: Any, selector: str, text: str) -> None:
-    """Wait until an element says this text, and no other."""
-    said(parts, selector, f"^{re.escape(text)}$")
+def await_exact_text(parts: Any, selector: str, text: str) -> None:
+    """Wait until the whole text of an element is `text`."""
+    await_text(parts, selector, f"^{re.escape(text)}$")

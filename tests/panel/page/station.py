@@ -1,4 +1,4 @@
-"""A service, its panel and its page, for the tests of one file: a failed test leaves none of them to the next."""
+"""Stations, each a service with its panel and a window: the tests of a file share one until a test fails."""
 
 from __future__ import annotations
 
@@ -8,45 +8,43 @@ from pathlib import Path
 from typing import Any
 
 from tests.faults.bench import Bench
-from tests.panel.page.browser import opened, panel_of
+from tests.panel.page.browser import opened, start_panel
 
 CHANGES = ("[recording]", "[service]\narm = true\n[recording]")
 
 
 class Station:
-    """A service whose outputs are off until it is armed, its panel, and a window with the page, opened once: loading it
-    takes longer than most that is done with it.
-    """
+    """A service whose loop is not armed, its panel, and a window with the page, which loads slowly and only once."""
 
     def __init__(self, folder: Path, browser: Any) -> None:
         self._ending = ExitStack()
         with ExitStack() as ending:
             self.bench = ending.enter_context(Bench(folder, CHANGES))
-            self.address = panel_of(self.bench)[0]
+            self.address = start_panel(self.bench)[0]
             self.window = opened(browser, self.address)
             ending.callback(self.window.context.close)
             self._ending = ending.pop_all()
 
     def close(self) -> None:
-        """End all of it."""
+        """Close the window and end the panel and the service."""
         self._ending.close()
 
 
 class Stations:
-    """The station that the tests of a file share as long as they pass; `start` makes another one."""
+    """The stations of a test file, one at a time, which `start` makes when a test needs one."""
 
     def __init__(self, start: Callable[[], Any]) -> None:
         self._start = start
-        self._present: Any = None
+        self._current: Any = None
 
-    def present(self) -> Any:
-        """The station of the tests before, or a new one."""
-        if self._present is None:
-            self._present = self._start()
-        return self._present
+    def current(self) -> Any:
+        """Return the station of the tests before, or a new one if there is none."""
+        if self._current is None:
+            self._current = self._start()
+        return self._current
 
     def discard(self) -> None:
-        """End the present one: the next test starts another."""
-        if self._present is not None:
-            station, self._present = self._present, None
+        """End the current station, so that the next test starts a new one."""
+        if self._current is not None:
+            station, self._current = self._current, None
             station.close()

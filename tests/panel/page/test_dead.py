@@ -11,22 +11,29 @@ import pytest
 
 from rtloop.hil import board
 from tests.faults.bench import Bench
-from tests.panel.page.browser import chromium, opened, panel_of, running, said, stopped
+from tests.panel.page.browser import (
+    await_text,
+    chromium_path,
+    opened,
+    start_by_client,
+    start_panel,
+    stop_by_keyboard,
+)
 
-DESK = ("#go", "#set-mode button", "#setpoint", "#tune-value", "#undo")
+DESK_CONTROLS = ("#go", "#set-mode button", "#setpoint", "#tune-value", "#undo")
 
-GREYS = """(at) => {
+COUNT_GREY_FILTERS = """(at) => {
   let count = 0;
   for (let e = document.querySelector(at); e; e = e.parentElement)
     if (getComputedStyle(e).filter.includes("grayscale")) count++;
   return count}"""
-"""How many times an element is made grey: twice is too faint to read."""
+"""Script: count the grey filters on an element and those around it, for two make it too faint to read."""
 
 
 @pytest.fixture
-def doomed(tmp_path: Any) -> Iterator[Bench]:
-    """Whose loop ends by itself a second after its service died."""
-    chromium()
+def bench_to_kill(tmp_path: Any) -> Iterator[Bench]:
+    """Yield a bench whose processes the test kills; its loop ends one second after the death of the service."""
+    chromium_path()
     changes = (
         ("[recording]", "[service]\narm = true\n[recording]"),
         ("[loop]\n", "[loop]\nheartbeat_timeout_s = 1.0\n"),
@@ -35,63 +42,67 @@ def doomed(tmp_path: Any) -> Iterator[Bench]:
         yield bench
 
 
-def blank(page: Any, selector: str) -> None:
-    """Wait until an element says nothing."""
-    said(page, selector, "^$")
+def await_empty(page: Any, selector: str) -> None:
+    """Wait until an element has no text."""
+    await_text(page, selector, "^$")
 
 
-def test_a_dead_process_is_named_and_old_values_are_grey_and_locked(browser: Any, doomed: Bench) -> None:
-    address, panel = panel_of(doomed)
+def test_a_dead_process_is_named_and_old_values_are_grey_and_locked(browser: Any, bench_to_kill: Bench) -> None:
+    address, panel = start_panel(bench_to_kill)
     page = opened(browser, address)
-    running(page, doomed)
-    doomed.ask_for(board.FROZEN_INPUT)
-    said(page, "#alarm", "Tripped: x: frozen 2000 ticks, its limit 2000 ticks; also stale. Use Reset to continue")
-    doomed.ask_for(board.NO_FAULT)
+    start_by_client(page, bench_to_kill)
+    bench_to_kill.ask_for(board.FROZEN_INPUT)
+    await_text(page, "#alarm", "Tripped: x: frozen 2000 ticks, its limit 2000 ticks; also stale. Use Reset to continue")
+    bench_to_kill.ask_for(board.NO_FAULT)
     page.click("#reset")
-    blank(page, "#alarm")
+    await_empty(page, "#alarm")
 
-    os.kill(doomed.pid("rt"), signal.SIGKILL)
-    doomed.await_restart()
-    said(
+    os.kill(bench_to_kill.pid("rt"), signal.SIGKILL)
+    bench_to_kill.await_restart()
+    await_text(
         page,
         "#alarm",
         r"Tripped: the loop's process died \(signal 9\); rtloop parked the outputs.* Use Reset to continue",
     )
     assert page.is_enabled("#reset")
 
-    assert doomed.service is not None
-    doomed.service.kill()
-    doomed.service.wait()
+    assert bench_to_kill.service is not None
+    bench_to_kill.service.kill()
+    bench_to_kill.service.wait()
     died = "The service does not answer: the service has died: .* STOP does not get through"
-    said(page, "#said", f"{died}.*`rtloop park CONFIG --name lab`, .*then start the service with `rtloop serve CONFIG")
-    said(page, "#state-word", "^unreachable$")
-    said(page, "#drives", "^—$")
-    assert str(doomed.folder) not in page.inner_text("body")
-    assert page.evaluate("(places) => places.every((one) => document.querySelector(one).closest('[inert]'))", [*DESK])
+    await_text(
+        page, "#said", f"{died}.*`rtloop park CONFIG --name lab`, .*then start the service with `rtloop serve CONFIG"
+    )
+    await_text(page, "#state-word", "^unreachable$")
+    await_text(page, "#drives", "^—$")
+    assert str(bench_to_kill.folder) not in page.inner_text("body")
+    assert page.evaluate(
+        "(controls) => controls.every((at) => document.querySelector(at).closest('[inert]'))", [*DESK_CONTROLS]
+    )
     for figure in ("#digits", "#rate", "#traces", "#trigger-state", "#spectrum-figures"):
-        assert page.evaluate(GREYS, figure) == 1, figure
-    assert page.evaluate(GREYS, "#state") == 0, "the service is unreachable now"
-    said(page, "#recording", "^—$")
+        assert page.evaluate(COUNT_GREY_FILTERS, figure) == 1, figure
+    assert page.evaluate(COUNT_GREY_FILTERS, "#state") == 0, "the service is unreachable now"
+    await_text(page, "#recording", "^—$")
     page.keyboard.press("Escape")
     page.keyboard.press("Space")
-    said(page, "#stop-alarm", "STOP did not get through: the service does not answer: the service has died")
+    await_text(page, "#stop-alarm", "STOP did not get through: the service does not answer: the service has died")
 
-    assert doomed.rtloop("park", doomed.config).wait() == 0
-    doomed.start_service()
-    said(page, "#state-word", "stopped")
-    for place in ("#stop-alarm", "#alarm", "#said", "#power-error", "#lock-error"):
-        blank(page, place)
+    assert bench_to_kill.rtloop("park", bench_to_kill.config).wait() == 0
+    bench_to_kill.start_service()
+    await_text(page, "#state-word", "stopped")
+    for selector in ("#stop-alarm", "#alarm", "#said", "#power-error", "#lock-error"):
+        await_empty(page, selector)
     assert not page.evaluate("document.querySelector('#desk').inert")
-    running(page, doomed)
-    stopped(page)
+    start_by_client(page, bench_to_kill)
+    stop_by_keyboard(page)
 
     panel.kill()
     page.wait_for_selector("body.stale")
-    said(page, "#said", "No connection: .* Use the emergency stop")
-    said(page, "#age", "s old")
+    await_text(page, "#said", "No connection: .* Use the emergency stop")
+    await_text(page, "#age", "s old")
     assert "the values shown are" in page.get_attribute("#scope-plot .veil", "data-says")
     for figure in ("#scope-plot .uplot", "#state"):
-        assert page.evaluate(GREYS, figure) == 1, figure
+        assert page.evaluate(COUNT_GREY_FILTERS, figure) == 1, figure
     page.keyboard.press("Space")
-    said(page, "#stop-alarm", "STOP did not get through.*emergency stop")
+    await_text(page, "#stop-alarm", "STOP did not get through.*emergency stop")
     page.context.close()

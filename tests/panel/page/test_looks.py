@@ -1,6 +1,6 @@
-"""The page on screens of all sizes, in both themes, for people who see or use it otherwise, and for strangers.
+"""The page fits screens of all sizes in both themes and is accessible, by the rules of axe-core.
 
-Pages of other origins, and a page without the token, neither see nor move anything.
+A page of another origin can neither read nor command the panel; a page without the token asks for it.
 """
 
 from __future__ import annotations
@@ -14,23 +14,24 @@ from urllib.parse import urlsplit
 import pytest
 
 from tests.faults.bench import Bench
-from tests.panel.page.browser import AXE, PATIENCE_S, opened, running, said, stopped
+from tests.panel.page.browser import AXE, TIMEOUT_S, await_text, opened, start_by_client, stop_by_keyboard
 
-MOVING = "[...document.querySelectorAll('*')].filter((one) => parseFloat(getComputedStyle(one).transitionDuration))"
+MOVING = "[...document.querySelectorAll('*')].filter((e) => parseFloat(getComputedStyle(e).transitionDuration))"
+"""Script: the elements with a transition."""
 VIEWS = ("scope", "xy", "spectrum", "timing", "recordings", "measure")
 TAGS = ["wcag2a", "wcag2aa", "wcag21a", "wcag21aa"]
 
 ATTACKS = """async (panel) => {
-  const tried = {};
+  const outcomes = {};
   const post = (name, path, options) => fetch(panel + path, {method: "POST", credentials: "include", ...options})
-    .then((answer) => (tried[name] = answer.type + answer.status), (error) => (tried[name] = "failed"));
+    .then((answer) => (outcomes[name] = answer.type + answer.status), (error) => (outcomes[name] = "failed"));
   const body = JSON.stringify({axis: "x", value: 30});
   await post("json", "/api/setpoint?as=ada", {body, headers: {"Content-Type": "application/json"}});
   await post("plain", "/api/setpoint?as=ada", {body, mode: "no-cors", headers: {"Content-Type": "text/plain"}});
   await post("stop", "/api/stop", {mode: "no-cors", body: "{}"});
   await post("mode", "/api/mode?as=ada", {mode: "no-cors", body: '{"mode": "off"}'});
-  tried.read = await fetch(panel + "/api/status", {credentials: "include"}).then((a) => a.text(), () => "failed");
-  tried.socket = await new Promise((resolve) => {
+  outcomes.read = await fetch(panel + "/api/status", {credentials: "include"}).then((a) => a.text(), () => "failed");
+  outcomes.socket = await new Promise((resolve) => {
     const socket = new WebSocket(panel.replace("http", "ws") + "/live");
     socket.onopen = () => resolve("open");
     socket.onerror = () => resolve("failed");
@@ -41,12 +42,13 @@ ATTACKS = """async (panel) => {
   document.body.append(frame, form);
   form.submit();
   await new Promise((resolve) => setTimeout(resolve, 500));
-  return tried;
+  return outcomes;
 }"""
+"""Script: requests from another origin to the panel at an address; returns the outcome of each by its name."""
 
 
-class Page(BaseHTTPRequestHandler):
-    """An empty one."""
+class EmptyPageHandler(BaseHTTPRequestHandler):
+    """Answers each request with an empty page."""
 
     def do_GET(self) -> None:
         self.send_response(200)
@@ -55,15 +57,15 @@ class Page(BaseHTTPRequestHandler):
         self.wfile.write(b"<!doctype html><title>elsewhere</title><body></body>")
 
     def log_message(self, format: str, *_: Any) -> None:
-        """Nothing."""
+        """Log no request to the terminal."""
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
-def test_axe_finds_no_violation_in_any_view(shown: Any, scheme: str) -> None:
-    """The dark theme differs from the light one in its colours alone."""
+def test_axe_finds_no_violation_in_any_view(window: Any, scheme: str) -> None:
+    """Only the contrast is checked in the dark theme, which differs from the light one in its colours alone."""
     if not AXE.exists():
-        pytest.skip(f"{AXE} is not there: make tools")
-    page = shown
+        pytest.skip(f"{AXE} is not installed: make tools")
+    page = window
     page.emulate_media(color_scheme=scheme)
     page.wait_for_selector(f"html[data-theme={scheme}]", state="attached")
     page.evaluate(AXE.read_text(encoding="utf-8") + "; undefined")
@@ -74,34 +76,34 @@ def test_axe_finds_no_violation_in_any_view(shown: Any, scheme: str) -> None:
         page.keyboard.press(str(VIEWS.index(view) + 1) if view in VIEWS else "?")
         if view == "scope":
             page.keyboard.press("m")
-        drawn(page)
-        found = page.evaluate(check, rules)
-        assert [(view, one["id"], [node["html"] for node in one["nodes"]]) for one in found] == []
+        await_drawing(page)
+        violations = page.evaluate(check, rules)
+        assert [(view, rule["id"], [node["html"] for node in rule["nodes"]]) for rule in violations] == []
 
 
 @pytest.mark.parametrize(("width", "scheme"), [(320, "light"), (400, "dark"), (1400, "light"), (2560, "dark")])
-def test_nothing_lies_beyond_the_edge_and_stop_is_always_seen(shown: Any, width: int, scheme: str) -> None:
-    page = shown
+def test_nothing_lies_beyond_the_edge_and_stop_is_always_seen(window: Any, width: int, scheme: str) -> None:
+    page = window
     page.set_viewport_size({"width": width, "height": 900})
     page.emulate_media(color_scheme=scheme)
     page.wait_for_selector(f"html[data-theme={scheme}]", state="attached")
-    for place, view in enumerate(VIEWS, start=1):
-        page.keyboard.press(str(place))
-        drawn(page)
+    for number, view in enumerate(VIEWS, start=1):
+        page.keyboard.press(str(number))
+        await_drawing(page)
         assert page.is_visible(f"#{view}")
         assert page.is_visible("#scope") or width < 1900, "a large screen keeps the scope"
         assert page.evaluate("document.documentElement.scrollWidth <= innerWidth"), view
         assert page.evaluate("document.documentElement.scrollHeight <= innerHeight") or width < 1400, view
-        for scrolled in ("0", "document.body.scrollHeight"):
-            page.evaluate(f"scrollTo(0, {scrolled})")
-            seen = page.evaluate(
+        for scroll_px in ("0", "document.body.scrollHeight"):
+            page.evaluate(f"scrollTo(0, {scroll_px})")
+            is_stop_visible = page.evaluate(
                 """() => {
                 const {left, top, right, bottom} = document.querySelector("#stop").getBoundingClientRect();
-                const there = document.elementFromPoint((left + right) / 2, (top + bottom) / 2);
+                const element = document.elementFromPoint((left + right) / 2, (top + bottom) / 2);
                 const within = left >= 0 && top >= 0 && right <= innerWidth && bottom <= innerHeight;
-                return within && !!there.closest("#stop")}"""
+                return within && !!element.closest("#stop")}"""
             )
-            assert seen, (view, scrolled)
+            assert is_stop_visible, (view, scroll_px)
             top, bottom = page.evaluate(
                 "(({top, bottom}) => [top, bottom])(document.querySelector('#state').getBoundingClientRect())"
             )
@@ -112,50 +114,52 @@ def test_nothing_lies_beyond_the_edge_and_stop_is_always_seen(shown: Any, width:
     assert page.get_attribute("html", "data-theme") == scheme
 
 
-def test_with_reduced_motion_it_works_as_well(shown: Any) -> None:
-    shown.emulate_media(reduced_motion="reduce")
-    assert shown.evaluate(f"{MOVING}.length") == 0
-    said(shown, "#position-x", r"\d")
+def test_with_reduced_motion_it_works_as_well(window: Any) -> None:
+    window.emulate_media(reduced_motion="reduce")
+    assert window.evaluate(f"{MOVING}.length") == 0
+    await_text(window, "#position-x", r"\d")
 
 
 def test_the_numbers_beside_the_plot_say_what_it_shows(page: Any, bench: Bench) -> None:
-    running(page, bench)
+    start_by_client(page, bench)
     page.fill("#setpoint", "-2.5")
     page.keyboard.press("Enter")
-    said(page, "#traces tbody tr:nth-of-type(2)", r"−2\.500.*−2\.500")
+    await_text(page, "#traces tbody tr:nth-of-type(2)", r"−2\.500.*−2\.500")
     page.keyboard.press("Escape")
     page.keyboard.press("m")
     slider = "[role=slider][aria-label='Cursor A']"
-    page.wait_for_selector(f"{slider}[aria-valuetext*='Cursor A']")  # placed in the next frame
-    said(page, "#measured", "1/Δt")
-    stopped(page)
+    page.wait_for_selector(f"{slider}[aria-valuetext*='Cursor A']")  # The next frame places the cursor.
+    await_text(page, "#measured", "1/Δt")
+    stop_by_keyboard(page)
 
 
-def drawn(page: Any) -> None:
-    """Wait until what was asked for is on the screen: in the second frame from now."""
-    page.evaluate("() => new Promise((seen) => requestAnimationFrame(() => requestAnimationFrame(seen)))")
+def await_drawing(page: Any) -> None:
+    """Wait for two frames, after which the page has drawn all earlier changes."""
+    page.evaluate("() => new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))")
 
 
 @pytest.fixture(scope="module")
-def elsewhere() -> Iterator[str]:
-    """A second origin of the same host: to a browser the same site, whose cookies it sends along."""
-    server = ThreadingHTTPServer(("127.0.0.1", 0), Page)
+def other_origin() -> Iterator[str]:
+    """Yield the address of a page of another origin on the same host: its requests carry the panel's cookies."""
+    server = ThreadingHTTPServer(("127.0.0.1", 0), EmptyPageHandler)
     threading.Thread(target=server.serve_forever, daemon=True).start()
     yield f"http://127.0.0.1:{server.server_address[1]}/"
     server.shutdown()
     server.server_close()
 
 
-def test_a_page_of_another_origin_cannot_move_the_drive(page: Any, bench: Bench, address: str, elsewhere: str) -> None:
-    running(page, bench)
+def test_a_page_of_another_origin_cannot_move_the_drive(
+    page: Any, bench: Bench, address: str, other_origin: str
+) -> None:
+    start_by_client(page, bench)
     page.fill("#setpoint", "12.5")
     page.keyboard.press("Enter")
-    said(page, "#digits", "12.500")
-    stranger = page.context.new_page()  # with the session's cookie
-    stranger.goto(elsewhere)
+    await_text(page, "#digits", "12.500")
+    stranger = page.context.new_page()  # The context has the cookie of the session.
+    stranger.goto(other_origin)
     parts = urlsplit(address)
-    tried = stranger.evaluate(ATTACKS, f"{parts.scheme}://{parts.netloc}")
-    assert tried["json"] == tried["read"] == tried["socket"] == "failed"
+    outcomes = stranger.evaluate(ATTACKS, f"{parts.scheme}://{parts.netloc}")
+    assert outcomes["json"] == outcomes["read"] == outcomes["socket"] == "failed"
     status = bench.status()
     assert status["state"] == "running"
     assert status["mode"] == "closed_loop"
@@ -163,7 +167,7 @@ def test_a_page_of_another_origin_cannot_move_the_drive(page: Any, bench: Bench,
     stranger.close()
     page.keyboard.press("Escape")
     page.keyboard.press("Space")
-    said(page, "#state-word", "stopped")
+    await_text(page, "#state-word", "stopped")
     page.click("#release")
 
 
@@ -173,14 +177,14 @@ def test_the_token_leaves_the_address_and_without_it_there_is_a_form(browser: An
     assert "#" not in page.url
     page.reload()
     page.wait_for_selector("body:not(.stale)")
-    bare, token = address.split("#token=")
+    address_without_token, token = address.split("#token=")
     stranger = browser.new_context().new_page()
-    stranger.set_default_timeout(1000 * PATIENCE_S)
-    stranger.goto(bare)
+    stranger.set_default_timeout(1000 * TIMEOUT_S)
+    stranger.goto(address_without_token)
     stranger.wait_for_selector("#token-dialog[open]")
     stranger.fill("#token", "not-it")
     stranger.keyboard.press("Enter")
-    said(stranger, "#token-error", "not the token")
+    await_text(stranger, "#token-error", "not the token")
     stranger.fill("#token", token)
     stranger.keyboard.press("Enter")
     stranger.wait_for_selector("body:not(.stale)")

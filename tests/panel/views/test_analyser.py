@@ -1,4 +1,4 @@
-"""Spectrum of one client: it holds all samples since the last reset and none before."""
+"""The spectrum of one client has all samples since the last reset and none before."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ LOOP: Any = SimpleNamespace(rate_hz=RATE_HZ, unit=lambda _: "V", axes={"x": {}})
 NAMES = (DEADLINE_NS, "x_drive_v", "x_reference_um", "mode")
 
 
-def fed(analyser: Analyser, volts: np.ndarray[Any, Any], first: int, run: int = 0, reference: Any = 0.0) -> int:
-    """In stretches of some ticks, as they are read, in closed loop; the tick behind them."""
+def feed(analyser: Analyser, volts: np.ndarray[Any, Any], first: int, run: int = 0, reference: Any = 0.0) -> int:
+    """Feed drives (V) in closed loop from tick `first` on, in stretches of 17 ticks; return the tick after them."""
     rows = np.column_stack([np.zeros(volts.size), volts, np.broadcast_to(reference, volts.size), 3.0 + 0 * volts])
     rows[:, 0] = (first + np.arange(volts.size)) * 1e9 / RATE_HZ
     for start in range(0, volts.size, 17):
@@ -28,32 +28,32 @@ def fed(analyser: Analyser, volts: np.ndarray[Any, Any], first: int, run: int = 
     return first + volts.size
 
 
-@pytest.mark.parametrize("anew", ["reset", "another run"])
-def test_a_reset_discards_earlier_samples_and_keeps_later_ones(anew: str) -> None:
+@pytest.mark.parametrize("cause", ["reset", "another run"])
+def test_a_reset_discards_earlier_samples_and_keeps_later_ones(cause: str) -> None:
     analyser = Analyser(validate_field("spectrum", {"signal": "x_drive_v"}), LOOP)
-    tick = fed(analyser, np.full(4100, 0.0) + 1e6 * (np.arange(4100) % 2), 0)
-    if anew == "reset":
+    tick = feed(analyser, np.full(4100, 0.0) + 1e6 * (np.arange(4100) % 2), 0)
+    if cause == "reset":
         analyser.reset()
     sine = np.sqrt(2) * np.sin(2 * np.pi * 100 * np.arange(4096) / RATE_HZ)
-    fed(analyser, sine, tick, run=int(anew != "reset"))
+    feed(analyser, sine, tick, run=int(cause != "reset"))
     header, arrays = unpacked(analyser.frame())
-    assert header["averages_most"] == 7, "all of the 4096 samples, in halves of 1024 but for the first"
+    assert header["averages_most"] == 7, "7 half-overlapping segments of 1024 samples fill the 4096 samples"
     assert header["rms"] == pytest.approx(1.0, rel=0.01)
     assert arrays["hz"][np.argmax(arrays["amplitude"])] == pytest.approx(100.0, abs=0.5)
 
 
 def test_the_spectrum_of_an_axis_at_rest_is_called_noise_until_its_reference_moves() -> None:
     analyser = Analyser(validate_field("spectrum", {"signal": "x_drive_v"}), LOOP)
-    said = lambda: unpacked(analyser.frame())[0]["at_rest"]
-    tick = fed(analyser, np.zeros(170), 0, reference=5.0)
-    assert said()
-    tick = fed(analyser, np.zeros(170), tick, reference=5.001)  # the step lies between two stretches
-    assert not said()
+    at_rest = lambda: unpacked(analyser.frame())[0]["at_rest"]
+    tick = feed(analyser, np.zeros(170), 0, reference=5.0)
+    assert at_rest()
+    tick = feed(analyser, np.zeros(170), tick, reference=5.001)  # The reference steps between two stretches.
+    assert not at_rest()
     analyser.reset()
-    tick = fed(analyser, np.zeros(170), tick, reference=5.001)
-    assert said()
-    fed(analyser, np.zeros(170), tick, reference=np.arange(170.0))
-    assert not said()
+    tick = feed(analyser, np.zeros(170), tick, reference=5.001)
+    assert at_rest()
+    feed(analyser, np.zeros(170), tick, reference=np.arange(170.0))
+    assert not at_rest()
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""Scope screens as the server makes them: commands at their tick, counted sweeps, bounded subscriptions."""
+"""Scope screens of the server: sweeps at the ticks of commands, counted sweeps, and bounded subscriptions."""
 
 from __future__ import annotations
 
@@ -27,7 +27,8 @@ LOOP = Description(
 )
 
 
-def stretch(first: int, end: int, run: int = 0, **signals: Any) -> Stretch:
+def make_stretch(first: int, end: int, run: int = 0, **signals: Any) -> Stretch:
+    """Return ticks `first` … `end` − 1, 1 ms apart; a signal is a constant, an array by tick, or 0 by default."""
     rows = np.zeros((end - first, len(NAMES)))
     rows[:, 0], rows[:, 1] = np.arange(first, end), np.arange(first, end) * 1e6
     for name, values in signals.items():
@@ -35,62 +36,63 @@ def stretch(first: int, end: int, run: int = 0, **signals: Any) -> Stretch:
     return Stretch(NAMES, first, rows, 0, run)
 
 
-def view(**trigger: Any) -> Any:
-    wish = {"signals": ["x_reference_um"], "seconds": 0.02, "pixels": 100, "trigger": trigger}
-    return validate_field("view", wish)
+def make_view(**trigger: Any) -> Any:
+    """Return the subscription of a screen of 20 ms with these options of its trigger."""
+    subscription = {"signals": ["x_reference_um"], "seconds": 0.02, "pixels": 100, "trigger": trigger}
+    return validate_field("view", subscription)
 
 
 def test_commands_are_found_at_their_ticks_in_stretches_of_any_length():
     random = np.random.default_rng(5)
     ticks = np.sort(random.choice(np.arange(30, 100_000, 25), 3000, replace=False))
-    scope, found, tick = Scope(view(mode="normal", kind="command", pre_percent=10), LOOP), [], 0
+    scope, sweeps, tick = Scope(make_view(mode="normal", kind="command", pre_percent=10), LOOP), [], 0
     while tick < 100_100:
         end = tick + int(random.integers(1, 300))
-        # an event is there before its tick is, so some come early
-        come = ticks[(ticks >= tick) & (ticks < end)]
-        found += scope.feed(stretch(tick, end), come.tolist())
+        # The events of commands come together with their ticks.
+        commands = ticks[(ticks >= tick) & (ticks < end)]
+        sweeps += scope.feed(make_stretch(tick, end), commands.tolist())
         tick = end
-    assert [sweep.trigger for sweep in found] == ticks.tolist()
+    assert [sweep.trigger for sweep in sweeps] == ticks.tolist()
     assert scope.sweep_count == 3000
 
 
 def test_a_run_that_ends_shows_its_open_sweep():
-    past, scope = TickHistory(NAMES, 3200), Scope(view(mode="normal", kind="command"), LOOP)
-    first = stretch(0, 100, x_reference_um=7.0)
-    past.append(first)
-    scope.feed(first, [95])
-    scope.end_run(past)
-    other = stretch(0, 50, run=1)
-    past.append(other)
-    scope.feed(other, [])
-    header, arrays = unpacked(scope.frame(past))
+    history, scope = TickHistory(NAMES, 3200), Scope(make_view(mode="normal", kind="command"), LOOP)
+    first_run = make_stretch(0, 100, x_reference_um=7.0)
+    history.append(first_run)
+    scope.feed(first_run, [95])
+    scope.end_run(history)
+    second_run = make_stretch(0, 50, run=1)
+    history.append(second_run)
+    scope.feed(second_run, [])
+    header, arrays = unpacked(scope.frame(history))
     assert (header["run"], header["trigger"], header["end"], header["number"]) == (0, 95, 100, 1)
     assert set(arrays["x_reference_um:low"].tolist()) == {7.0}
-    assert scope.frame(past) is None
+    assert scope.frame(history) is None
 
 
 def test_a_roll_and_a_long_sweep_grow():
-    past = TickHistory(NAMES, 32_000)
+    history = TickHistory(NAMES, 32_000)
     roll = Scope(
         validate_field("view", {"signals": ["tick"], "seconds": 1, "pixels": 50, "trigger": {"mode": "roll"}}), LOOP
     )
-    slow = {"mode": "normal", "kind": "step", "source": "x_reference_um", "pre_percent": 0}
-    growing = Scope(validate_field("view", {"signals": ["tick"], "seconds": 2, "pixels": 50, "trigger": slow}), LOOP)
-    one = stretch(0, 1500, x_reference_um=(np.arange(5000) >= 1000).astype(float))
-    past.append(one)
-    growing.feed(one, [])
-    header, arrays = unpacked(roll.frame(past))
+    trigger = {"mode": "normal", "kind": "step", "source": "x_reference_um", "pre_percent": 0}
+    growing = Scope(validate_field("view", {"signals": ["tick"], "seconds": 2, "pixels": 50, "trigger": trigger}), LOOP)
+    ticks = make_stretch(0, 1500, x_reference_um=(np.arange(5000) >= 1000).astype(float))
+    history.append(ticks)
+    growing.feed(ticks, [])
+    header, arrays = unpacked(roll.frame(history))
     assert (header["first"], header["end"], header["cause"]) == (500, 1500, "roll")
     assert arrays["tick:low"][0] == 500 + 0
     assert arrays["tick:high"][-1] == 1499
-    header, arrays = unpacked(growing.frame(past))
+    header, arrays = unpacked(growing.frame(history))
     assert (header["complete"], header["trigger"], header["end"]) == (False, 1000, 3000)
     assert np.nanmax(arrays["tick:high"]) == 1499
-    assert growing.frame(past) is None
+    assert growing.frame(history) is None
 
 
 @pytest.mark.parametrize(
-    ("name", "value", "said"),
+    ("name", "value", "words"),
     [
         ("view", {"signals": ["no"], "seconds": 1, "pixels": 1e308}, "pixels"),
         ("view", {"signals": ["a"] * 9, "seconds": 1, "pixels": 10}, "signals"),
@@ -104,8 +106,8 @@ def test_a_roll_and_a_long_sweep_grow():
         ("__class__", 1, "known"),
     ],
 )
-def test_invalid_subscriptions_are_refused(name: str, value: Any, said: str):
-    with pytest.raises(ValueError, match=said):
+def test_invalid_subscriptions_are_refused(name: str, value: Any, words: str):
+    with pytest.raises(ValueError, match=words):
         validate_field(name, value)
 
 
@@ -118,16 +120,16 @@ def test_invalid_messages_are_refused(text: str):
 
 
 def test_signals_and_times_that_the_loop_lacks_are_refused():
-    for change, said in (
+    for change, words in (
         ({"signals": ["x_posiotn_um"]}, "not recorded; allowed"),
         ({"seconds": 61.0}, "at most 60 s"),
         ({"trigger": {"kind": "edge"}}, "source: missing"),
         ({"trigger": {"source": "y"}}, "not recorded; allowed"),
         ({"trigger": {"kind": "window", "source": "tick", "low": 2, "high": 1}}, "lower end"),
     ):
-        wish = {"signals": [], "seconds": 1.0, "pixels": 10} | change
-        with pytest.raises(ValueError, match=said):
-            Scope(validate_field("view", wish), LOOP)
+        subscription = {"signals": [], "seconds": 1.0, "pixels": 10} | change
+        with pytest.raises(ValueError, match=words):
+            Scope(validate_field("view", subscription), LOOP)
 
 
 def test_a_frame_is_aligned():
@@ -141,21 +143,21 @@ def test_a_frame_is_aligned():
 
 def test_timing_covers_the_last_minute():
     random = np.random.default_rng(3)
-    late = random.lognormal(2.0, 1.0, 90_000)
-    late[5000], late[80_000] = 9e5, 4321.0
+    lateness_us = random.lognormal(2.0, 1.0, 90_000)
+    lateness_us[5000], lateness_us[80_000] = 9e5, 4321.0
     timing = Timing(LOOP)
     for first in range(0, 90_000, 170):
         end = min(first + 170, 90_000)
-        timing.feed(stretch(first, end, lateness_us=late, exec_us=10 * late))
+        timing.feed(make_stretch(first, end, lateness_us=lateness_us, exec_us=10 * lateness_us))
     header, arrays = unpacked(timing.frame())
-    kept = late[30_000:]
+    last_minute = lateness_us[30_000:]
     assert header["window_s"] == 60
     assert header["ticks"] == arrays["counts"].sum() == 60_000
     assert header["worst_us"] == 4321.0
     for key, quantile, factor in (("p50_us", 0.5, 1), ("p99_us", 0.99, 1), ("exec_p99_us", 0.99, 10)):
-        assert header[key] == pytest.approx(factor * np.quantile(kept, quantile), rel=0.03)
+        assert header[key] == pytest.approx(factor * np.quantile(last_minute, quantile), rel=0.03)
     edges = arrays["edges_us"].astype(float)
-    assert arrays["counts"][30] == pytest.approx(np.sum((kept >= edges[30]) & (kept < edges[31])), abs=1)
+    assert arrays["counts"][30] == pytest.approx(np.sum((last_minute >= edges[30]) & (last_minute < edges[31])), abs=1)
     assert "4321 µs late" in header["advice"][0]
     assert "rtloop doctor" in header["advice"][-1]
 
@@ -163,7 +165,7 @@ def test_timing_covers_the_last_minute():
 def test_extreme_indices_contain_all_extremes():
     random = np.random.default_rng(4)
     a, b = random.normal(size=(2, 10_007))
-    places = extreme_indices([a, b], 100)
-    assert places.size <= 400
-    assert {int(np.argmin(a)), int(np.argmax(a)), int(np.argmin(b)), int(np.argmax(b))} <= set(places.tolist())
+    indices = extreme_indices([a, b], 100)
+    assert indices.size <= 400
+    assert {int(np.argmin(a)), int(np.argmax(a)), int(np.argmin(b)), int(np.argmax(b))} <= set(indices.tolist())
     assert extreme_indices([a[:50]], 100).tolist() == list(range(50))

@@ -1,4 +1,4 @@
-"""The model's loop beside the measured one; the plays are written here independently."""
+"""The model's hysteresis curve agrees with the measured one, which an independent play model makes here."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ LOOP = Description(
 )
 
 
-def plays(drive: np.ndarray) -> np.ndarray:
-    """Σ w·y, y = max(u − r, min(u + r, y)), from rest (Visintin 1994)."""
+def play_model(drive: np.ndarray) -> np.ndarray:
+    """Return the position Σ w·y, y = max(u − r, min(u + r, y)), of a drive u from rest, µm (Visintin 1994)."""
     total = np.zeros(drive.size)
     for r, w in zip(THRESHOLDS_V, WEIGHTS, strict=True):
         y = 0.0
@@ -35,35 +35,35 @@ def plays(drive: np.ndarray) -> np.ndarray:
     return total
 
 
-def shown_of(drive: np.ndarray, position: np.ndarray, reference: np.ndarray) -> Any:
-    """The last second of an axis in closed loop: the frame's header and arrays."""
-    tick, past = np.arange(drive.size), TickHistory(NAMES, 8 * RATE_HZ)
+def make_frame(drive: np.ndarray, position: np.ndarray, reference: np.ndarray) -> Any:
+    """Return header and arrays of the frame of the last second of an axis in closed loop."""
+    tick, history = np.arange(drive.size), TickHistory(NAMES, 8 * RATE_HZ)
     rows = np.column_stack([tick, tick * 1e6, drive, position, reference, 3.0 + 0 * drive]).astype(np.float64)
-    past.append(Stretch(NAMES, 0, rows))
-    frame = XyPlot(validate_field("xy", {"axis": "x", "seconds": 1.0}), LOOP).frame(past)
+    history.append(Stretch(NAMES, 0, rows))
+    frame = XyPlot(validate_field("xy", {"axis": "x", "seconds": 1.0}), LOOP).frame(history)
     assert frame is not None
     return unpacked(frame)
 
 
 def test_at_rest_there_is_noise_and_no_width_of_a_loop() -> None:
     noise = np.random.default_rng(1).normal(0.0, 0.01, (2, 2 * RATE_HZ))
-    header, _ = shown_of(3.0 + noise[0], 12.5 + noise[1], reference=np.full(2 * RATE_HZ, 12.5))
+    header, _ = make_frame(3.0 + noise[0], 12.5 + noise[1], reference=np.full(2 * RATE_HZ, 12.5))
     assert header["at_rest"]
     assert header["loop_percent"] is None
 
 
 @pytest.mark.parametrize("begins", [0.03, 0.2, 0.35, 0.5, 0.72, 0.9])
 def test_the_models_loop_knows_what_came_before_the_screen(begins: float) -> None:
-    """Wherever in a period of a fast drive the screen begins: what is shown of the model has no jump in it."""
+    """The model's curve follows the measured one wherever in a period of the drive the screen begins."""
     ticks = round(6.0 * RATE_HZ + begins * RATE_HZ)
     drive = 9.0 * np.sin(2 * np.pi * np.arange(ticks) / RATE_HZ)
-    truth = plays(drive) + 0.7
-    header, arrays = shown_of(drive, truth, reference=truth)
+    truth = play_model(drive) + 0.7
+    header, arrays = make_frame(drive, truth, reference=truth)
     assert not header["at_rest"]
     assert header["offset_um"] == pytest.approx(0.7, abs=0.05)
-    shown = extreme_indices([drive[-RATE_HZ:]], MODEL_BINS)
-    np.testing.assert_array_equal(arrays["model_drive_v"], np.float32(drive[-RATE_HZ:][shown]))
-    np.testing.assert_allclose(arrays["model_position_um"], truth[-RATE_HZ:][shown], atol=0.1)
+    indices = extreme_indices([drive[-RATE_HZ:]], MODEL_BINS)
+    np.testing.assert_array_equal(arrays["model_drive_v"], np.float32(drive[-RATE_HZ:][indices]))
+    np.testing.assert_allclose(arrays["model_position_um"], truth[-RATE_HZ:][indices], atol=0.1)
 
 
 def test_extremes_are_in_the_order_of_the_drive() -> None:

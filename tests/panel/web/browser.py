@@ -1,4 +1,4 @@
-"""A browser by hand: requests to a panel with exact headers, a session, unpacked messages."""
+"""Client of a panel that sends requests with exact headers, keeps a session, and unpacks binary messages."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from websockets.sync.client import ClientConnection, connect
 
 from tests.faults.bench import Bench
 from tests.faults.evidence import wait_for
-from tests.panel.served import Answer, exchange
+from tests.panel.route_server import Response, exchange
 
 TIMEOUT_S = 30.0
 
 
 def unpacked(message: Any) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    """Header and arrays of a binary message, by the words of its description alone."""
+    """Return header and arrays (float32) of a binary message, decoded by the description of the format alone."""
     size = struct.unpack_from("<I", message)[0]
     header = json.loads(message[4 : 4 + size])
     offset, arrays = 4 + size, {}
@@ -34,39 +34,39 @@ def unpacked(message: Any) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
 
 
 class Browser:
-    """Talks to the panel of a bench; `process` is the panel's."""
+    """Starts a panel for the service of a bench, as `process`, and sends requests to it."""
 
     def __init__(self, bench: Bench, *options: str) -> None:
         (bench.folder / "log").touch()
-        mark = len(bench.log())
+        log_length = len(bench.log())
         self.process: subprocess.Popen[str] = bench.rtloop("panel", bench.client.path, "--port", "0", *options)
-        said = wait_for(
-            lambda: re.search(r"http://127\.0\.0\.1:(\d+)/#token=(\S+)", bench.log()[mark:]), "a panel", 120
+        match = wait_for(
+            lambda: re.search(r"http://127\.0\.0\.1:(\d+)/#token=(\S+)", bench.log()[log_length:]), "a panel", 120
         )
-        self.port, self.token = int(said[1]), said[2]
+        self.port, self.token = int(match[1]), match[2]
         self.origin = f"http://127.0.0.1:{self.port}"
         self.cookie = ""
 
-    def request(self, method: str, path: str, body: Any = None, headers: dict[str, Any] | None = None) -> Answer:
-        """Send a request as a page does, with other `headers`; None leaves one out."""
+    def request(self, method: str, path: str, body: Any = None, headers: dict[str, Any] | None = None) -> Response:
+        """Send a request as a page does, with `headers` added or replaced; None leaves a header out."""
         return exchange(self.port, method, path, body, {"Origin": self.origin, "Cookie": self.cookie} | (headers or {}))
 
     def json(self, method: str, path: str, body: Any = None) -> tuple[int, Any]:
-        """Status and JSON of an answer."""
+        """Send a request as a page does; return the status and the JSON of the response, None if it is empty."""
         status, _, data = self.request(method, path, body)
         return status, json.loads(data) if data else None
 
     def log_in(self) -> Browser:
-        """Exchange the token for a session; returns this browser."""
+        """Exchange the token for a session; return this browser."""
         status, headers, _ = self.request("POST", "/session", {"token": self.token})
         assert status == 204
         self.cookie = headers["set-cookie"].split(";")[0]
         return self
 
     @contextmanager
-    def live(self, *wishes: dict[str, Any], headers: dict[str, str] | None = None) -> Iterator[ClientConnection]:
-        """The stream, with wishes."""
-        mine = {"Origin": self.origin, "Cookie": self.cookie} | (headers or {})
+    def live(self, *subscriptions: dict[str, Any], headers: dict[str, str] | None = None) -> Iterator[ClientConnection]:
+        """Yield a connection to `/live`, after these subscriptions were sent."""
+        all_headers = {"Origin": self.origin, "Cookie": self.cookie} | (headers or {})
         address = f"ws://127.0.0.1:{self.port}/live"
         limits: dict[str, Any] = {
             "compression": None,
@@ -74,15 +74,15 @@ class Browser:
             "open_timeout": TIMEOUT_S,
             "close_timeout": 1.0,
         }
-        with connect(address, additional_headers=mine, **limits) as live:
-            for wish in wishes:
-                live.send(json.dumps(wish))
+        with connect(address, additional_headers=all_headers, **limits) as live:
+            for subscription in subscriptions:
+                live.send(json.dumps(subscription))
             yield live
 
-    def first(self, live: ClientConnection, kind: str) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-        """The next message of a kind."""
+    def next_message(self, live: ClientConnection, kind: str) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+        """Read up to the next message of a kind; return its header and arrays."""
         for message in live:
             header, arrays = unpacked(message)
             if header["kind"] == kind:
                 return header, arrays
-        raise AssertionError(f"no {kind} any more")
+        raise AssertionError(f"the connection ended without a message {kind}")

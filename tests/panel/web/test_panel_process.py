@@ -1,4 +1,4 @@
-"""`rtloop run --panel`: the panel of a loop at a terminal ends with the loop and never delays it."""
+"""The panel of `rtloop run --panel` ends with the loop and never delays it; `rtloop panel` ends when it is stopped."""
 
 from __future__ import annotations
 
@@ -23,42 +23,43 @@ from tests.paper_configuration import RATE, TEXT
 ADDRESS = re.compile(r"http://127\.0\.0\.1:(\d+)/#token=\S+")
 
 
-def on_the_rig(folder: Path) -> str:
-    """The paper's loop, slower: it needs no board."""
+def rig_configuration(folder: Path) -> str:
+    """Return the paper's configuration at 2 kHz, with recordings in `folder`; it needs no board."""
     return TEXT.replace('folder = "recordings"', f'folder = "{folder}/recordings"').replace(RATE, "rate_hz = 2000\n")
 
 
-def listens(port: str) -> bool:
+def is_listening(port: str) -> bool:
+    """Return whether a process listens on this port of 127.0.0.1."""
     return f"0100007f:{int(port):04x} 00000000:0000 0a" in Path("/proc/net/tcp").read_text().lower()
 
 
 def test_a_panel_that_hangs_ends_with_the_run(tmp_path: Path):
-    bench = Bench(tmp_path, board=False, text=on_the_rig(tmp_path))
+    bench = Bench(tmp_path, board=False, text=rig_configuration(tmp_path))
     try:
         run = bench.rtloop("run", bench.config, "--panel", "--panel-port", "0")
-        said = wait_for(lambda: ADDRESS.search(bench.log()), "a panel", 120)
+        address = wait_for(lambda: ADDRESS.search(bench.log()), "a panel", 120)
         wait_for(lambda: bench.status().get("ticks"), "ticks", 120)
-        assert listens(said[1])
+        assert is_listening(address[1])
         children = Path(f"/proc/{run.pid}/task/{run.pid}/children").read_text().split()
         panel = next(pid for pid in children if b"panel" in Path(f"/proc/{pid}/cmdline").read_bytes().split(b"\0"))
         os.kill(int(panel), signal.SIGSTOP)
         run.send_signal(signal.SIGINT)
         assert run.wait(60) == 0
         wait_for(lambda: not Path(f"/proc/{panel}").exists(), "the end of the panel")
-        assert not listens(said[1])
+        assert not is_listening(address[1])
     finally:
         bench.__exit__()
-    found = account(tmp_path / "recordings", [])
-    assert (found.problems, found.lost) == ([], 0)
+    report = account(tmp_path / "recordings", [])
+    assert (report.problems, report.lost) == ([], 0)
 
 
 def test_a_run_with_a_duration_ends_with_its_panel(tmp_path: Path):
-    bench = Bench(tmp_path, board=False, text=on_the_rig(tmp_path))
+    bench = Bench(tmp_path, board=False, text=rig_configuration(tmp_path))
     try:
         run = bench.rtloop("run", bench.config, "--panel", "--panel-port", "0", "--duration", "1.5")
         assert run.wait(120) == 0
-        said = ADDRESS.search(bench.log())
-        assert said is None or not listens(said[1])
+        address = ADDRESS.search(bench.log())
+        assert address is None or not is_listening(address[1])
     finally:
         bench.__exit__()
     assert account(tmp_path / "recordings", []).executed >= 3000
@@ -74,26 +75,26 @@ def test_options_that_exclude_a_panel_are_refused(tmp_path: Path):
 
 @pytest.mark.parametrize("options", [(), ("--until-stdin-ends",)], ids=["by hand", "by its service"])
 def test_a_panel_beside_a_dead_service_says_so_to_who_starts_it(tmp_path: Path, options: tuple[str, ...]):
-    """A service that starts its own panel is not there yet, and that is nothing to speak of."""
+    """A panel that its service has started does not warn, for the service does not listen yet."""
     path = tmp_path / "lab.sock"
     with socket.socket(socket.AF_UNIX) as dead:
         dead.bind(str(path))
     command = [sys.executable, "-m", "rtloop", "panel", str(path), "--port", "0", *options]
     with subprocess.Popen(command, stdin=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=ROOT) as panel:
         assert panel.stderr is not None
-        said = ""
-        while not ADDRESS.search(said):
+        output = ""
+        while not ADDRESS.search(output):
             line = panel.stderr.readline()
-            assert line, said
-            said += line
+            assert line, output
+            output += line
         panel.terminate()
-    assert ("the service has died" in said) == (not options)
-    assert ("; the panel waits for the service" in said) == (not options)
+    assert ("the service has died" in output) == (not options)
+    assert ("; the panel waits for the service" in output) == (not options)
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
 def test_a_panel_that_is_stopped_before_it_serves_ends(tmp_path: Path, number: signal.Signals):
-    """The signal comes when the address is printed and the web server's own handlers are not there yet."""
+    """The signal comes after the address was printed and before the web server has installed its handlers."""
     program = f"""
 import asyncio, os, sys
 from pathlib import Path

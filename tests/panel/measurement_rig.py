@@ -1,4 +1,4 @@
-"""A rig for measurements from the panel: a model and a specification, and a resonance beside the model's."""
+"""Configuration for measurements from the panel: a model, a specification, and a rig with another resonance."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 from tests.service.test_response import CONFIGURATION, HELD_UM, LOOP
 
 MODEL_HZ = LOOP.hz / 1.05
-"""The model's resonance: the rig's lies 5 % above it."""
+"""Resonance of the model; the resonance of the rig lies 5 % above it."""
 _OMEGA = 2 * np.pi * MODEL_HZ
 _MODEL = f"""
 [axis.model]
@@ -29,12 +29,12 @@ settling_ms = 1.5
 points_per_tick = 2
 """
 TICKS = 100
-WANTED_UM = HELD_UM + 4.0 * np.sin(2 * np.pi * np.arange(TICKS) / TICKS)
-"""One period of a scan (n,)."""
+SCAN_UM = HELD_UM + 4.0 * np.sin(2 * np.pi * np.arange(TICKS) / TICKS)
+"""One period of a scan: the reference of each tick, (TICKS,)."""
 
 
-def configuration(folder: Path, *changes: tuple[str, str]) -> str:
-    """Return the text of the rig's configuration and write its specification to `folder`."""
+def make_configuration(folder: Path, *changes: tuple[str, str]) -> str:
+    """Write the specification to `folder`; return the text of the configuration, with the `changes` (old, new)."""
     (folder / "spec.toml").write_text(_SPECIFICATION)
     text = CONFIGURATION.replace("FOLDER", str(folder)).replace("[axis.interlocks]", _MODEL + "[axis.interlocks]")
     for old, new in (('name = "x"\n', 'name = "x"\nspecification = "spec.toml"\n'), *changes):

@@ -1,4 +1,4 @@
-"""Routes at a separate port for a test that sends requests as a stranger does."""
+"""HTTP server for some routes of the panel, and requests with exact headers, as a hostile client sends them."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ from starlette.routing import BaseRoute
 from tests.faults.evidence import wait_for
 
 TIMEOUT_S = 300.0
-"""For the longest measurement on a loaded host."""
+"""Time-out of a request: the longest measurement on a loaded host ends before."""
 
 
-class Answer(NamedTuple):
+class Response(NamedTuple):
     """Status, headers with names in lower case, and body of a response."""
 
     code: int
@@ -32,8 +32,11 @@ class Answer(NamedTuple):
         return json.loads(self.body)
 
 
-def exchange(port: int, method: str, path: str, body: Any, headers: Mapping[str, str | None]) -> Answer:
-    """Send a request with exactly these headers and its length; None leaves a header out; bodies become JSON."""
+def exchange(port: int, method: str, path: str, body: Any, headers: Mapping[str, str | None]) -> Response:
+    """Send a request with these headers and its length alone; return the response.
+
+    The header Host is added unless `headers` has it; None leaves a header out; a body that is not bytes becomes JSON.
+    """
     data = body if isinstance(body, bytes | None) else json.dumps(body).encode()
     with closing(http.client.HTTPConnection("127.0.0.1", port, timeout=TIMEOUT_S)) as connection:
         connection.putrequest(method, path, skip_host="Host" in headers, skip_accept_encoding=True)
@@ -42,22 +45,23 @@ def exchange(port: int, method: str, path: str, body: Any, headers: Mapping[str,
                 connection.putheader(name, value)
         connection.endheaders(data)
         response = connection.getresponse()
-        return Answer(response.status, {k.lower(): v for k, v in response.getheaders()}, response.read())
+        return Response(response.status, {k.lower(): v for k, v in response.getheaders()}, response.read())
 
 
-class Served:
-    """Routes that a thread serves until `close`; `port` on 127.0.0.1."""
+class RouteServer:
+    """Server of `routes` in a thread, on `port` of 127.0.0.1, until `close`; `settings` go to uvicorn."""
 
     def __init__(self, routes: Sequence[BaseRoute], **settings: Any) -> None:
-        listening = socket.create_server(("127.0.0.1", 0))
-        self.port: int = listening.getsockname()[1]
+        listener = socket.create_server(("127.0.0.1", 0))
+        self.port: int = listener.getsockname()[1]
         config = uvicorn.Config(Starlette(routes=routes), log_level="critical", lifespan="off", **settings)
         self._server = uvicorn.Server(config)
-        self._thread = threading.Thread(target=self._server.run, args=([listening],), daemon=True)
+        self._thread = threading.Thread(target=self._server.run, args=([listener],), daemon=True)
         self._thread.start()
         wait_for(lambda: self._server.started, "a server")
 
-    def ask(self, path: str, method: str = "GET", body: Any = None, **headers: str) -> Answer:
+    def request(self, path: str, method: str = "GET", body: Any = None, **headers: str) -> Response:
+        """Send a request to the server with these headers alone; return the response."""
         return exchange(self.port, method, path, body, headers)
 
     def close(self) -> None:
