@@ -34,7 +34,11 @@ class Palette:
         panel.set_ylabel(y)
         panel.set_title(title, loc="left", fontsize=10, fontweight="bold")
         if legend is not None:
-            panel.legend(loc=legend, fontsize=8, framealpha=0.85, edgecolor="none", facecolor=self.background)
+            self.add_legend(panel, legend)
+
+    def add_legend(self, panel: Any, loc: str = "best") -> None:
+        """Add a transparent legend to a panel at `loc`, matplotlib's name of the location."""
+        panel.legend(loc=loc, fontsize=8, framealpha=0.85, edgecolor="none", facecolor=self.background)
 
 
 LIGHT = Palette("#ffffff", "#1c2024", "#8a919b", "#1f6fb2", "#2b3036", "#d62728", "#2a8c2a", "#8257b5", "#c4700a")

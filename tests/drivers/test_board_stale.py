@@ -99,7 +99,7 @@ def test_a_loop_on_a_board_of_50_khz_loses_nothing_and_replays(tmp_path, capsys)
     with (tmp_path / "log").open("w") as log:
         board_process = subprocess.Popen([*rtloop_command, "hil", "serve", config], env=ENVIRONMENT, stderr=log)
         try:
-            wait_for(lambda: "board at" in (tmp_path / "log").read_text(), "a board", 120.0)
+            wait_for(lambda: "the simulated board runs" in (tmp_path / "log").read_text(), "a board", 120.0)
             wait_for(lambda: has_samples(tmp_path / "board"), "samples", 120.0)
             result = completed(*rtloop_command, "run", config, "--duration", "1", "--json")
             memory = board_memory(tmp_path / "board")

@@ -37,7 +37,7 @@ def _compare_exchange(array: Any, index: int, expected: int, new_value: int) -> 
 _ORDERED = {
     "load_acquire": _load_acquire,
     "store_release": _store_release,
-    "exchanged": _compare_exchange,
+    "compare_exchange": _compare_exchange,
     "fence_acquire": lambda: None,
     "fence_release": lambda: None,
 }

@@ -54,8 +54,8 @@ def _steps(figure: Any, traces: Mapping[str, Mapping[float, tuple[Real, Real]]],
         near.set_ylim(0.94 * TRACED_UM, 1.06 * TRACED_UM)
         ink.label(wide, "", "" if column else "x / µm", f"resonance {f'{percent:+g} %' if percent else 'as modelled'}")
         ink.label(near, "time since the step / ms", "" if column else "x / µm, enlarged")
-    ink.legend(panels[0, 1], loc="lower right")
-    ink.legend(panels[1, 1], loc="lower right")
+    ink.add_legend(panels[0, 1], loc="lower right")
+    ink.add_legend(panels[1, 1], loc="lower right")
 
 
 def _loops(figure: Any, curves: Mapping[str, Any], ink: Palette) -> None:
@@ -81,8 +81,8 @@ def _loops(figure: Any, curves: Mapping[str, Any], ink: Palette) -> None:
         ink.label(gain, "", "" if column else "|L| / dB", title)
         ink.label(phase, "", "" if column else "phase of L / °")
         ink.label(sensitivity, "frequency / Hz", "" if column else "|S|")
-        ink.legend(gain)
-        ink.legend(sensitivity, loc="lower right")
+        ink.add_legend(gain)
+        ink.add_legend(sensitivity, loc="lower right")
 
 
 def _shift(figure: Any, runs: Mapping[str, Mapping[float, Steps]], ink: Palette) -> None:
@@ -99,7 +99,7 @@ def _shift(figure: Any, runs: Mapping[str, Mapping[float, Steps]], ink: Palette)
     over.set_yscale("log")
     ink.label(settling, "shift of the resonance / %", "settling to 5 % / ms, worst of eight steps", "Settling")
     ink.label(over, "shift of the resonance / %", "overshoot of 40 µm / %", "Overshoot")
-    ink.legend(settling)
+    ink.add_legend(settling)
 
 
 def _label_ticks(axis: Any, ticks: tuple[int, ...]) -> None:
@@ -124,7 +124,7 @@ def _scans(figure: Any, errors: Mapping[str, Any], ink: Palette) -> None:
             panel.plot(errors[percent][number], marker="o", markersize=3, color=colour, label=f"resonance {percent} %")
         panel.set_yscale("log")
         ink.label(panel, "cycle of learning", "rms error / % of 40 µm" if panel is panels[0] else "", f"{hz} Hz")
-    ink.legend(panels[0])
+    ink.add_legend(panels[0])
 
 
 def _draws(figure: Any, figures: Mapping[str, Any], ink: Palette) -> None:
@@ -142,4 +142,4 @@ def _draws(figure: Any, figures: Mapping[str, Any], ink: Palette) -> None:
         panel.set_ylim(0.0, 102.0)
         ink.label(panel, label_text, "rigs that do no worse / %" if panel is panels[0] else "")
     _label_ticks(panels[0].xaxis, (3, 4, 5, 6, 8, 10))
-    ink.legend(panels[1], loc="lower right")
+    ink.add_legend(panels[1], loc="lower right")
