@@ -1,4 +1,4 @@
-"""A service with its control API, for the tests of a module."""
+"""Fixtures: a real service on a simulated board, with its control API, shared by the tests of a module."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from tests.faults.bench import Bench
 
 @pytest.fixture(scope="module")
 def bench(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
-    """One service for all tests, outputs off until it is armed; each test leaves it stopped."""
+    """Yield a service that is disarmed at first, for all tests of a module; each test leaves its state `stopped`."""
     changes = ("[recording]", "[service]\narm = true\n[recording]")
     with Bench(tmp_path_factory.mktemp("api"), changes) as bench:
         yield bench
@@ -19,7 +19,7 @@ def bench(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
 
 @pytest.fixture
 def running(bench: Bench) -> Iterator[Bench]:
-    """In closed loop."""
+    """Yield the service armed and in closed loop, and stop it afterwards."""
     bench.client.post("/arm")
     bench.client.post("/start")
     bench.await_drive()

@@ -1,4 +1,4 @@
-"""A board's memory without the board: it outlives who parks, and keeps every write in order."""
+"""Memory of a board without the board's process: a test reads it after parking, with all writes in their order."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from rtloop.hil.board import FIFO, LSB_V, BoardMemory
 
 
 class FakeBoard:
-    """Memory of a board in the file `path`, with all its outputs at `volts`."""
+    """Memory of a board in the file `path`, with `channels` outputs that start at `volts`."""
 
     def __init__(self, path: Path, volts: float, channels: int = 1) -> None:
         self.channels, self.start_v = channels, volts
@@ -27,18 +27,18 @@ class FakeBoard:
 
     @property
     def outputs_v(self) -> list[float]:
-        """Volts at the converters."""
+        """Present output voltages (V), one for each channel."""
         return (self._memory.dac_codes[: self.channels] * LSB_V).tolist()
 
     @property
     def path_v(self) -> np.ndarray:
-        """Volts of the first output, from the start through every write to the end."""
+        """Voltages (V) of the first output: the start voltage, then one for each later write."""
         count = int(self._memory.words[board.WRITTEN])
-        assert count < FIFO, "more writes than the board keeps"
+        assert count < FIFO, "more writes than the FIFO stores"
         return np.array([self.start_v, *self._memory.fifo.codes[1:count, 0] * LSB_V])
 
 
 def write_first(memory: BoardMemory, codes: list[int]) -> None:
-    """Have the outputs of a board whose memory is fresh stand at `codes`, by one write."""
+    """Set the outputs of a fresh board memory to the DAC codes `codes`, as its first write."""
     memory.fifo.codes[0, : len(codes)] = codes
     memory.words[board.WRITTEN] = 1

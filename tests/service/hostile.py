@@ -1,4 +1,4 @@
-"""Requests that no client in its right mind would send: good ones with one value exchanged for a hostile one."""
+"""Hostile control requests: valid requests with one value replaced by a huge, tiny, nested or mistyped one."""
 
 from __future__ import annotations
 
@@ -41,37 +41,39 @@ BODIES: tuple[tuple[str, dict[str, Any]], ...] = (
     ("/controller", AXIS | {"controller": {"form": "state_space", "a": [[-0.5]], "b": [1.0], "c": [60.0], "d": 0.0,
                                            "method": "zoh"}}),
 )  # fmt: skip
-"""Path and body of good requests."""
+"""Path and body of valid requests."""
 EXPENSIVE = {"/controller": {"axis": "x", "controller": {"form": "state_space", "d": 0.0, "b": [1.0] * 600,
                                                          "c": [1.0] * 600, "a": [[0.5] * 600] * 600}}}  # fmt: skip
-"""A request that fits into a body and took minutes."""
+"""Path and body of a request within the size limit whose controller of order 600 would take minutes to build."""
 
 
 def hostile(seed: int, count: int) -> Iterator[tuple[str, bytes]]:
-    """Path and body of `count` requests, the same for the same seed."""
-    chance = random.Random(seed)
+    """Yield path and JSON body of `count` hostile requests; equal seeds give equal requests."""
+    generator = random.Random(seed)
     for _ in range(count):
-        path, body = chance.choice(BODIES)
-        place = chance.choice([place for place in _places(body) if place])
-        yield path, json.dumps(_put(body, place, chance.choice(HOSTILE))).encode()
+        path, body = generator.choice(BODIES)
+        place = generator.choice([place for place in _places(body) if place])
+        yield path, json.dumps(_replace(body, place, generator.choice(HOSTILE))).encode()
 
 
 def every(values: tuple[Any, ...]) -> Iterator[tuple[str, bytes]]:
-    """Each of `values` in each place of each good body."""
+    """Yield path and JSON body of each valid request with each of `values` at each key path of the body."""
     for path, body in BODIES:
         for place in _places(body):
             for value in values if place else ():
-                yield path, json.dumps(_put(body, place, value)).encode()
+                yield path, json.dumps(_replace(body, place, value)).encode()
 
 
-def _places(node: Any, above: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
-    yield above
+def _places(node: Any, parent: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
+    """Yield the key path of `node` and of every node below it; `parent` is the key path of `node` itself."""
+    yield parent
     if isinstance(node, dict | list):
         for key in node if isinstance(node, dict) else range(len(node)):
-            yield from _places(node[key], (*above, key))
+            yield from _places(node[key], (*parent, key))
 
 
-def _put(body: Any, place: tuple[Any, ...], value: Any) -> Any:
+def _replace(body: Any, place: tuple[Any, ...], value: Any) -> Any:
+    """Return a copy of `body` with `value` at the key path `place`."""
     changed = node = copy.deepcopy(body)
     for key in place[:-1]:
         node = node[key]

@@ -1,4 +1,4 @@
-"""One HTTP exchange on a UNIX socket, with the status and the body whatever they are."""
+"""HTTP requests on a UNIX socket: status and body are returned, also of error responses."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ GOOD_CONTROLLER = {
 
 
 def exchange(path: Path, method: str, resource: str, body: bytes = b"") -> tuple[int, bytes]:
-    """Status and body; a server may answer before it has read everything, and hang up."""
+    """Return status and body of a request. A server may respond and disconnect before it has read the request."""
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as connection:
         connection.connect(str(path))
         connection.settimeout(TIMEOUT_S)
@@ -31,12 +31,12 @@ def exchange(path: Path, method: str, resource: str, body: bytes = b"") -> tuple
         with suppress(ConnectionResetError):
             while part := connection.recv(1 << 16):
                 data += part
-    status, _, rest = data.partition(b"\r\n")
-    return int(status.split()[1]), rest.partition(b"\r\n\r\n")[2]
+    status, _, remainder = data.partition(b"\r\n")
+    return int(status.split()[1]), remainder.partition(b"\r\n\r\n")[2]
 
 
 def answer(bench: Bench, method: str, resource: str, body: Any = None) -> tuple[int, Any]:
-    """Status, and the JSON object or the text of an answer."""
+    """Return the status, and the JSON object or the text of the response."""
     code, data = exchange(bench.client.path, method, resource, json.dumps(body or {}).encode())
     text = data.decode()
     return code, json.loads(text) if text.startswith("{") else text

@@ -1,4 +1,4 @@
-"""After a mishap: supervisor, parking, the recorder's keeper and the service against clocks that the test moves."""
+"""Supervisor, parking, recorder keeper and service after a process has failed, with clocks that the test moves."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ SIZES = Sizes(columns=1, axes=1, rate_hz=1000.0, snapshot_bytes=8, table_samples
 
 
 class Clock:
-    """The module `time` of whoever is told so: it moves as one sleeps."""
+    """Stand-in for the module `time`: `sleep` advances its clock at once."""
 
     def __init__(self) -> None:
         self.now_s = 1000.0
@@ -47,12 +47,13 @@ class Clock:
 
 @pytest.fixture
 def block() -> SharedBlock:
+    """Return a shared block of one axis at 1 kHz."""
     return SharedBlock.create(SIZES)
 
 
 @pytest.mark.parametrize("drive_v", [-10.0, 10.0])
 def test_a_loop_without_its_service_has_the_time_that_its_ramp_takes(block, monkeypatch, drive_v):
-    """From either end of the range: 10 V at 2 V/s after a heartbeat of 1 s; only then is it killed."""
+    """The loop is killed after the heartbeat timeout of 1 s and a ramp of 10 V at 2 V/s from either end."""
     clock, killed_s = Clock(), list[float]()
     monkeypatch.setattr(parking, "time", clock)
     monkeypatch.setattr(SharedBlock, "driver_pid", lambda _: None if killed_s else 4711)
@@ -73,32 +74,32 @@ def test_the_heart_beats_only_while_the_loop_is_watched(block, silent_s, beats):
 
 
 def test_a_loop_that_ramps_down_behind_its_last_tick_does_not_stand_still(block):
-    """Ticks behind the last recorded one are in no ring: its head stands still while the outputs are ramped."""
+    """Ticks after the last recorded tick are not in the ring: its head stands still while the outputs ramp down."""
     supervisor: Any = object.__new__(Supervisor)
-    ended: list[bool] = []
+    end_calls: list[bool] = []
     supervisor.block, supervisor._stall = block, StallWatch(0.0, 1.0)
     supervisor.prepared = SimpleNamespace(plan=SimpleNamespace(pacing=SimpleNamespace(paced=True)))
-    supervisor._loop = SimpleNamespace(end=lambda: ended.append(True))
+    supervisor._loop = SimpleNamespace(end=lambda: end_calls.append(True))
     block.store(Word.LOOP_STATE, ProcessState.RUNNING)
     block["ticks_head"][0] = 100
     block.store(Word.FINISHED_TICKS, 100)
     assert not supervisor._kill_stalled_loop()
     block.store(Word.FINISHED_TICKS, 0)
     assert supervisor._kill_stalled_loop()
-    assert ended == [True]
+    assert end_calls == [True]
 
 
 @pytest.mark.parametrize(("complete", "code"), [(True, 0), (False, LoopFault.exit_code)])
 def test_a_recording_that_is_not_whole_is_no_success(complete, code):
     supervisor: Any = object.__new__(Supervisor)
-    finished = {"report": "finished", "outcome": "done", "driver_error": None}
-    supervisor._loop = SimpleNamespace(wait=lambda _: 0, reports=lambda: [finished], exit_code=0)
+    report = {"report": "finished", "outcome": "done", "driver_error": None}
+    supervisor._loop = SimpleNamespace(wait=lambda _: 0, reports=lambda: [report], exit_code=0)
     supervisor._reports, supervisor.error, supervisor.recorder = {}, None, SimpleNamespace(notes=[])
     assert supervisor._result({"paths": [], "complete": complete}).exit_code == code
 
 
-class Recorder:
-    """A recorder's process that lives and does nothing."""
+class IdleRecorder:
+    """Process of a recorder that runs and does nothing."""
 
     def __init__(self, *_: object, **__: object) -> None:
         self.exit_code: int | None = None
@@ -107,15 +108,16 @@ class Recorder:
         return True
 
 
-def a_keeper(block: SharedBlock, folder: Path) -> RecorderKeeper:
+def make_keeper(block: SharedBlock, folder: Path) -> RecorderKeeper:
+    """Return the keeper of an idle recorder that has its orders; the recordings are in `folder`."""
     options = RecordingOptions()
-    keeper = RecorderKeeper(Recorder(), block, RequesterNames.create(), folder / "lab-1.mcap", options)  # type: ignore[arg-type]
+    keeper = RecorderKeeper(IdleRecorder(), block, RequesterNames.create(), folder / "lab-1.mcap", options)  # type: ignore[arg-type]
     keeper._has_orders = True
     return keeper
 
 
 def test_a_recorder_that_cannot_start_is_told_in_the_totals(block, tmp_path, monkeypatch):
-    keeper = a_keeper(block, tmp_path)
+    keeper = make_keeper(block, tmp_path)
 
     def refuse() -> None:
         raise OutputError(f"{tmp_path}: No space left on device", 28)
@@ -133,8 +135,8 @@ def test_a_recorder_that_cannot_start_is_told_in_the_totals(block, tmp_path, mon
     [(ProcessState.FINISHED, False), (ProcessState.RUNNING, False), (ProcessState.FAILED, True)],
 )
 def test_a_recorder_may_finish_before_it_is_seen_running(block, tmp_path, monkeypatch, state, is_refused):
-    """A stop during the start ends the loop at once, and the recorder finishes its file between two looks at it."""
-    keeper = a_keeper(block, tmp_path)
+    """A stop during the start ends the loop, and the recorder finishes its file between two polls of its state."""
+    keeper = make_keeper(block, tmp_path)
     keeper._child = SimpleNamespace(exit_code=0, wait=lambda _: 0, reports=list)  # type: ignore[assignment]
     monkeypatch.setattr(keeper, "_send_orders", lambda: block.store(Word.RECORDER_STATE, state))
     if is_refused:
@@ -146,11 +148,11 @@ def test_a_recorder_may_finish_before_it_is_seen_running(block, tmp_path, monkey
 
 @pytest.mark.parametrize(("recorded", "replaced"), [(500, 0), (499, 1)])
 def test_a_recorder_is_replaced_only_if_there_is_something_to_record(block, tmp_path, monkeypatch, recorded, replaced):
-    """Its cursor stands still for ten seconds: at the newest tick it waits, behind it it stands still."""
+    """The recorder's cursor stands still for 10 s: at the newest tick the recorder is idle, behind it stuck."""
     clock = Clock()
     monkeypatch.setattr(recorder_keeper, "time", clock)
-    monkeypatch.setattr(recorder_keeper, "Child", Recorder)
-    keeper = a_keeper(block, tmp_path)
+    monkeypatch.setattr(recorder_keeper, "Child", IdleRecorder)
+    keeper = make_keeper(block, tmp_path)
     block["ticks_head"][0] = 500
     block.store(Word.RECORDER_CURSOR, recorded)
     for _ in range(200):
@@ -167,9 +169,9 @@ def test_a_recorder_is_replaced_only_if_there_is_something_to_record(block, tmp_
     ],
 )  # fmt: skip
 def test_a_recorder_that_ended_with_its_loop_is_not_replaced(block, tmp_path, monkeypatch, loop, code, replaced):
-    """The supervisor may be late to see the end of the loop; a killed recorder is replaced all the same."""
-    monkeypatch.setattr(recorder_keeper, "Child", Recorder)
-    keeper = a_keeper(block, tmp_path)
+    """The supervisor may see the end of the loop late; a killed recorder is replaced in any case."""
+    monkeypatch.setattr(recorder_keeper, "Child", IdleRecorder)
+    keeper = make_keeper(block, tmp_path)
     block.store(Word.LOOP_STATE, loop)
     keeper._child.exit_code = code  # type: ignore[misc]
     keeper._replace_if_dead()
@@ -177,77 +179,79 @@ def test_a_recorder_that_ended_with_its_loop_is_not_replaced(block, tmp_path, mo
 
 
 def test_the_pipes_of_the_last_recorder_are_closed(block, tmp_path, monkeypatch):
-    """It may be another than that which the run began with."""
-    keeper, ended = a_keeper(block, tmp_path), list[bool]()
+    """The last recorder may be a replacement of the first one."""
+    keeper, end_calls = make_keeper(block, tmp_path), list[bool]()
     child: Any = keeper._child
     child.exit_code, child.wait, child.reports = 0, lambda _: 0, list
-    monkeypatch.setattr(child, "end", lambda: ended.append(True), raising=False)
+    monkeypatch.setattr(child, "end", lambda: end_calls.append(True), raising=False)
     keeper._finish()
-    assert ended == [True]
+    assert end_calls == [True]
 
 
 def test_another_recorder_begins_behind_the_last_file_whatever_was_removed(block, tmp_path):
-    """The quota took the files 1 to 3: a fifth after the fourth, and never one that is there."""
-    keeper = a_keeper(block, tmp_path)
+    """The quota has removed the files 1 to 3: the next number follows the highest one, even of an unfinished file."""
+    keeper = make_keeper(block, tmp_path)
     keeper.replacements = 1
     (tmp_path / "lab-1-0004.mcap").touch()
     (tmp_path / "lab-1-0005.mcap.part").touch()
     assert keeper._next_sequence() == 6
 
 
-def dying_loops(monkeypatch: pytest.MonkeyPatch, after_s: float, loops: int = 100) -> tuple[Service, list[bool]]:
-    """A service whose loops die after so many seconds, and which is ended with the last of them; what each was told
-    of `resting`."""
-    service, clock, resting = Service(DEPLOY / "paper.toml"), Clock(), list[bool]()
+def dying_loop_service(monkeypatch: pytest.MonkeyPatch, after_s: float, loops: int = 100) -> tuple[Service, list[bool]]:
+    """Return a service whose loops each die after `after_s`, and a list that gets `outputs_off` of each loop.
+
+    The service ends with loop number `loops`.
+    """
+    service, clock, outputs_off_flags = Service(DEPLOY / "paper.toml"), Clock(), list[bool]()
     options = service.configuration.service.model_copy(update={"restarts": 2, "restart_window_s": 60.0})
     service.configuration = replace(service.configuration, service=options)
     monkeypatch.setattr(service_module, "time", clock)
-    done = SimpleNamespace(join=lambda timeout_s: None, is_alive=lambda: False)
-    monkeypatch.setattr(service, "_start_thread", lambda work: done)
+    ended_thread = SimpleNamespace(join=lambda timeout_s: None, is_alive=lambda: False)
+    monkeypatch.setattr(service, "_start_thread", lambda work: ended_thread)
 
-    def episode(at_rest: bool) -> Any:
-        resting.append(at_rest)
+    def run_loop(outputs_off: bool) -> Any:
+        outputs_off_flags.append(outputs_off)
         clock.sleep(after_s)
-        if len(resting) == loops:
+        if len(outputs_off_flags) == loops:
             service.end()
         return SimpleNamespace(error="the loop's process died", outcome="killed", exit_code=70, notes=[])
 
-    monkeypatch.setattr(service, "_run_loop", episode)
-    return service, resting
+    monkeypatch.setattr(service, "_run_loop", run_loop)
+    return service, outputs_off_flags
 
 
 def test_the_loop_after_one_that_died_begins_with_its_outputs_off(monkeypatch):
-    service, resting = dying_loops(monkeypatch, after_s=1.0)
+    service, outputs_off_flags = dying_loop_service(monkeypatch, after_s=1.0)
     with pytest.raises(LoopFault, match="the loop ended too often"):
         service.run()
-    assert resting == [service.configuration.service.arm, True, True]
+    assert outputs_off_flags == [service.configuration.service.arm, True, True]
 
 
 @pytest.mark.parametrize("driving", ["a schedule", "a depolarisation", "nothing but the mode"])
 def test_nothing_drives_the_outputs_after_a_start_that_failed(monkeypatch, caplog, driving):
-    """The service is tripped, and says so; somebody may look after the wiring."""
-    service, resting = dying_loops(monkeypatch, after_s=1.0, loops=2)
+    """The service is tripped after a failed start, because an engineer may be working on the wiring."""
+    service, outputs_off_flags = dying_loop_service(monkeypatch, after_s=1.0, loops=2)
     if driving == "a schedule":
         service.configuration = replace(service.configuration, schedule=[ScheduleOptions(at_tick=5, mode="off")])
     if driving == "a depolarisation":
         options = service.configuration.service.model_copy(update={"tare_s": 0.5})
         service.configuration = replace(service.configuration, service=options)
-    episode = service._run_loop
+    run_loop = service._run_loop
 
-    def start(at_rest: bool) -> Any:
-        result = episode(at_rest)
-        if len(resting) == 1:
+    def fail_at_first_start(outputs_off: bool) -> Any:
+        result = run_loop(outputs_off)
+        if len(outputs_off_flags) == 1:
             raise UnavailableError("no board")
         return result
 
-    monkeypatch.setattr(service, "_run_loop", start)
+    monkeypatch.setattr(service, "_run_loop", fail_at_first_start)
     service.run()
-    assert (resting, service.state) == ([False, True], State.TRIPPED)
+    assert (outputs_off_flags, service.state) == ([False, True], State.TRIPPED)
     assert ("neither depolarised nor tared" in caplog.text) == (driving == "a depolarisation")
 
 
 def test_a_status_without_a_tick_says_why_it_has_no_axes(monkeypatch):
-    service, _ = dying_loops(monkeypatch, after_s=1.0)
+    service, _ = dying_loop_service(monkeypatch, after_s=1.0)
     assert "axes" not in status(service)
     assert status(service)["no_signals"] == "the loop has not executed a tick yet"
     with pytest.raises(LoopFault):
@@ -258,6 +262,6 @@ def test_a_status_without_a_tick_says_why_it_has_no_axes(monkeypatch):
 
 
 def test_deaths_that_lie_far_apart_are_not_too_many(monkeypatch):
-    service, resting = dying_loops(monkeypatch, after_s=31.0, loops=10)
+    service, outputs_off_flags = dying_loop_service(monkeypatch, after_s=31.0, loops=10)
     assert service.run() == 70
-    assert len(resting) == 10
+    assert len(outputs_off_flags) == 10

@@ -1,4 +1,4 @@
-"""Who waits for whom: requests that bring the outputs to rest wait for nobody. The service is a stand-in."""
+"""Requests that bring the outputs to rest never wait for other requests. The service is a stand-in."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from rtloop.service.desk import Refusal
 from rtloop.service.lock import Lock
 
 PATIENCE_S = 20.0
-MANY = 60
+WAITING_REQUESTS = 60
 
 
-class Stuck:
-    """A service whose ordinary work does not come back until it is let go."""
+class BlockedService:
+    """Service whose `start` and `reload_now` block until `let_go` is set; `stop` and `reset` return at once."""
 
     def __init__(self) -> None:
         self.let_go, self.lock = threading.Event(), Lock()
@@ -38,7 +38,7 @@ class Stuck:
 
 
 async def post(app: Any, path: str) -> int:
-    """The status of an answer, asked for without a socket."""
+    """Return the status of a POST request, which is sent to the application without a socket."""
     sent: list[Any] = []
 
     async def receive() -> dict[str, Any]:
@@ -55,21 +55,21 @@ async def post(app: Any, path: str) -> int:
 
 @pytest.mark.parametrize("path", ["/reload", "/start"])
 def test_stop_and_reset_wait_for_nobody(path):
-    async def crowd() -> list[int]:
-        stuck = Stuck()
-        app = application(stuck)  # type: ignore[arg-type]
-        waiting = [asyncio.create_task(post(app, path)) for _ in range(MANY)]
+    async def send_requests() -> list[int]:
+        service = BlockedService()
+        app = application(service)  # type: ignore[arg-type]
+        tasks = [asyncio.create_task(post(app, path)) for _ in range(WAITING_REQUESTS)]
         await asyncio.sleep(0)
         try:
-            said = [await asyncio.wait_for(post(app, path), PATIENCE_S) for path in ("/stop", "/reset")]
+            codes = [await asyncio.wait_for(post(app, path), PATIENCE_S) for path in ("/stop", "/reset")]
         finally:
-            stuck.let_go.set()
-        answers = await asyncio.gather(*waiting)
-        assert stuck.stopped == 2
-        assert set(answers) == {200, 503}  # more than may wait are told so at once
-        return said
+            service.let_go.set()
+        blocked_codes = await asyncio.gather(*tasks)
+        assert service.stopped == 2
+        assert set(blocked_codes) == {200, 503}  # requests beyond the limit are refused at once
+        return codes
 
-    assert asyncio.run(crowd()) == [200, 200]
+    assert asyncio.run(send_requests()) == [200, 200]
 
 
 class EndingService:

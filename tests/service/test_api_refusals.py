@@ -1,4 +1,4 @@
-"""What the control API refuses, with the right 4xx, and without any change."""
+"""The control API refuses invalid and hostile requests with the right 4xx status, and changes nothing."""
 
 from __future__ import annotations
 
@@ -43,9 +43,9 @@ from tests.service.http import GOOD_CONTROLLER, answer, exchange
 ])  # fmt: skip
 def test_what_is_outside_the_envelope_changes_nothing(bench: Bench, path: str, body: dict[str, Any]):
     commands = bench.blocks[-1].load(Word.COMMANDS_HEAD)
-    code, said = answer(bench, "POST", path, body)
-    assert code == 422, said
-    assert said["error"][0].isalnum(), said  # it begins with a key
+    code, response = answer(bench, "POST", path, body)
+    assert code == 422, response
+    assert response["error"][0].isalnum(), response  # the message begins with a key
     assert bench.blocks[-1].load(Word.COMMANDS_HEAD) == commands
 
 
@@ -53,24 +53,24 @@ def test_what_is_outside_the_envelope_changes_nothing(bench: Bench, path: str, b
     "data", [b"", b"{", b"[]", b"null", b"\xff\xfe", b'{"mode": NaN}', b"[" * 100_000, b'{"mode":']
 )
 def test_malformed_json(bench: Bench, data: bytes):
-    code, said = exchange(bench.client.path, "POST", "/mode", data)
+    code, response = exchange(bench.client.path, "POST", "/mode", data)
     assert code == 422
-    assert json.loads(said)["error"]
+    assert json.loads(response)["error"]
 
 
-@pytest.mark.parametrize("make", ["fifo", "zero", "shadow", "link", "above"])
-def test_a_table_is_a_file_below_the_configuration(bench: Bench, make: str):
-    """Whoever may use the API may not read what the service may read."""
+@pytest.mark.parametrize("kind", ["fifo", "zero", "shadow", "link", "above"])
+def test_a_table_is_a_file_below_the_configuration(bench: Bench, kind: str):
+    """A client of the API must not read files outside the configuration's folder with the rights of the service."""
     folder = bench.config.parent
-    name = {"zero": "/dev/zero", "shadow": "/etc/passwd", "above": f"../{folder.name}/wave.csv"}.get(make, make)
+    name = {"zero": "/dev/zero", "shadow": "/etc/passwd", "above": f"../{folder.name}/wave.csv"}.get(kind, kind)
     (folder / "wave.csv").write_text("1.0\n")
-    if make == "fifo":
+    if kind == "fifo":
         os.mkfifo(folder / "fifo")
-    if make == "link":
+    if kind == "link":
         (folder / "link").symlink_to("/etc/passwd")
-    code, said = answer(bench, "POST", "/reference", {"axis": "x", "reference": {"kind": "table", "file": name}})
+    code, response = answer(bench, "POST", "/reference", {"axis": "x", "reference": {"kind": "table", "file": name}})
     assert code == 422
-    assert "root" not in said["error"].replace(str(folder), "")
+    assert "root" not in response["error"].replace(str(folder), "")
 
 
 def test_a_table_below_the_configuration_plays(bench: Bench):
@@ -80,8 +80,8 @@ def test_a_table_below_the_configuration_plays(bench: Bench):
     body = {"axis": "x", "reference": {"kind": "table", "file": "waves/wave.csv", "hold_ticks": 3}}
     assert answer(bench, "POST", "/reference", body)[0] == 200
     (folder / "wave.csv").write_text("root of all\n")
-    code, said = answer(bench, "POST", "/reference", body)
-    assert (code, "root" in said["error"]) == (422, False)
+    code, response = answer(bench, "POST", "/reference", body)
+    assert (code, "root" in response["error"]) == (422, False)
     assert answer(bench, "POST", "/setpoint", {"axis": "x", "value": 0.0})[0] == 200
 
 
@@ -89,13 +89,13 @@ def test_unknown_too_large_and_wrong_method(bench: Bench):
     assert answer(bench, "GET", "/nowhere")[0] == 404
     assert answer(bench, "GET", "/mode")[0] == 405
     assert answer(bench, "DELETE", "/status")[0] == 405
-    code, said = exchange(bench.client.path, "POST", "/waveform", b" " * (5 << 20))
+    code, response = exchange(bench.client.path, "POST", "/waveform", b" " * (5 << 20))
     assert code == 413
-    assert "bytes" in json.loads(said)["error"]
+    assert "bytes" in json.loads(response)["error"]
     samples = [0.0] * 600_000
-    code, said = answer(bench, "POST", "/waveform", {"axis": "x", "samples": samples})
+    code, response = answer(bench, "POST", "/waveform", {"axis": "x", "samples": samples})
     assert code == 422
-    assert "at most" in said["error"]
+    assert "at most" in response["error"]
 
 
 @pytest.mark.parametrize(("path", "body"), [
@@ -108,28 +108,28 @@ def test_unknown_too_large_and_wrong_method(bench: Bench):
     ("/controller", EXPENSIVE["/controller"]),
 ])  # fmt: skip
 def test_numbers_that_nothing_can_be_made_of(bench: Bench, path: str, body: dict[str, Any]):
-    code, said = answer(bench, "POST", path, body)
-    assert code == 422, said
-    assert 0 < len(said["error"]) < 2000
+    code, response = answer(bench, "POST", path, body)
+    assert code == 422, response
+    assert 0 < len(response["error"]) < 2000
 
 
 def test_hostile_requests_are_refused_and_change_nothing(bench: Bench):
     refused = 0
     for path, body in hostile(seed=1, count=120):
         commands = bench.blocks[-1].load(Word.COMMANDS_HEAD)
-        code, said = exchange(bench.client.path, "POST", path, body)
-        assert code in (200, 413, 422), (path, body[:300], said)
+        code, response = exchange(bench.client.path, "POST", path, body)
+        assert code in (200, 413, 422), (path, body[:300], response)
         if code != 200:
             refused += 1
-            assert len(json.loads(said)["error"]) < 2000
+            assert len(json.loads(response)["error"]) < 2000
             assert bench.blocks[-1].load(Word.COMMANDS_HEAD) == commands
     assert refused > 80
     assert "Traceback" not in bench.log()
-    bench.client.post("/reload")  # back to the file, whatever was taken
+    bench.client.post("/reload")  # load the file again: some of the requests were accepted
 
 
 def test_more_silent_clients_than_there_are_connections(bench: Bench):
-    """None of them says anything, or all of what it has to say: whoever does speak is heard."""
+    """No silent client sends a complete request, and half of them send nothing; the service answers another client."""
     with contextlib.ExitStack() as stack:
         for number in range(3 * MAX_CONNECTIONS):
             client = stack.enter_context(socket.socket(socket.AF_UNIX, socket.SOCK_STREAM))
@@ -138,7 +138,7 @@ def test_more_silent_clients_than_there_are_connections(bench: Bench):
                 with contextlib.suppress(BrokenPipeError, ConnectionResetError):
                     client.send(b"POST /mode HTTP/1.1\r\nContent-Length: 100\r\n\r\n{")
         open_files = len(os.listdir(f"/proc/{bench.pid('service')}/fd"))
-        assert open_files < MAX_CONNECTIONS + 3 * BACKLOG  # one lot is just taken, another just closed
+        assert open_files < MAX_CONNECTIONS + 3 * BACKLOG  # one backlog is being accepted, another being closed
         assert bench.client.get("/status")["state"] == "stopped"
         bench.client.post("/stop")
 

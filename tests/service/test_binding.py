@@ -1,4 +1,4 @@
-"""The control socket's place: what stands there already is not lost."""
+"""Binding of the control socket replaces neither a file nor a link nor the socket of a running service."""
 
 from __future__ import annotations
 
@@ -46,6 +46,6 @@ def test_the_name_of_a_service_is_no_pattern(tmp_path: Path, monkeypatch: pytest
         _bind(tmp_path / f"{name}.sock", 0o660).close()
     monkeypatch.setattr("rtloop.supervision.paths.client_folders", lambda: [tmp_path])
     for name in ("lab[b]", "labb"):
-        said = CliRunner().invoke(main, ["ctl", "--name", name, "status"])
-        assert said.exit_code == 69
-        assert f"{tmp_path}/{name}.sock: no service answers at this socket" in said.stderr
+        result = CliRunner().invoke(main, ["ctl", "--name", name, "status"])
+        assert result.exit_code == 69
+        assert f"{tmp_path}/{name}.sock: no service answers at this socket" in result.stderr

@@ -1,4 +1,4 @@
-"""The desk and the staging beside a shared block whose words the test moves: neither is a tick early."""
+"""The desk and the staging on a shared block whose words the test moves: neither confirms a change a tick early."""
 
 from __future__ import annotations
 
@@ -19,15 +19,16 @@ from rtloop.signals import MODE, Mode
 
 @pytest.fixture
 def block() -> SharedBlock:
+    """Return a shared block of 20 columns and one axis at 1 kHz."""
     return SharedBlock.create(Sizes(columns=20, axes=1, rate_hz=1000.0, snapshot_bytes=64, table_samples=0))
 
 
 def test_the_desk_answers_when_the_record_of_the_tick_is_there(block, monkeypatch):
-    """The event comes before its tick: the head of the ring stands at that tick until the tick was executed."""
+    """The loop publishes the event of a tick before the tick's record: until then the ring's head stays at that tick."""
     now_s = [0.0]
 
     def sleep(seconds: float) -> None:
-        """The loop meanwhile: it publishes the event of tick 7, and then one record after the other."""
+        """Act as the loop: publish the event of tick 7 at the first call, and one record at each later call."""
         now_s[0] += seconds
         events = block.ring("events")
         if int(events.head[0]) == 0:
@@ -45,7 +46,7 @@ def test_the_desk_answers_when_the_record_of_the_tick_is_there(block, monkeypatc
 
 
 def test_a_change_that_was_taken_is_settled_two_ticks_later(block):
-    """Taken with records up to tick 4 there: tick 5 may be the one that reads what is staged, and tick 6 follows it."""
+    """The loop takes the command after the record of tick 4: tick 5 may read the staged change; tick 6 follows."""
 
     class DeafDesk:
         def submit(self, *_: Any, **__: Any) -> int:
@@ -63,7 +64,7 @@ def test_a_change_that_was_taken_is_settled_two_ticks_later(block):
     block["ticks_head"][0] = 7
     staging.require_settled()
     block["ticks_head"][0] = 5
-    staging.require_settled()  # once settled, it is forgotten
+    staging.require_settled()  # a settled change is settled for good
 
 
 @pytest.mark.parametrize(
@@ -84,7 +85,7 @@ def test_a_refusal_names_the_reason_for_which_the_loop_refuses_this_kind(kind: K
 def test_raw_mode_is_that_of_the_newest_tick(block, mode: Mode):
     staging, ticks = Staging(block, SimpleNamespace()), block.ring("ticks")  # type: ignore[arg-type]
     assert not staging.in_raw_mode
-    for tick, told in enumerate((Mode.OFF, mode)):
-        ticks.slots[claim(ticks, np.uint64(tick)), MODE] = told
+    for tick, recorded_mode in enumerate((Mode.OFF, mode)):
+        ticks.slots[claim(ticks, np.uint64(tick)), MODE] = recorded_mode
         publish(ticks, np.uint64(tick))
     assert staging.in_raw_mode == (mode == Mode.RAW)

@@ -1,4 +1,4 @@
-"""Differences of an axis in words, as the events of a panel tell them."""
+"""Texts of the differences between two versions of an axis, as the panel shows them."""
 
 from __future__ import annotations
 
@@ -33,6 +33,6 @@ AXIS: dict[str, Any] = {
 def test_a_difference_is_its_key_before_and_after(changes: dict, text: str) -> None:
     before = AxisOptions.model_validate(AXIS)
     after = AxisOptions.model_validate(AXIS | changes)
-    found = differences(before, after)
-    assert found.startswith(text.format(position_um=before.interlocks.position_um))
-    assert found.endswith(", and 1 more") == (len(changes.get("interlocks", ())) == 4)
+    description = differences(before, after)
+    assert description.startswith(text.format(position_um=before.interlocks.position_um))
+    assert description.endswith(", and 1 more") == (len(changes.get("interlocks", ())) == 4)

@@ -1,4 +1,4 @@
-"""The faults that matter most, on real processes; all of them are in `make faults`."""
+"""The two most important faults, injected into real processes; `make faults` runs all faults."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Which service `rtloop ctl` talks to, and what it says where that is none, or not the only one."""
+"""`rtloop ctl` finds the control socket of a service, and reports no match or several matches."""
 
 from __future__ import annotations
 
@@ -26,18 +26,18 @@ CASES = [
 ]
 
 
-@pytest.mark.parametrize(("there", "options", "said"), CASES)
-def test_what_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, there: list[str], options: list[str], said: str):
-    for name in there:
+@pytest.mark.parametrize(("names", "options", "text"), CASES)
+def test_what_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, names: list[str], options: list[str], text: str):
+    for name in names:
         (tmp_path / f"{name}.sock").touch()
     monkeypatch.setattr("rtloop.supervision.paths.client_folders", lambda: [tmp_path])
-    done = CliRunner().invoke(main, ["ctl", *options, "status"])
-    assert done.exit_code == 69
-    assert done.stderr == f"rtloop: {said.format(folder=tmp_path)}\n"
+    result = CliRunner().invoke(main, ["ctl", *options, "status"])
+    assert result.exit_code == 69
+    assert result.stderr == f"rtloop: {text.format(folder=tmp_path)}\n"
 
 
-class Silent:
-    """A service that grants every request without more words."""
+class EmptyResponses:
+    """Client whose requests all succeed with an empty response."""
 
     def post(self, *_: object) -> dict[str, str]:
         return {}
@@ -52,7 +52,7 @@ class Silent:
 def test_a_response_without_content_is_a_sentence_on_a_terminal(
     command: str, sentence: str, is_terminal: bool, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
-    monkeypatch.setattr("rtloop.cli.ctl.make_client", lambda _: Silent())
+    monkeypatch.setattr("rtloop.cli.ctl.make_client", lambda _: EmptyResponses())
     monkeypatch.setattr("sys.stdout.isatty", lambda: is_terminal)
     with pytest.raises(SystemExit, match="0"):
         main(["ctl", command])

@@ -1,4 +1,4 @@
-"""Clients that nobody here wrote read the description and the metrics of a running service, and find no fault."""
+"""Third-party clients (schemathesis, promtool) find no fault in the description and metrics of a running service."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ from tests.service.http import exchange
 
 CONFIGURATION = Path(__file__).with_name("schemathesis.toml")
 CASES = 5
-"""Random cases of an operation, beside those at the bounds of its schema."""
+"""Random cases of each operation, in addition to those at the bounds of its schema."""
 CHUNK_BYTES = 1 << 16
 
 
 @pytest.fixture
 def address(running: Bench) -> Iterator[str]:
-    """Address of the control API on a TCP port of this machine, for clients that know no UNIX sockets."""
+    """Yield the address of the control API on a local TCP port, for clients that cannot use UNIX sockets."""
     with socket.create_server(("127.0.0.1", 0)) as listening:
         threading.Thread(target=_accept, args=(listening, running.client.path), daemon=True).start()
         yield f"http://127.0.0.1:{listening.getsockname()[1]}"
@@ -39,7 +39,7 @@ def _accept(listening: socket.socket, path: Path) -> None:
     with suppress(OSError):
         while True:
             client, _ = listening.accept()
-            client.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)  # else each short body waits for 40 ms
+            client.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)  # without it each short body waits for 40 ms
             threading.Thread(target=_connect, args=(client, path), daemon=True).start()
 
 
@@ -54,7 +54,7 @@ def _connect(client: socket.socket, path: Path) -> None:
 
 
 def _forward(source: socket.socket, target: socket.socket) -> None:
-    """Forward all bytes from `source` to `target`, then its end."""
+    """Forward all bytes from `source` to `target`, then the end of the stream."""
     with suppress(OSError):
         while data := source.recv(CHUNK_BYTES):
             target.sendall(data)
@@ -65,11 +65,11 @@ def _forward(source: socket.socket, target: socket.socket) -> None:
 def test_schemathesis_finds_no_fault_of_the_description(address: str, tmp_path: Path) -> None:
     command = [sys.executable, "-m", "schemathesis.cli", "--config-file", str(CONFIGURATION), "run"]
     options = ["--phases", "coverage,fuzzing", "-n", str(CASES), "--seed", "1", "--no-color"]
-    done = subprocess.run(
+    result = subprocess.run(
         [*command, f"{address}/openapi.json", *options], cwd=tmp_path, capture_output=True, text=True, check=False
     )
-    assert done.returncode == 0, done.stdout[-4000:] + done.stderr[-2000:]
-    tested = re.search(r"Tested: (\d+)", done.stdout)
+    assert result.returncode == 0, result.stdout[-4000:] + result.stderr[-2000:]
+    tested = re.search(r"Tested: (\d+)", result.stdout)
     assert tested is not None
     assert int(tested[1]) == len(REQUESTS)
 
@@ -78,5 +78,5 @@ def test_schemathesis_finds_no_fault_of_the_description(address: str, tmp_path: 
 def test_promtool_finds_no_fault_of_the_metrics(running: Bench) -> None:
     code, text = exchange(running.client.path, "GET", "/metrics")
     assert code == 200
-    done = subprocess.run(["promtool", "check", "metrics"], input=text, capture_output=True, check=False)
-    assert (done.returncode, done.stdout, done.stderr) == (0, b"", b"")
+    result = subprocess.run(["promtool", "check", "metrics"], input=text, capture_output=True, check=False)
+    assert (result.returncode, result.stdout, result.stderr) == (0, b"", b"")
