@@ -24,7 +24,7 @@ def block() -> SharedBlock:
 
 
 def test_the_desk_answers_when_the_record_of_the_tick_is_there(block, monkeypatch):
-    """The loop publishes the event of a tick before the tick's record: until then the ring's head stays at that tick."""
+    """The loop publishes the event of a tick before the tick's record; until then the ring's head stays there."""
     now_s = [0.0]
 
     def sleep(seconds: float) -> None:

@@ -1,4 +1,4 @@
-"""The service knows the reference that the loop holds, and a player returns to it; the loop runs in this process."""
+"""The service knows the reference that the loop holds, and a player returns to it. The loop runs in this process."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ UNCONFIRMED = UnconfirmedCommand("set_reference: the loop has taken the command 
 
 
 class LoopDesk:
-    """Desk of a loop in this process. It raises the `failures` one by one; the loop takes an unconfirmed command."""
+    """Desk of a loop in this process. Each command raises the next of `failures`; an unconfirmed one is executed."""
 
     def __init__(self, bench: LoopBench) -> None:
         self._bench, self.failures = bench, list[Exception]()
@@ -57,7 +57,7 @@ class LoopDesk:
 
 
 class Bench:
-    """A loop in this process, its desk, and the references as the service knows them."""
+    """A loop in this process, its desk, and the service's view of its references."""
 
     def __init__(self, configuration: str = ONE_AXIS) -> None:
         prepared = prepare_text(configuration)
@@ -71,12 +71,13 @@ class Bench:
         self.desk.submit(Kind.SET_MODE, values=[float(mode), 0.0, float(holds_output)])
 
     def setpoint_of_loop(self, number: int = 0) -> float | None:
-        """The constant reference in µm in the loop's memory; None for another one."""
+        """Return the constant reference (µm) in the loop's memory; None for another kind or in V."""
         generator = self.loop.assembly.generators[number]
         is_setpoint = generator["kind"] == Generator.HOLD and not generator["volts"]
         return float(generator["parameters"][0]) if is_setpoint else None
 
     def player(self) -> Player:
+        """Return a player of axis 0 for the activity `response`."""
         supervisor: Any = SimpleNamespace(ticks=int(self.loop.block.ring("ticks").head[0]), block=self.loop.block)
         supervisor.newest = lambda count: Supervisor.newest(supervisor, count)
         live: Any = SimpleNamespace(prepared=self.prepared, references=self.references)
@@ -85,6 +86,7 @@ class Bench:
 
 @pytest.fixture
 def bench(monkeypatch: pytest.MonkeyPatch) -> Bench:
+    """Return a bench of one axis, on which a player needs no time of rest."""
     monkeypatch.setattr(player_module, "REST_S", 0.0)
     return Bench()
 
@@ -119,7 +121,7 @@ def test_a_scheduled_setpoint_is_the_held_one() -> None:
 
 @pytest.mark.parametrize("seed", range(4))
 def test_the_service_knows_the_references_of_the_loop_after_any_commands(seed: int) -> None:
-    """Modes, references, trips and resets at random on two axes, with the loop's own memory as the truth."""
+    """The commands are random modes, references, trips and resets on two axes; the loop's memory is the oracle."""
     bench, random, setpoints = Bench(TWO_AXES), np.random.default_rng(seed), 0
     limits_v = bench.loop.law.coefficients["sensor_max_v"]
     for _ in range(150):
@@ -164,7 +166,7 @@ def test_after_lost_events_the_reference_is_unknown_until_mode_and_setpoint_are_
 def test_a_setpoint_that_is_set_just_now_is_read_from_a_record_that_has_it(
     bench: Bench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The event is there before the record of its tick; a loop that stands still then gives no answer."""
+    """The event is published before the record of its tick; if the loop then stands still, the reference is refused."""
     newest, now_s = Staging.newest_record, [0.0]
     stale = bench.references._staging.newest_record
     bench.references.set("x", {"kind": "hold", "value": 9.0})
@@ -213,7 +215,7 @@ def test_a_player_leaves_the_reference_of_another_client_as_it_is(bench: Bench, 
 
 
 def test_a_reference_that_is_being_set_is_waited_for(bench: Bench) -> None:
-    """It is refused in the end, and the player has owned the reference all the time."""
+    """The new reference is refused in the end, so the player has owned the axis all the time."""
     player, is_sending, may_fail = bench.player(), threading.Event(), threading.Event()
     bench.desk.before_submit, bench.desk.failures = lambda: (is_sending.set(), may_fail.wait()), [WITHDRAWN]
     refusals, answers = list[Exception](), list[bool]()
@@ -237,16 +239,16 @@ def test_a_reference_that_is_being_set_is_waited_for(bench: Bench) -> None:
 
 
 def test_samples_that_the_loop_may_play_are_not_overwritten(bench: Bench) -> None:
-    """An unconfirmed waveform plays in the end: the next one goes to the other place."""
+    """An unconfirmed waveform plays after all: the next waveform is written to the other place of the table."""
     bench.desk.failures = [UNCONFIRMED]
     with pytest.raises(UnconfirmedCommand):
         bench.references.set_waveform("x", np.full((10, 1), 6.0), 1, True)
     bench.loop.run(10)
     first = int(bench.loop.assembly.generators[0]["parameters"][0])
-    seen_um: list[list[float]] = []
-    bench.desk.before_submit = lambda: seen_um.append(bench.loop.block["table"][first : first + 10].tolist())
+    samples_um: list[list[float]] = []
+    bench.desk.before_submit = lambda: samples_um.append(bench.loop.block["table"][first : first + 10].tolist())
     bench.references.set_waveform("x", np.full((10, 1), 2.0), 1, True)
-    assert seen_um == [[6.0] * 10]
+    assert samples_um == [[6.0] * 10]
 
 
 @pytest.mark.parametrize("mode", [Mode.FEEDFORWARD, Mode.RAW, Mode.OFF])

@@ -1,4 +1,4 @@
-"""Nobody waits for a log: a full pipe costs lines, and neither a tick nor a parking."""
+"""The journal never waits for its reader: a full pipe costs lines of the log, and delays neither ticks nor parking."""
 
 from __future__ import annotations
 
@@ -17,35 +17,37 @@ from tests.full_pipe import fill
 
 @pytest.fixture
 def pipe():
-    """Reading and writing end of a pipe that is full."""
-    reading, writing = os.pipe()
-    yield reading, writing, fill(writing)
-    os.close(reading)
+    """Yield the read end and the write end of a full pipe, and the number of bytes in it."""
+    read_end, write_end = os.pipe()
+    yield read_end, write_end, fill(write_end)
+    os.close(read_end)
 
 
-def record(text: str) -> logging.LogRecord:
+def make_record(text: str) -> logging.LogRecord:
+    """Return a log record with the message `text`."""
     return logging.LogRecord("test", logging.INFO, __file__, 1, text, None, None)
 
 
-def read(reading: int, size: int) -> bytes:
+def read_bytes(read_end: int, size: int) -> bytes:
+    """Read exactly `size` bytes from the descriptor `read_end`."""
     data = b""
     while len(data) < size:
-        data += os.read(reading, size - len(data))
+        data += os.read(read_end, size - len(data))
     return data
 
 
 def test_a_full_pipe_holds_nobody_up_and_what_was_lost_is_counted(pipe):
-    reading, writing, size = pipe
-    journal = Journal(writing, lines=3)
+    read_end, write_end, size = pipe
+    journal = Journal(write_end, lines=3)
     for number in range(10):
-        journal.handle(record(f"line {number}"))  # the test would stand still here
-    assert read(reading, size) == b"x" * size
+        journal.handle(make_record(f"line {number}"))  # a journal that waits would stop the test here
+    assert read_bytes(read_end, size) == b"x" * size
     journal.flush()
-    found = os.read(reading, 4096).decode()
-    written = [int(number) for number in re.findall(r"^line (\d)$", found, re.MULTILINE)]
+    output = os.read(read_end, 4096).decode()
+    written = [int(number) for number in re.findall(r"^line (\d)$", output, re.MULTILINE)]
     lost = [
         int(lines)
-        for lines in re.findall(r"^\((\d+) lines of the log are lost here, since stderr", found, re.MULTILINE)
+        for lines in re.findall(r"^\((\d+) lines of the log are lost here, since stderr", output, re.MULTILINE)
     ]
     assert written == sorted(set(written))
     assert lost
@@ -53,21 +55,21 @@ def test_a_full_pipe_holds_nobody_up_and_what_was_lost_is_counted(pipe):
 
 
 def test_a_reader_that_has_gone_is_no_error():
-    reading, writing = os.pipe()
-    os.close(reading)
-    journal = Journal(writing)
-    journal.emit(record("anybody there?"))
+    read_end, write_end = os.pipe()
+    os.close(read_end)
+    journal = Journal(write_end)
+    journal.emit(make_record("anybody there?"))
     journal.flush()
 
 
 def test_what_was_said_last_is_written_before_the_end():
-    reading, writing = os.pipe()
-    journal = Journal(writing)
+    read_end, write_end = os.pipe()
+    journal = Journal(write_end)
     for number in range(100):
-        journal.emit(record(f"line {number}"))
+        journal.emit(make_record(f"line {number}"))
     journal.flush()
-    assert len(os.read(reading, 1 << 16).splitlines()) == 100
-    os.close(reading)
+    assert len(os.read(read_end, 1 << 16).splitlines()) == 100
+    os.close(read_end)
 
 
 def test_the_log_tells_a_death_once_and_an_end(tmp_path: Path):
@@ -86,7 +88,7 @@ def test_the_log_tells_a_death_once_and_an_end(tmp_path: Path):
 
 
 def test_the_log_tells_a_stop_and_an_end_in_their_order(tmp_path: Path):
-    """The end ramps as the stop does, but no state that it passes reads as if the service stayed armed."""
+    """The end of the service ramps down like a stop, but logs no state that suggests an armed service."""
     with Bench(tmp_path) as bench:
         bench.await_drive()
         bench.client.post("/stop")
@@ -95,6 +97,6 @@ def test_the_log_tells_a_stop_and_an_end_in_their_order(tmp_path: Path):
         bench.await_drive()
         assert bench.stop() == 0
         lines = [line[24:] for line in bench.log().splitlines() if re.match(r"\d{4}-\d\d-\d\d ", line)]
-    told = [line for line in lines if line not in ("operator takes the lock", "ramping")]  # A ramp may be too short.
-    assert told[-5:] == ["running", "armed", "running", "stopping: the outputs ramp to safe", "stopped"]
-    assert lines[-2:] == told[-2:]
+    states = [line for line in lines if line not in ("operator takes the lock", "ramping")]  # A short ramp is absent.
+    assert states[-5:] == ["running", "armed", "running", "stopping: the outputs ramp to safe", "stopped"]
+    assert lines[-2:] == states[-2:]

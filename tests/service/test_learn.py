@@ -1,4 +1,4 @@
-"""A running service learns a scan: the error falls, what is learned goes on, what cannot be learned is refused."""
+"""A running service learns a scan: the error falls, the result can be played, and an invalid request is refused."""
 
 from __future__ import annotations
 
@@ -27,18 +27,19 @@ form = "factors"
 gain = {OMEGA**2!r}
 denominator = [[1.0, {2 * LOOP.damping * OMEGA!r}, {OMEGA**2!r}]]
 """
-"""It says nothing of a delay: what the rig's driver has is in the loop all the same."""
+"""Model of the plant without a delay; the loop's promise includes the delay of the rig's driver."""
 TICKS = 100
-WANTED_UM = HELD_UM + 4.0 * np.sin(2 * np.pi * np.arange(TICKS) / TICKS)
+SCAN_UM = HELD_UM + 4.0 * np.sin(2 * np.pi * np.arange(TICKS) / TICKS)
 LONG_CYCLES = 50
 JUDGED_TICKS = 5000
-"""After so many ticks of learning a first table has been judged, and others are being tried."""
-BACK_S = 10.0
-ASKED = {"axis": "x", "samples": WANTED_UM.tolist(), "cycles": 3}
+"""Ticks of learning after which the first table has been evaluated, and further tables are tried."""
+RETURN_S = 10.0
+REQUEST = {"axis": "x", "samples": SCAN_UM.tolist(), "cycles": 3}
 
 
 @pytest.fixture(scope="module")
 def running(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
+    """Yield a running service whose axis has a model."""
     folder = tmp_path_factory.mktemp("learn")
     text = CONFIGURATION.replace("[axis.interlocks]", MODEL + "[axis.interlocks]")
     with Bench(folder, board=False, text=text.replace("FOLDER", str(folder))) as bench:
@@ -46,30 +47,31 @@ def running(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
         yield bench
 
 
-def held(bench: Bench) -> None:
+def hold_setpoint(bench: Bench) -> None:
+    """Set the reference to the constant HELD_UM."""
     bench.client.post("/setpoint", {"axis": "x", "value": HELD_UM})
 
 
 def test_a_scan_is_learned_and_goes_on(running: Bench, tmp_path: Path):
-    held(running)
-    (tmp_path / "wanted.csv").write_text("\n".join(map(repr, WANTED_UM.tolist())))
-    arguments = ["ctl", "--socket", str(running.client.path), "learn", "x", str(tmp_path / "wanted.csv")]
-    ran = CliRunner().invoke(main, [*arguments, "--cycles", "3", "--out", str(tmp_path / "learned.csv"), "--json"])
-    assert ran.exit_code == 0, ran.output
-    found = json.loads(ran.stdout)
-    errors = [cycle["rms_um"] for cycle in found["cycles"]]
+    hold_setpoint(running)
+    (tmp_path / "scan.csv").write_text("\n".join(map(repr, SCAN_UM.tolist())))
+    arguments = ["ctl", "--socket", str(running.client.path), "learn", "x", str(tmp_path / "scan.csv")]
+    result = CliRunner().invoke(main, [*arguments, "--cycles", "3", "--out", str(tmp_path / "learned.csv"), "--json"])
+    assert result.exit_code == 0, result.output
+    report = json.loads(result.stdout)
+    errors = [cycle["rms_um"] for cycle in report["cycles"]]
     assert errors[0] > 0.5
     assert min(errors) < errors[0] / 20
     learned = np.loadtxt(tmp_path / "learned.csv", delimiter=",")
-    np.testing.assert_array_equal(learned.T, [found["reference_um"], found["command_um"]])
-    held(running)
-    again = CliRunner().invoke(main, [*arguments[:3], "waveform", "x", str(tmp_path / "learned.csv"), "--repeat"])
-    assert again.exit_code == 0, again.output
-    held(running)
+    np.testing.assert_array_equal(learned.T, [report["reference_um"], report["command_um"]])
+    hold_setpoint(running)
+    replay = CliRunner().invoke(main, [*arguments[:3], "waveform", "x", str(tmp_path / "learned.csv"), "--repeat"])
+    assert replay.exit_code == 0, replay.output
+    hold_setpoint(running)
 
 
 @pytest.mark.parametrize(
-    ("change", "said"),
+    ("change", "message"),
     [
         ({"cycles": 0}, "cycles"),
         ({"samples": [1.0, 2.0]}, "samples: "),
@@ -78,43 +80,44 @@ def test_a_scan_is_learned_and_goes_on(running: Bench, tmp_path: Path):
         ({"axis": "z"}, "axis 'z': unknown; allowed: x"),
     ],
 )
-def test_what_cannot_be_learned_is_refused_with_the_reason(running: Bench, change: dict[str, object], said: str):
-    held(running)
-    code, told = answer(running, "POST", "/learn", ASKED | change)
+def test_what_cannot_be_learned_is_refused_with_the_reason(running: Bench, change: dict[str, object], message: str):
+    hold_setpoint(running)
+    code, response = answer(running, "POST", "/learn", REQUEST | change)
     assert code == 422
-    assert said in json.dumps(told, ensure_ascii=False)
+    assert message in json.dumps(response, ensure_ascii=False)
     assert running.client.get("/status")["axes"]["x"]["reference_um"] == pytest.approx(HELD_UM)
 
 
 def test_the_rigs_delay_is_in_the_loop_that_is_promised(running: Bench):
-    held(running)
-    found = running.client.post("/response", QUICK, 60.0)
-    true = margins_of(LOOP.open, found["from_hz"], found["to_hz"])
-    promised = found["model"]["margins"]
+    hold_setpoint(running)
+    measurement = running.client.post("/response", QUICK, 60.0)
+    true = margins_of(LOOP.open, measurement["from_hz"], measurement["to_hz"])
+    promised = measurement["model"]["margins"]
     assert promised["gain_margin"] == pytest.approx(true["gain_margin"], rel=1e-3)
     assert promised["phase_margin_deg"] == pytest.approx(true["phase_margin_deg"], abs=0.05)
 
 
 def reference_um(bench: Bench) -> float:
+    """Return the present reference (µm) of axis x."""
     return bench.client.get("/status")["axes"]["x"]["reference_um"]
 
 
-def holds_as_before(bench: Bench) -> None:
-    """What was held comes back within BACK_S, as a hold about which the next measurement may begin, and stays."""
-    wait_for(lambda: reference_um(bench) == HELD_UM, "the held reference", BACK_S)
-    seen, end = set[float](), bench.ticks + 4 * TICKS
+def assert_reference_returns(bench: Bench) -> None:
+    """Check that the reference returns to HELD_UM within RETURN_S and stays, and that the measurement has ended."""
+    wait_for(lambda: reference_um(bench) == HELD_UM, "the held reference", RETURN_S)
+    references_um, end = set[float](), bench.ticks + 4 * TICKS
     while bench.ticks < end:
-        seen.add(reference_um(bench))
-    assert seen == {HELD_UM}
-    refused = ASKED | {"samples": [5.0] * 100_000, "cycles": 50}
-    wait_for(lambda: answer(bench, "POST", "/learn", refused)[0] == 422, "an end of the measurement", BACK_S)
+        references_um.add(reference_um(bench))
+    assert references_um == {HELD_UM}
+    too_long = REQUEST | {"samples": [5.0] * 100_000, "cycles": 50}
+    wait_for(lambda: answer(bench, "POST", "/learn", too_long)[0] == 422, "the end of the measurement", RETURN_S)
 
 
 def kill_client(bench: Bench, tmp_path: Path, number: int) -> str:
-    """Have a real client learn, and end it by a signal while tables are tried; what it said on stderr."""
-    (tmp_path / "wanted.csv").write_text("\n".join(map(repr, WANTED_UM.tolist())))
-    words = ["ctl", "--socket", bench.client.path, "learn", "x", tmp_path / "wanted.csv", "--cycles", str(LONG_CYCLES)]
-    command = [sys.executable, "-m", "rtloop", *map(str, words)]
+    """Start a client process that learns, send it signal `number` while tables are tried, and return its stderr."""
+    (tmp_path / "scan.csv").write_text("\n".join(map(repr, SCAN_UM.tolist())))
+    options = ["ctl", "--socket", bench.client.path, "learn", "x", tmp_path / "scan.csv", "--cycles", str(LONG_CYCLES)]
+    command = [sys.executable, "-m", "rtloop", *map(str, options)]
     with subprocess.Popen(command, env=bench.environment, stderr=subprocess.PIPE, text=True) as client:
         try:
             await_tables(bench)
@@ -125,8 +128,8 @@ def kill_client(bench: Bench, tmp_path: Path, number: int) -> str:
 
 
 def cut_connection(bench: Bench) -> None:
-    """Ask as a client does, and close the socket while tables are tried."""
-    body = json.dumps(ASKED | {"cycles": LONG_CYCLES}).encode()
+    """Send a learn request on a socket, and close the socket while tables are tried."""
+    body = json.dumps(REQUEST | {"cycles": LONG_CYCLES}).encode()
     with socket.socket(socket.AF_UNIX) as connection:
         connection.connect(str(bench.client.path))
         head = f"POST /learn HTTP/1.1\r\nHost: localhost\r\nContent-Length: {len(body)}\r\n\r\n"
@@ -135,6 +138,7 @@ def cut_connection(bench: Bench) -> None:
 
 
 def await_tables(bench: Bench) -> None:
+    """Wait until a table is played, and then until JUDGED_TICKS ticks have passed."""
     wait_for(lambda: reference_um(bench) != HELD_UM, "a table that is played")
     tick = bench.ticks
     wait_for(lambda: bench.ticks > tick + JUDGED_TICKS, "tables that were judged")
@@ -150,6 +154,6 @@ ENDINGS: dict[str, Callable[[Bench, Path], object]] = {
 
 @pytest.mark.parametrize("ending", ENDINGS)
 def test_learning_ends_with_its_client_and_the_held_reference_comes_back(running: Bench, tmp_path: Path, ending: str):
-    held(running)
+    hold_setpoint(running)
     ENDINGS[ending](running, tmp_path)
-    holds_as_before(running)
+    assert_reference_returns(running)

@@ -1,4 +1,4 @@
-"""Unfinished recordings of others: completed as soon as nobody writes them any more."""
+"""A service completes an unfinished recording of another one as soon as no process writes to the file."""
 
 from __future__ import annotations
 
@@ -15,33 +15,33 @@ from tests.paper_configuration import TEXT
 from tests.recording.hand_made_loop import make_rows, write_recording
 
 CUT_OFF_BYTES = 2_000
-"""Of the end of a file, with its index."""
+"""Bytes at the end of a recording that are cut off; the index is among them."""
 
 
 def test_a_part_that_grew_at_the_start_is_completed_at_the_end(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """A recorder outlives its service, and dies while the next one runs."""
+    """A recorder outlives its service, and dies while the next service runs."""
     config = tmp_path / "lab.toml"
     folder = tmp_path / "recordings"
     folder.mkdir()
     config.write_text(TEXT.replace('folder = "recordings"', f'folder = "{folder}"'))
-    whole = write_recording(tmp_path / "whole.mcap", make_rows(5_000))
+    complete_file = write_recording(tmp_path / "whole.mcap", make_rows(5_000))
     part = folder / "lab-1.mcap.part"
-    part.write_bytes(whole.read_bytes()[:-CUT_OFF_BYTES])
+    part.write_bytes(complete_file.read_bytes()[:-CUT_OFF_BYTES])
     recorder = part.open("rb")
     fcntl.flock(recorder, fcntl.LOCK_EX)
     service = Service(config)
-    aside, threads = service._start_thread, list[threading.Thread]()
-    looked_at: list[bool] = []
+    start_thread, threads = service._start_thread, list[threading.Thread]()
+    was_completed: list[bool] = []
 
-    def episode(_: bool) -> Any:
+    def run_loop(_: bool) -> Any:
         threads[0].join()
-        looked_at.append((folder / "lab-1.mcap").exists())
+        was_completed.append((folder / "lab-1.mcap").exists())
         recorder.close()
         service.end()
         return SimpleNamespace(exit_code=0, error=None)
 
-    monkeypatch.setattr(service, "_start_thread", lambda work: threads.append(aside(work)) or threads[-1])
-    monkeypatch.setattr(service, "_run_loop", episode)
+    monkeypatch.setattr(service, "_start_thread", lambda work: threads.append(start_thread(work)) or threads[-1])
+    monkeypatch.setattr(service, "_run_loop", run_loop)
     assert service.run() == 0
-    assert looked_at == [False]
+    assert was_completed == [False]
     assert (folder / "lab-1.mcap").exists()

@@ -1,4 +1,4 @@
-"""One drives, many watch: who may command, until when, and under which name it is recorded."""
+"""The lock of a service: one client drives, every client may read and stop, and the recording has the client's name."""
 
 from __future__ import annotations
 
@@ -26,22 +26,22 @@ from tests.service.http import answer, exchange
 KEY = "brass-otter-seven"
 DIGEST = hashlib.sha256(KEY.encode()).hexdigest()
 TUNE = {"axis": "x", "section": "limits", "values": {"bump_s": 0.02}}
-DRIVES = "ada has held the lock since "
-ASKED: dict[str, Any] = {
+ADA_HOLDS_LOCK = "ada has held the lock since "
+REQUESTS: dict[str, Any] = {
     "/arm": {}, "/start": {}, "/reset": {}, "/reload": {}, "/mode": {"mode": "raw"}, "/tune": TUNE,
     "/setpoint": {"axis": "x", "value": 1.0}, "/reference": {"axis": "x", "reference": {"kind": "hold", "value": 1.0}},
     "/waveform": {"axis": "x", "samples": [1.0]}, "/response": {"axis": "x"},
     "/learn": {"axis": "x", "samples": [0.0] * 4}, "/controller": {"axis": "x", "controller": {}},
 }  # fmt: skip
-HOSTILE = ["", " ada", "ada ", "a\nb", "\x1b[2Jada", "a\0b", "\u202eada", "[red]", "<b>", "a/b", "é" * 41, "can",
-           "LOOP", "recorder", "Operator", "42", "-rf", "\ufffd"]  # fmt: skip
+INVALID_NAMES = ["", " ada", "ada ", "a\nb", "\x1b[2Jada", "a\0b", "\u202eada", "[red]", "<b>", "a/b", "é" * 41,
+                 "can", "LOOP", "recorder", "Operator", "42", "-rf", "\ufffd"]  # fmt: skip
 
-NAMES = ["ada", "Ada Lovelace", "李小龍", "Zoë Ångström", "x.y-z_1", "a@b+c", "O'Neill"]
+VALID_NAMES = ["ada", "Ada Lovelace", "李小龍", "Zoë Ångström", "x.y-z_1", "a@b+c", "O'Neill"]
 
 
 @pytest.fixture(scope="module")
 def bench(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
-    """Armed on command, with an emergency key."""
+    """Yield a service on a board, armed on command, with an emergency key."""
     section = f'[service]\narm = true\nemergency_key_sha256 = "{DIGEST}"\n[recording]'
     with Bench(tmp_path_factory.mktemp("lock"), ("[recording]", section)) as bench:
         yield bench
@@ -49,7 +49,7 @@ def bench(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
 
 @pytest.fixture
 def ada(bench: Bench) -> Iterator[Client]:
-    """Drives, in closed loop."""
+    """Yield a client that holds the lock and drives in closed loop; stop the loop and release the lock afterwards."""
     client = Client(bench.client.path, "ada")
     client.post("/arm")
     client.post("/setpoint", {"axis": "x", "value": 20.0})
@@ -64,38 +64,39 @@ def ada(bench: Bench) -> Iterator[Client]:
 
 @pytest.fixture
 def bob(bench: Bench) -> Client:
+    """Return a second client."""
     return Client(bench.client.path, "bob")
 
 
-def who(bench: Bench, kind: str, tick: int) -> str:
-    """Who asked for what took effect at `tick`, by the recording."""
+def requester(bench: Bench, kind: str, tick: int) -> str:
+    """Return the name of the client whose command took effect at `tick`, as soon as the recording has its event."""
 
-    return each_who(bench, kind, [tick])[0]
+    return requesters(bench, kind, [tick])[0]
 
 
-def each_who(bench: Bench, kind: str, ticks: list[int]) -> list[str]:
-    """Who asked for what took effect at each of `ticks`, by the recording, which is read as a whole."""
+def requesters(bench: Bench, kind: str, ticks: list[int]) -> list[str]:
+    """Return the name of the client for each of `ticks`, as soon as the recording has all their events."""
 
-    def found() -> list[str]:
+    def read_names() -> list[str]:
         events = [event for part in (bench.folder / "recordings").glob("*.part") for event in rtloop.load(part).events]
         names = {event["tick"]: event["who"] for event in reversed(events) if event["kind"] == kind}
         return [names[tick] for tick in ticks] if names.keys() >= set(ticks) else []
 
-    return wait_for(found, f"{kind} at {ticks} in the file")
+    return wait_for(read_names, f"{kind} at {ticks} in the file")
 
 
 def test_the_second_is_refused_with_who_drives_and_both_may_stop(bench: Bench, ada: Client, bob: Client):
-    held = bench.status()["lock"]
-    assert held["name"] == "ada"
-    assert 0 < held["until_unix_s"] - held["since_unix_s"] < 120
+    lock = bench.status()["lock"]
+    assert lock["name"] == "ada"
+    assert 0 < lock["until_unix_s"] - lock["since_unix_s"] < 120
     ada.post("/setpoint", {"axis": "x", "value": 7.0})
-    for path, body in ASKED.items():
-        for asking in ("?as=bob", ""):
-            code, said = answer(bench, "POST", f"{path}{asking}", body)
-            assert (code, said["error"][: len(DRIVES)]) == (409, DRIVES), path
+    for path, body in REQUESTS.items():
+        for query in ("?as=bob", ""):
+            code, response = answer(bench, "POST", f"{path}{query}", body)
+            assert (code, response["error"][: len(ADA_HOLDS_LOCK)]) == (409, ADA_HOLDS_LOCK), path
     with unix_connect(str(bench.client.path), "ws://localhost/setpoints?as=bob") as stream:
         stream.send(json.dumps({"axis": "x", "value": 1.0}))
-        assert json.loads(stream.recv())["error"].startswith(DRIVES)
+        assert json.loads(stream.recv())["error"].startswith(ADA_HOLDS_LOCK)
     assert next(iter(bob.watch()))["lock"]["name"] == "ada"
     assert "rtloop_state" in bob.get("/metrics")
     assert (bench.status()["axes"]["x"]["reference_um"], bench.status()["mode"]) == (7.0, "closed_loop")
@@ -103,34 +104,34 @@ def test_the_second_is_refused_with_who_drives_and_both_may_stop(bench: Bench, a
     assert bench.status()["lock"]["name"] == "ada"
     bench.await_state("stopped")
     ada.post("/arm")
-    started, again = ada.post("/start")["tick"], bob.post("/mode", {"mode": "off"})["tick"]
-    last = ada.post("/stop")["tick"]
-    assert [who(bench, "set_mode", tick) for tick in (stopped, started, again, last)] == ["bob", "ada", "bob", "ada"]
+    started, off = ada.post("/start")["tick"], bob.post("/mode", {"mode": "off"})["tick"]
+    end = ada.post("/stop")["tick"]
+    assert [requester(bench, "set_mode", tick) for tick in (stopped, started, off, end)] == ["bob", "ada", "bob", "ada"]
 
 
 def test_what_was_changed_is_recorded_under_the_name(bench: Bench, ada: Client):
-    changed, loaded = ada.post("/setpoint", ASKED["/setpoint"])["tick"], ada.post("/tune", TUNE)["tick"]
-    assert (who(bench, "set_reference", changed), who(bench, "load_law", loaded)) == ("ada", "ada")
+    changed, loaded = ada.post("/setpoint", REQUESTS["/setpoint"])["tick"], ada.post("/tune", TUNE)["tick"]
+    assert (requester(bench, "set_reference", changed), requester(bench, "load_law", loaded)) == ("ada", "ada")
     ada.delete("/lock")
-    nobody = bench.client.post("/setpoint", ASKED["/setpoint"])["tick"]
-    assert who(bench, "set_reference", nobody) == "operator"
+    unnamed = bench.client.post("/setpoint", REQUESTS["/setpoint"])["tick"]
+    assert requester(bench, "set_reference", unnamed) == "operator"
     assert bench.status()["lock"]["name"] == "operator"
-    bench.client.post("/setpoint", ASKED["/setpoint"])  # all who give no name are one
+    bench.client.post("/setpoint", REQUESTS["/setpoint"])  # clients without a name count as one
     with pytest.raises(RtloopError, match=r"^operator \(a client without a name\) has held the lock since "):
-        ada.post("/setpoint", ASKED["/setpoint"])
+        ada.post("/setpoint", REQUESTS["/setpoint"])
 
 
 def test_only_the_emergency_key_breaks_it(bench: Bench, ada: Client, bob: Client):
     for key in ("", "brass-otter-six", DIGEST, "ä\0"):
         with pytest.raises(RtloopError, match=r"^the given emergency key is wrong; "):
             bob.lock(key)
-    for refused in (bob.lock, lambda: bob.delete("/lock")):
-        with pytest.raises(RtloopError, match=f"^{DRIVES}.*; `rtloop ctl stop` works without the lock$"):
-            refused()
+    for request in (bob.lock, lambda: bob.delete("/lock")):
+        with pytest.raises(RtloopError, match=f"^{ADA_HOLDS_LOCK}.*; `rtloop ctl stop` works without the lock$"):
+            request()
     assert bench.status()["lock"]["name"] == "ada"
     assert bob.lock(KEY)["name"] == "bob"
     with pytest.raises(RtloopError, match=r"^bob has held the lock since "):
-        ada.post("/setpoint", ASKED["/setpoint"])
+        ada.post("/setpoint", REQUESTS["/setpoint"])
     assert bob.delete("/lock") == {}
     assert bench.status()["lock"] is None
     assert (KEY in bench.log(), "bob takes the lock from ada" in bench.log()) == (False, True)
@@ -139,50 +140,50 @@ def test_only_the_emergency_key_breaks_it(bench: Bench, ada: Client, bob: Client
 
 def test_what_is_no_name_is_refused_but_stops(bench: Bench):
     stopped: dict[str, int] = {}
-    for name in HOSTILE:
+    for name in INVALID_NAMES:
         before = bench.status()["lock"]
         query = f"?as={quote(name, safe='')}"
         for path in ("/arm", "/lock"):
-            code, said = answer(bench, "POST", f"{path}{query}")
-            refused = (code, said["error"][:4], said["error"].replace("…", "").isascii())
+            code, response = answer(bench, "POST", f"{path}{query}")
+            refused = (code, response["error"][:4], response["error"].replace("…", "").isascii())
             assert refused == (422, "as: ", True), name
         assert bench.status()["lock"] == before, name
         stopped[name] = answer(bench, "POST", f"/stop{query}")[1]["tick"]
-    told = dict(zip(HOSTILE, each_who(bench, "set_mode", [*stopped.values()]), strict=True))
-    assert told == dict.fromkeys(HOSTILE, "operator")
+    requesters_by_name = dict(zip(INVALID_NAMES, requesters(bench, "set_mode", [*stopped.values()]), strict=True))
+    assert requesters_by_name == dict.fromkeys(INVALID_NAMES, "operator")
 
 
 @pytest.mark.parametrize("query", ["as=%ff", "as=a&as=b", "as=%", "as=" + 60_000 * "a"])
 def test_a_query_that_is_none(bench: Bench, query: str):
-    code, said = exchange(bench.client.path, "POST", f"/arm?{query}")
+    code, response = exchange(bench.client.path, "POST", f"/arm?{query}")
     assert code == 422
-    assert len(said) < 300
+    assert len(response) < 300
     assert bench.status()["state"] == "stopped"
 
 
 def test_names_of_people(bench: Bench):
     stopped: dict[str, int] = {}
-    for name in NAMES:
+    for name in VALID_NAMES:
         with rtloop.connect(bench.client.path, as_=name) as loop:
             stopped[name] = loop.stop()
             loop.arm()
             assert loop.status["lock"]["name"] == name
             loop.stop()
         assert bench.status()["lock"] is None, name
-    assert each_who(bench, "set_mode", [*stopped.values()]) == NAMES
+    assert requesters(bench, "set_mode", [*stopped.values()]) == VALID_NAMES
 
 
 def test_ctl_drives_under_a_name(bench: Bench, ada: Client):
     def ctl(*arguments: str, typed: str | None = None) -> Any:
-        done = CliRunner().invoke(main, ["ctl", "--socket", str(bench.client.path), "--as", *arguments], input=typed)
-        return done.exit_code, done.output
+        result = CliRunner().invoke(main, ["ctl", "--socket", str(bench.client.path), "--as", *arguments], input=typed)
+        return result.exit_code, result.output
 
-    code, said = ctl("bob", "setpoint", "x", "3")
-    assert (code, said[:28]) == (1, f"rtloop: {DRIVES}"[:28])
+    code, output = ctl("bob", "setpoint", "x", "3")
+    assert (code, output[:28]) == (1, f"rtloop: {ADA_HOLDS_LOCK}"[:28])
     assert ctl("bob", "lock")[0] == ctl("bob", "release")[0] == ctl("bob", "lock", "--break", typed="no\n")[0] == 1
     assert ctl("bob", "lock", "--break", typed=f"{KEY}\n")[0] == 0
-    code, said = ctl("bob", "setpoint", "x", "3")
-    assert who(bench, "set_reference", json.loads(said)["tick"]) == "bob"
+    code, output = ctl("bob", "setpoint", "x", "3")
+    assert requester(bench, "set_reference", json.loads(output)["tick"]) == "bob"
     assert json.loads(ctl("eve", "status")[1])["lock"]["name"] == "bob"
     assert ctl("bob", "release") == (0, "{}\n")
     assert ctl("a\x1bb", "arm") == (1, "rtloop: as: 'a\\x1bb'; allowed: 1 to 40 letters, digits, blanks and .-_@+', a "
@@ -191,26 +192,27 @@ def test_ctl_drives_under_a_name(bench: Bench, ada: Client):
 
 def test_connect(bench: Bench, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr("rtloop.supervision.paths.client_folders", lambda: [bench.client.path.parent])
-    with rtloop.connect("lab", as_="ada") as loop, rtloop.connect(str(bench.client.path), as_="bob") as other:
+    with rtloop.connect("lab", as_="ada") as loop, rtloop.connect(str(bench.client.path), as_="bob") as bob:
         loop.arm()
         loop.setpoint("x", 20.0)
-        started = loop.start()
+        start_tick = loop.start()
         bench.await_drive()
-        assert loop.setpoint("x", 12.5) > started
+        assert loop.setpoint("x", 12.5) > start_tick
         assert loop.status["axes"]["x"]["reference_um"] == 12.5
-        moved = loop.reference("x", kind="sine", amplitude=2.0, frequency_hz=3.0)
-        tuned = loop.tune("x", "controller", gain=0.012)
-        assert [who(bench, *one) for one in (("set_reference", moved), ("load_law", tuned))] == ["ada", "ada"]
-        for refused in (other.start, other.reset, other.take, other.release, lambda: other.setpoint("x", 1.0)):
-            with pytest.raises(RtloopError, match=f"^{DRIVES}"):
-                refused()
-        for bad, words in ((99.0, "a magnitude of 99 µm"), (float("nan"), "value: "), ("5", "value: ")):
-            with pytest.raises(RtloopError, match=words):
-                loop.setpoint("x", bad)  # type: ignore[arg-type]
+        reference_tick = loop.reference("x", kind="sine", amplitude=2.0, frequency_hz=3.0)
+        tune_tick = loop.tune("x", "controller", gain=0.012)
+        events = (("set_reference", reference_tick), ("load_law", tune_tick))
+        assert [requester(bench, *event) for event in events] == ["ada", "ada"]
+        for request in (bob.start, bob.reset, bob.take, bob.release, lambda: bob.setpoint("x", 1.0)):
+            with pytest.raises(RtloopError, match=f"^{ADA_HOLDS_LOCK}"):
+                request()
+        for value, message in ((99.0, "a magnitude of 99 µm"), (float("nan"), "value: "), ("5", "value: ")):
+            with pytest.raises(RtloopError, match=message):
+                loop.setpoint("x", value)  # type: ignore[arg-type]
         with pytest.raises(RtloopError, match="there is no trip"):
             loop.reset()
-        other.stop()
-        assert other.take(emergency_key=KEY)["name"] == "bob"
+        bob.stop()
+        assert bob.take(emergency_key=KEY)["name"] == "bob"
     assert rtloop.connect().status["lock"] is None
     bench.await_state("stopped")
 
@@ -227,16 +229,16 @@ def test_a_recorder_in_the_place_of_a_dead_one_knows_the_names(bench: Bench):
     os.kill(dead, signal.SIGKILL)
     wait_for(lambda: bench.pid("recorder") != dead, "another recorder")
     with rtloop.connect(bench.client.path, as_="ada") as loop:
-        assert who(bench, "set_reference", loop.setpoint("x", 2.0)) == "ada"
+        assert requester(bench, "set_reference", loop.setpoint("x", 2.0)) == "ada"
 
 
 def test_the_recording_shows_and_replays_it(bench: Bench):
-    """Last in this file: the service ends."""
+    """End the shared service. This test must be the last of the file."""
     bench.client.post("/stop")
     assert bench.stop() == 0
     pattern = str(bench.folder / "recordings" / "lab*.mcap")
-    shown = CliRunner().invoke(main, ["info", pattern, "--json"])
-    assert {"ada", "bob", "operator"} <= set(json.loads(shown.output)["commands"])
-    done = CliRunner().invoke(main, ["replay", pattern, "--json"])
-    assert (done.exit_code, json.loads(done.output)["identical"]) == (0, True)
+    info = CliRunner().invoke(main, ["info", pattern, "--json"])
+    assert {"ada", "bob", "operator"} <= set(json.loads(info.output)["commands"])
+    result = CliRunner().invoke(main, ["replay", pattern, "--json"])
+    assert (result.exit_code, json.loads(result.output)["identical"]) == (0, True)
     assert "Traceback" not in bench.log()

@@ -1,4 +1,4 @@
-"""The lock against a clock that the test moves: silence, work that goes on, and a key that comes meanwhile."""
+"""The lock with a clock that the test moves: idle time, long work, and an emergency key during the work."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ DIGEST = hashlib.sha256(b"a key").hexdigest()
 
 
 class Clock:
-    """Seconds, moved by hand."""
+    """Clock (s) that the test moves."""
 
     def __init__(self) -> None:
         self.now_s = 1000.0
@@ -35,7 +35,7 @@ class Clock:
 
 
 class Bench:
-    """The API without a loop: `arm` works for `work_s`, and does `meanwhile`."""
+    """The API of a service without a loop: `arm` takes `work_s` and then calls `meanwhile`."""
 
     def __init__(self) -> None:
         self.clock = Clock()
@@ -51,9 +51,9 @@ class Bench:
         self.clock.now_s += self.work_s
         self.meanwhile()
 
-    def ask(self, who: str, path: str = "/arm", method: str = "POST") -> tuple[int, str]:
-        """Status, and what is said against it."""
-        scope = {"type": "http", "method": method, "path": path, "query_string": f"as={who}".encode(), "headers": []}
+    def request(self, name: str, path: str = "/arm", method: str = "POST") -> tuple[int, str]:
+        """Send a request as the client `name`; return the status and the error message, or an empty text."""
+        scope = {"type": "http", "method": method, "path": path, "query_string": f"as={name}".encode(), "headers": []}
         sent: list[dict[str, Any]] = []
 
         async def receive() -> dict[str, Any]:
@@ -68,40 +68,40 @@ class Bench:
 
 def test_after_a_minute_of_silence_another_drives():
     bench = Bench()
-    assert bench.ask("ada")[0] == 200
+    assert bench.request("ada")[0] == 200
     bench.clock.now_s += 59.0
-    code, said = bench.ask("bob")
-    assert (code, "becomes free after 1 s without a command" in said) == (409, True)
-    assert bench.ask("ada") == (200, "")  # no silence: the minute begins anew
+    code, error = bench.request("bob")
+    assert (code, "becomes free after 1 s without a command" in error) == (409, True)
+    assert bench.request("ada") == (200, "")  # a command restarts the minute
     bench.clock.now_s += 59.9
-    assert [bench.ask("bob", path)[0] for path in ("/arm", "/lock", "/stop")] == [409, 409, 200]
+    assert [bench.request("bob", path)[0] for path in ("/arm", "/lock", "/stop")] == [409, 409, 200]
     bench.clock.now_s += 0.1
     assert bench.lock.holder is None
-    assert bench.ask("bob")[0] == 200
-    assert bench.ask("ada")[1].startswith("bob has held the lock since ")
+    assert bench.request("bob")[0] == 200
+    assert bench.request("ada")[1].startswith("bob has held the lock since ")
 
 
 def test_stop_and_what_reads_takes_no_lock():
     bench = Bench()
-    assert [bench.ask("bob", "/stop")[0], bench.ask("bob", "/openapi.json", "GET")[0]] == [200, 200]
+    assert [bench.request("bob", "/stop")[0], bench.request("bob", "/openapi.json", "GET")[0]] == [200, 200]
     assert bench.lock.holder is None
-    assert bench.ask("ada", "/lock")[0] == 200
+    assert bench.request("ada", "/lock")[0] == 200
     bench.clock.now_s += 30.0
-    bench.ask("bob", "/stop")
+    bench.request("bob", "/stop")
     bench.clock.now_s += 30.0
-    assert bench.ask("bob")[0] == 200
+    assert bench.request("bob")[0] == 200
 
 
 def test_work_that_goes_on_is_no_silence():
     bench = Bench()
     answers: list[tuple[int, str]] = []
-    bench.work_s, bench.meanwhile = 300.0, lambda: answers.append(bench.ask("bob", "/lock"))
-    assert bench.ask("ada")[0] == 200
+    bench.work_s, bench.meanwhile = 300.0, lambda: answers.append(bench.request("bob", "/lock"))
+    assert bench.request("ada")[0] == 200
     assert answers[0][0] == 409
     bench.clock.now_s += 59.0
-    assert bench.ask("bob", "/lock")[0] == 409
+    assert bench.request("bob", "/lock")[0] == 409
     bench.clock.now_s += 1.0
-    assert bench.ask("bob", "/lock")[0] == 200
+    assert bench.request("bob", "/lock")[0] == 200
 
 
 def test_nothing_that_was_asked_for_before_the_key_came_takes_effect_after_it():
@@ -137,7 +137,7 @@ def test_names_are_found_by_the_recorder_until_others_take_their_place():
     names.store(17, "ada")
     names.store(18, "é李" * 20)
     assert [recorder.requester(identity) for identity in (0, 16, 17, 18)] == [None, None, "ada", "é李" * 20]
-    names.store(17 + 4096, "bob")  # as many as the ring of events holds
+    names.store(17 + 4096, "bob")  # after as many names as the ring of events holds
     assert [recorder.requester(identity) for identity in (17, 17 + 4096)] == [None, "bob"]
     names.close()
 
@@ -146,7 +146,7 @@ def test_an_event_by_a_name_is_the_command_of_an_operator():
     command = message(Kind.SET_MODE, tick=5, values=[3.0])
     event = event_from_message(command[0], ["x"], 0, name="ada")
     assert (event["who"], event_from_message(command[0], ["x"], 0)["who"]) == ("ada", OPERATOR)
-    again = message_from_event(event, ["x"])
-    assert again is not None
-    assert again.tobytes() == command.tobytes()
+    decoded = message_from_event(event, ["x"])
+    assert decoded is not None
+    assert decoded.tobytes() == command.tobytes()
     assert [name_problem(origin.name.lower()) is None for origin in Origin] == [o is Origin.OPERATOR for o in Origin]

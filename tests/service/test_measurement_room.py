@@ -1,4 +1,4 @@
-"""The motion of a measurement stays within position interlock and sensor's range, to both sides of the setpoint."""
+"""The motion of a measurement stays within position interlock and sensor range, on both sides of the setpoint."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Another user of the machine comes first: to the folder in /tmp, socket, block, board, compiled code."""
+"""A folder, socket, block, board or compiled code that another user has made first is not trusted."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 
-import rtloop.drivers.sim  # noqa: F401  (compiled where it is imported: not as a user who has no place for it)
+import rtloop.drivers.sim  # noqa: F401  (compiles at import: an unprivileged user has no folder for the cache)
 from rtloop.client import Client
 from rtloop.configuration.file import load
 from rtloop.drivers.base import Wiring
@@ -33,22 +33,24 @@ FORGED_V = 9.9
 
 
 @pytest.fixture
-def place() -> Iterator[Path]:
-    """The victim's folder in /tmp, not there yet."""
+def user_folder() -> Iterator[Path]:
+    """Yield the path of the victim's runtime folder in /tmp, which does not exist yet."""
     with clean_places() as folder:
         yield folder
 
 
 @pytest.fixture
-def config(place: Path) -> Iterator[Path]:
-    """The paper's configuration where everybody may read it."""
+def config(user_folder: Path) -> Iterator[Path]:
+    """Yield the path of a copy of the paper's configuration that every user may read."""
     path = Path(f"/tmp/rtloop-test-{os.getpid()}.toml")
     path.write_text(PAPER.read_text())
     yield path
     path.unlink()
 
 
-def bound(config: Path) -> Callable[[], Any]:
+def socket_binder(config: Path) -> Callable[[], Any]:
+    """Return a function that binds the control socket; it returns the path, and the modes of socket and folder."""
+
     def bind() -> tuple[str, int, int]:
         path = socket_path(load(config))
         with contextlib.closing(_bind(path, 0o660)):
@@ -57,7 +59,9 @@ def bound(config: Path) -> Callable[[], Any]:
     return bind
 
 
-def blocked(config: Path) -> Callable[[], Any]:
+def block_maker(config: Path) -> Callable[[], Any]:
+    """Return a function that creates the file of the shared block and returns its mode."""
+
     def make() -> int:
         path = block_path(config.stem)
         os.close(create_file(path))
@@ -66,57 +70,59 @@ def blocked(config: Path) -> Callable[[], Any]:
     return make
 
 
-def refused(uid: int, function: Callable[[], Any], place: Path | str) -> str:
-    """The message with which it is refused, at the exit code of what the host does not allow."""
+def refusal(uid: int, function: Callable[[], Any], path: Path | str) -> str:
+    """Return the message with which `function` fails as user `uid`; it names `path`, and its exit code is 69 or 77."""
     with pytest.raises(Raised) as caught:
         as_user(uid, function)
     assert caught.value.exit_code in (69, 77), caught.value.message
-    assert str(place) in caught.value.message
+    assert str(path) in caught.value.message
     return caught.value.message
 
 
-def occupy(place: Path, mode: int = 0o777) -> Callable[[], None]:
+def folder_maker(folder: Path, mode: int = 0o777) -> Callable[[], None]:
+    """Return a function that makes a folder with a mode."""
+
     def make() -> None:
-        place.mkdir()
-        place.chmod(mode)
+        folder.mkdir()
+        folder.chmod(mode)
 
     return make
 
 
-def test_a_user_needs_no_folder_that_somebody_made(place: Path, config: Path):
-    assert as_user(VICTIM, runtime_folder) == place
-    assert as_user(VICTIM, bound(config)) == (f"{place}/{config.stem}.sock", 0o660, 0o750)
-    assert as_user(VICTIM, blocked(config)) == 0o600
-    assert place.stat().st_uid == VICTIM
+def test_a_user_needs_no_folder_that_somebody_made(user_folder: Path, config: Path):
+    assert as_user(VICTIM, runtime_folder) == user_folder
+    assert as_user(VICTIM, socket_binder(config)) == (f"{user_folder}/{config.stem}.sock", 0o660, 0o750)
+    assert as_user(VICTIM, block_maker(config)) == 0o600
+    assert user_folder.stat().st_uid == VICTIM
 
 
 @pytest.mark.parametrize("mode", [0o777, 0o755])
-def test_a_folder_of_another_user_is_not_used(place: Path, config: Path, mode: int):
-    as_user(ATTACKER, occupy(place, mode))
-    for function in (bound(config), blocked(config)):
-        assert f"user {ATTACKER}" in refused(VICTIM, function, place)
-    assert os.listdir(place) == []
+def test_a_folder_of_another_user_is_not_used(user_folder: Path, config: Path, mode: int):
+    as_user(ATTACKER, folder_maker(user_folder, mode))
+    for function in (socket_binder(config), block_maker(config)):
+        assert f"user {ATTACKER}" in refusal(VICTIM, function, user_folder)
+    assert os.listdir(user_folder) == []
 
 
-def test_a_folder_that_others_may_write_is_not_used(place: Path, config: Path):
-    as_user(VICTIM, occupy(place))
-    for function in (bound(config), blocked(config)):
-        assert "may write" in refused(VICTIM, function, place)
+def test_a_folder_that_others_may_write_is_not_used(user_folder: Path, config: Path):
+    as_user(VICTIM, folder_maker(user_folder))
+    for function in (socket_binder(config), block_maker(config)):
+        assert "may write" in refusal(VICTIM, function, user_folder)
 
 
-def test_a_link_of_another_user_leads_nowhere(place: Path, config: Path):
+def test_a_link_of_another_user_leads_nowhere(user_folder: Path, config: Path):
     with contextlib.ExitStack() as stack:
-        own = Path(f"/tmp/rtloop-own-{os.getpid()}")
-        as_user(VICTIM, own.mkdir)
-        stack.callback(own.rmdir)
-        as_user(ATTACKER, lambda: place.symlink_to(own))
-        refused(VICTIM, bound(config), place)
-        assert os.listdir(own) == []
+        victim_folder = Path(f"/tmp/rtloop-own-{os.getpid()}")
+        as_user(VICTIM, victim_folder.mkdir)
+        stack.callback(victim_folder.rmdir)
+        as_user(ATTACKER, lambda: user_folder.symlink_to(victim_folder))
+        refusal(VICTIM, socket_binder(config), user_folder)
+        assert os.listdir(victim_folder) == []
 
 
 @contextlib.contextmanager
-def served(path: Path, uid: int) -> Iterator[None]:
-    """Somebody of this user who answers everything at `path`."""
+def forged_service(path: Path, uid: int) -> Iterator[None]:
+    """Run a process of user `uid` that answers every request at the socket `path`."""
     answer = b'HTTP/1.1 200 OK\r\nContent-Type: application/json\r\nContent-Length: 18\r\n\r\n{"by": "attacker"}'
     ready, done = os.pipe()
     pid = os.fork()
@@ -145,32 +151,32 @@ def served(path: Path, uid: int) -> Iterator[None]:
         path.unlink(missing_ok=True)
 
 
-@pytest.mark.parametrize("maker", [ATTACKER, VICTIM])
-def test_a_service_of_another_user_is_not_believed(place: Path, maker: int):
-    as_user(maker, occupy(place))
-    path = place / "lab.sock"
-    with served(path, ATTACKER):
-        refused(VICTIM, lambda: Client(path).get("/status"), place)
-        refused(VICTIM, lambda: next(iter(Client(path).watch())), place)
+@pytest.mark.parametrize("owner", [ATTACKER, VICTIM])
+def test_a_service_of_another_user_is_not_believed(user_folder: Path, owner: int):
+    as_user(owner, folder_maker(user_folder))
+    path = user_folder / "lab.sock"
+    with forged_service(path, ATTACKER):
+        refusal(VICTIM, lambda: Client(path).get("/status"), user_folder)
+        refusal(VICTIM, lambda: next(iter(Client(path).watch())), user_folder)
 
 
-def test_a_socket_with_another_owner_than_who_serves_it_is_not_believed(place: Path):
-    as_user(VICTIM, occupy(place, 0o755))
-    path = place / "lab.sock"
-    place.chmod(0o777)
-    with served(path, ATTACKER):
-        place.chmod(0o755)
+def test_a_socket_with_another_owner_than_who_serves_it_is_not_believed(user_folder: Path):
+    as_user(VICTIM, folder_maker(user_folder, 0o755))
+    path = user_folder / "lab.sock"
+    user_folder.chmod(0o777)
+    with forged_service(path, ATTACKER):
+        user_folder.chmod(0o755)
         os.chown(path, VICTIM, VICTIM)
-        assert f"user ID {ATTACKER}" in refused(VICTIM, lambda: Client(path).get("/status"), path)
+        assert f"user ID {ATTACKER}" in refusal(VICTIM, lambda: Client(path).get("/status"), path)
 
 
 def test_the_service_of_a_folder_that_root_gave_is_believed(tmp_path_factory: pytest.TempPathFactory):
-    """As /run/rtloop is the service user's: root alone can have given it to him."""
+    """A folder in /run that belongs to the service's user is trusted: only root can have created it for that user."""
     folder = Path(f"/run/rtloop-test-{os.getpid()}")
     folder.mkdir()
     try:
         os.chown(folder, ATTACKER, ATTACKER)
-        with served(folder / "lab.sock", ATTACKER):
+        with forged_service(folder / "lab.sock", ATTACKER):
             assert as_user(VICTIM, lambda: Client(folder / "lab.sock").get("/status")) == {"by": "attacker"}
     finally:
         folder.rmdir()
@@ -196,11 +202,11 @@ def test_the_group_of_the_folder_reaches_the_socket_of_root():
         folder.rmdir()
 
 
-def test_a_forged_block_parks_nothing(place: Path, config: Path):
-    as_user(ATTACKER, occupy(place))
+def test_a_forged_block_parks_nothing(user_folder: Path, config: Path):
+    as_user(ATTACKER, folder_maker(user_folder))
 
     def forge() -> None:
-        fd = os.open(place / f"{config.stem}.block", os.O_RDWR | os.O_CREAT, 0o666)
+        fd = os.open(user_folder / f"{config.stem}.block", os.O_RDWR | os.O_CREAT, 0o666)
         SharedBlock.create(SIZES, fd)["last_drive_v"][0] = FORGED_V
 
     def park() -> str:
@@ -208,12 +214,12 @@ def test_a_forged_block_parks_nothing(place: Path, config: Path):
         return parking.park_configuration(config)
 
     as_user(ATTACKER, forge)
-    refused(VICTIM, park, place)
+    refusal(VICTIM, park, user_folder)
 
 
 @pytest.mark.parametrize("kind", ["file", "link"])
 def test_a_board_of_another_user_is_not_driven(kind: str):
-    """In /dev/shm everybody may make files."""
+    """Every user may create files in /dev/shm."""
     path = Path(f"/dev/shm/rtloop-test-{os.getpid()}")
     real = Path(f"/dev/shm/rtloop-test-real-{os.getpid()}")
 
@@ -236,7 +242,7 @@ def test_a_board_of_another_user_is_not_driven(kind: str):
         for function in (serve, drive):
             with pytest.raises(Raised) as caught:
                 as_user(VICTIM, function)
-            # the last from fs.protected_symlinks
+            # "Permission denied" comes from fs.protected_symlinks.
             allowed = (f"user {ATTACKER}", "symbolic link", "Permission denied")
             assert any(reason in caught.value.message for reason in allowed), caught.value.message
             assert caught.value.name in ("UntrustedPath", "DriverError", "OSError", "PermissionError")
@@ -245,17 +251,17 @@ def test_a_board_of_another_user_is_not_driven(kind: str):
         real.unlink(missing_ok=True)
 
 
-def test_compiled_code_is_loaded_from_a_folder_that_is_ours_up_to_the_root(place: Path):
-    def made() -> list[bool]:
-        place.mkdir()
-        (place / "open").mkdir()
-        (place / "open").chmod(0o777)
+def test_compiled_code_is_loaded_from_a_folder_that_is_ours_up_to_the_root(user_folder: Path):
+    def make_folders() -> list[bool]:
+        user_folder.mkdir()
+        (user_folder / "open").mkdir()
+        (user_folder / "open").chmod(0o777)
         return [
-            _make_private_folder(place / "cache"),
-            _make_private_folder(place / "open" / "cache"),
-            _make_private_folder(place / "open"),
+            _make_private_folder(user_folder / "cache"),
+            _make_private_folder(user_folder / "open" / "cache"),
+            _make_private_folder(user_folder / "open"),
         ]
 
-    assert as_user(VICTIM, made) == [True, False, False]
-    as_user(ATTACKER, lambda: (place / "open" / "more").mkdir())
-    assert as_user(VICTIM, lambda: _make_private_folder(place / "open" / "more")) is False
+    assert as_user(VICTIM, make_folders) == [True, False, False]
+    as_user(ATTACKER, lambda: (user_folder / "open" / "more").mkdir())
+    assert as_user(VICTIM, lambda: _make_private_folder(user_folder / "open" / "more")) is False

@@ -1,4 +1,4 @@
-"""Parking where the host refuses a system call: the note is whole, and what cannot be read is told in one message."""
+"""Parking where the host refuses a system call: a note is never half written, and an unreadable file is reported."""
 
 from __future__ import annotations
 
@@ -26,6 +26,7 @@ WIRING = {"x": Wiring("adc0", "dac0")}
 
 
 def refuse(*_: object) -> Any:
+    """Raise the error of a process that has too many open files."""
     raise OSError(errno.EMFILE, os.strerror(errno.EMFILE))
 
 
@@ -82,7 +83,7 @@ def test_a_board_that_cannot_be_mapped_is_told(tmp_path: Path, monkeypatch: pyte
 
 
 def test_a_board_and_a_block_that_cannot_be_closed_are_parked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """Every `close` fails: Linux frees the descriptor all the same, and parking comes to its end."""
+    """Every `close` fails, although Linux frees the descriptor; parking continues to its end."""
     case = ParkingABoard(tmp_path)
     close = os.close
 

@@ -1,4 +1,4 @@
-"""How long `rtloop park` waits for a loop that outlived its service, in told time: no loop is killed in its ramp."""
+"""Waiting time of `rtloop park` for a loop that outlived its service, in simulated time: no ramp is cut short."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from rtloop.supervision import parking
 HEARTBEAT_TIMEOUT_S, SLEW_V_PER_S = 1.5, 2.0
 
 
-class Driven:
-    """A block whose loop goes on until it is killed at `killed_s`, or for ever; `now_s` is the time that passes."""
+class DrivenBlock:
+    """Block whose loop runs until it is killed at `killed_s`, or for ever; `now_s` is the simulated time."""
 
     def __init__(self, drives_v: list[float], *, can_be_killed: bool = True) -> None:
         self.now_s, self.killed_s, self._can_be_killed = 100.0, None, can_be_killed
@@ -38,7 +38,8 @@ class Driven:
         self.now_s += duration_s
 
 
-def await_end(block: Driven, safe_v: list[float], monkeypatch: pytest.MonkeyPatch) -> None:
+def await_end(block: DrivenBlock, safe_v: list[float], monkeypatch: pytest.MonkeyPatch) -> None:
+    """Wait for the end of the block's loop in the block's simulated time."""
     clock = SimpleNamespace(monotonic=lambda: block.now_s, sleep=block.sleep)
     monkeypatch.setattr(parking, "time", clock)
     parking._await_end(block, HEARTBEAT_TIMEOUT_S, SLEW_V_PER_S, np.array(safe_v))  # type: ignore[arg-type]
@@ -46,8 +47,8 @@ def await_end(block: Driven, safe_v: list[float], monkeypatch: pytest.MonkeyPatc
 
 @pytest.mark.parametrize("drives_v", [[9.0], [0.5, -9.0], [9.0, 0.5]])
 def test_a_loop_has_the_time_of_its_timeout_and_of_its_longest_ramp(drives_v, monkeypatch):
-    """9 V at 2 V/s take 4.5 s, after 1.5 s without a supervisor."""
-    block = Driven(drives_v)
+    """A ramp of 9 V at 2 V/s takes 4.5 s, and begins 1.5 s after the last heartbeat."""
+    block = DrivenBlock(drives_v)
     await_end(block, [0.0] * len(drives_v), monkeypatch)
     assert block.killed_s == pytest.approx(100.0 + 4.5 + 1.5 + parking.MARGIN_S, abs=2 * parking.POLL_S)
 
@@ -63,14 +64,14 @@ def test_a_loop_has_the_time_of_its_timeout_and_of_its_longest_ramp(drives_v, mo
     ],
 )
 def test_a_ramp_leads_to_the_safe_value_which_need_not_be_0(drives_v, safe_v, ramp_s, monkeypatch):
-    """At 2 V/s; a block with other axes than the board says nothing of the way."""
-    block = Driven(drives_v)
+    """The ramp has 2 V/s. For a block with another number of axes than the board, the longest ramp is assumed."""
+    block = DrivenBlock(drives_v)
     await_end(block, safe_v, monkeypatch)
     assert block.killed_s == pytest.approx(100.0 + ramp_s + 1.5 + parking.MARGIN_S, abs=2 * parking.POLL_S)
 
 
 def test_a_loop_that_cannot_be_killed_is_told(monkeypatch):
-    block = Driven([0.0], can_be_killed=False)
+    block = DrivenBlock([0.0], can_be_killed=False)
     with pytest.raises(DriverError, match="process 4711 drives the outputs and cannot be killed"):
         await_end(block, [0.0], monkeypatch)
     end_s = 100.0 + 1.5 + parking.MARGIN_S + parking.KILL_S

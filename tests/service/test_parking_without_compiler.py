@@ -1,4 +1,4 @@
-"""Parking needs no compiler: with a cache that is empty or torn, outputs go down by the same writes."""
+"""Parking needs no compiler: with an empty or damaged cache of compiled code, the writes are the same."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ SIZES = Sizes(columns=1, axes=1, rate_hz=1000.0, snapshot_bytes=8, table_samples
 
 @pytest.fixture
 def lab(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[Path, FakeBoard]:
-    """A configuration and its board, whose service died: its shared block is there."""
+    """Return the configuration and the board of a service that died and left its shared block."""
     (tmp_path / "run").mkdir(mode=0o700)
     monkeypatch.setenv("RUNTIME_DIRECTORY", str(tmp_path / "run"))
     config = tmp_path / "lab.toml"
@@ -50,20 +50,20 @@ def lab(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[Path, FakeBoar
     return config, FakeBoard(tmp_path / "board", START_V)
 
 
-def parked(config: Path) -> tuple[str, set[str]]:
-    """What `rtloop park` prints as a process of its own, and the modules that it imported."""
+def run_park(config: Path) -> tuple[str, set[str]]:
+    """Run `rtloop park` as a process, and return its stderr and the names of the modules that it imported."""
     environment = {**os.environ, "XDG_CACHE_HOME": str(config.parent / "cache")}
     command = [sys.executable, "-c", PROGRAM, str(config)]
-    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
-    assert "Traceback" not in done.stderr
-    return done.stderr, {*done.stdout.partition("imported:")[2].split()}
+    result = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+    assert result.returncode == 0, result.stderr
+    assert "Traceback" not in result.stderr
+    return result.stderr, {*result.stdout.partition("imported:")[2].split()}
 
 
 def test_no_compiler_is_imported_whatever_the_cache_holds(lab: tuple[Path, FakeBoard]):
-    """First there is none, then one whose every file is torn."""
+    """At first there is no cache; then its files of the driver's functions are empty."""
     config, board = lab
-    message, modules = parked(config)
+    message, modules = run_park(config)
     assert "numba" not in modules
     assert "scipy" not in modules
     assert "parked from 6.660 V" in message
@@ -71,7 +71,7 @@ def test_no_compiler_is_imported_whatever_the_cache_holds(lab: tuple[Path, FakeB
     (cache,) = (config.parent / "cache" / "rtloop").iterdir()
     for name in ("shm_read", "shm_write"):
         (cache / f"rtloop.drivers.shm.{name}.o").write_bytes(b"")
-    message, modules = parked(config)
+    message, modules = run_park(config)
     assert "numba" not in modules
     assert "the cache of compiled code is damaged" in message
     assert message.count("\n") == 2
@@ -79,16 +79,16 @@ def test_no_compiler_is_imported_whatever_the_cache_holds(lab: tuple[Path, FakeB
 
 
 def test_the_writes_are_the_same_with_machine_code_and_without(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """Bit by bit, over a ramp and values beside the codes."""
-    assert shm_write.address  # compiled, or loaded
-    boards = [FakeBoard(tmp_path / name, -3.3) for name in ("compiled", "written")]
-    for board, name in zip(boards, ("compiled", "written"), strict=True):
-        if name == "written":
+    """All codes at the output are equal, for random voltages, also out of range, and for the ramp."""
+    assert shm_write.address  # compiled, or loaded from the cache
+    boards = [FakeBoard(tmp_path / name, -3.3) for name in ("compiled", "uncompiled")]
+    for board, name in zip(boards, ("compiled", "uncompiled"), strict=True):
+        if name == "uncompiled":
             monkeypatch.setattr(shm_write, "_machine_code", None)
             monkeypatch.setattr(machine_code, "load", lambda name: None)
         driver = ShmDriver(ShmOptions(file=str(tmp_path / name)), {"x": Wiring("adc0", "dac0")}, 4000.0)
         with allow_uncompiled():
-            assert (shm_write.address == shm_write._python_callback[1]) == (name == "written")
+            assert (shm_write.address == shm_write._python_callback[1]) == (name == "uncompiled")
             pointers = driver.open()
         write = ctypes.CFUNCTYPE(ctypes.c_int32, ctypes.c_void_p, ctypes.c_void_p)(pointers.write)
         for volts in np.random.default_rng(1).uniform(-11.0, 11.0, 200):
@@ -101,7 +101,7 @@ def test_the_writes_are_the_same_with_machine_code_and_without(tmp_path: Path, m
 
 
 def test_a_kernel_that_raises_as_it_is_written_fails(monkeypatch: pytest.MonkeyPatch):
-    """A driver's write that did nothing must not look like one that did."""
+    """A driver's write that raised must not look like a successful write."""
 
     def broken(context, values):
         raise ZeroDivisionError
@@ -113,7 +113,7 @@ def test_a_kernel_that_raises_as_it_is_written_fails(monkeypatch: pytest.MonkeyP
 
 
 def test_a_process_that_has_parked_compiles_as_ever(monkeypatch: pytest.MonkeyPatch):
-    """The kernel as it is written is for parking alone: it would be far too slow for a loop."""
+    """Only parking runs kernels uncompiled: they would be far too slow for a loop."""
 
     def doubled(number):
         return number * 2
@@ -127,15 +127,15 @@ def test_a_process_that_has_parked_compiles_as_ever(monkeypatch: pytest.MonkeyPa
     assert function.address == 4711
 
 
-@pytest.mark.parametrize("make", ["comedi", "sim"])
-def test_other_drivers_park_as_they_are_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, make: str):
-    """A board that keeps its outputs at 7 V, and the rig."""
+@pytest.mark.parametrize("driver_kind", ["comedi", "sim"])
+def test_other_drivers_park_as_they_are_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, driver_kind: str):
+    """The comedi board has its output at 7 V; the other driver is the rig's."""
     monkeypatch.setattr(machine_code, "load", lambda name: None)
     monkeypatch.setattr(CFunction, "_compile", lambda self: pytest.fail("compiled"))
     for function in (comedi_read, comedi_write, sim_read, sim_write):
         monkeypatch.setattr(function, "_machine_code", None)
-    wiring = {"x": ComediDriver.example if make == "comedi" else SimDriver.example}
-    if make == "sim":
+    wiring = {"x": ComediDriver.example if driver_kind == "comedi" else SimDriver.example}
+    if driver_kind == "sim":
         assert park(SimDriver(RigOptions(), wiring, 1000.0), 500.0, np.array([0.02])) == [0.0]
         return
     options = ComediOptions(device=str(new_board(tmp_path / "comedi0")), library=str(stub_library()))

@@ -1,4 +1,4 @@
-"""Depolarising and taring on a rig that remembers: measured on the board's own truth."""
+"""Depolarisation and tare on a rig with hysteresis; board and recordings are the evidence."""
 
 from __future__ import annotations
 
@@ -16,20 +16,20 @@ from tests.faults.account import runs_in
 from tests.faults.bench import Bench
 from tests.faults.evidence import wait_for
 
-R = [0.095, 0.38, 0.84, 1.46, 2.21, 3.07, 4.01, 4.98, 5.96, 6.89, 7.76, 8.52, 9.14, 9.61, 9.9]
-P = [2.55, 0.57, 1.3, -1.57, 1.25, -0.054, -0.032, 0.66, 0.16, -0.77, 2.02, -1.63, -0.15, 2.99, -1.09]
+THRESHOLDS_V = [0.095, 0.38, 0.84, 1.46, 2.21, 3.07, 4.01, 4.98, 5.96, 6.89, 7.76, 8.52, 9.14, 9.61, 9.9]
+WEIGHTS_UM_PER_V = [2.55, 0.57, 1.3, -1.57, 1.25, -0.054, -0.032, 0.66, 0.16, -0.77, 2.02, -1.63, -0.15, 2.99, -1.09]
 
 
 def displacement_um(volts: np.ndarray, plays: np.ndarray) -> float:
-    """Eq (4) after `volts`, from the memory `plays`, which moves."""
+    """Return the displacement (µm) by eq. (4) of the paper after the drives `volts`; updates the states `plays`."""
     for value in volts:
-        plays[:] = np.maximum(value - np.array(R), np.minimum(value + np.array(R), plays))
-    return float(np.dot(P, plays))
+        plays[:] = np.maximum(value - np.array(THRESHOLDS_V), np.minimum(value + np.array(THRESHOLDS_V), plays))
+    return float(np.dot(WEIGHTS_UM_PER_V, plays))
 
 
 def test_the_sweep_wipes_out_what_the_actuator_remembers():
     for history in ([10.0, 0.0], [-10.0, 0.0], [7.0, -3.0, 0.0]):
-        plays = np.zeros(len(R))
+        plays = np.zeros(len(THRESHOLDS_V))
         before = displacement_um(np.array(history), plays)
         sweep = decaying_sine(DepolariseOptions(amplitude_v=10.0, frequency_hz=10.0, cycles=40), 10_000.0)
         after = displacement_um(np.append(sweep, 0.0), plays)
@@ -46,7 +46,7 @@ def test_the_sweep_begins_and_ends_at_rest():
 
 
 def test_the_tare_survives_the_loop(tmp_path):
-    """A sensor that is 3 µm off: read from the recordings of the tared loop and of the one after it."""
+    """The sensor is 3 µm off. The offsets are read from the recordings of the tared loop and of the next loop."""
     changes = (
         ("noise_um = 0.010\n", "noise_um = 0.0\noffset_um = 3.0\n"),
         ("[recording]", "[service]\ntare_s = 0.2\n[recording]"),
@@ -66,7 +66,7 @@ def test_the_tare_survives_the_loop(tmp_path):
 
 
 def test_while_the_actuator_is_depolarised_setpoints_move_nothing_and_no_start_undoes_a_stop(tmp_path):
-    """4 µm would be 4 V in mode raw; the sine has 2 V."""
+    """A setpoint of 4 µm would be 4 V in mode raw; the depolarising sine has 2 V."""
     sine = "[service]\ndepolarise = { amplitude_v = 2.0, cycles = 1000 }\n[recording]"
     with Bench(tmp_path, ("[recording]", sine)) as bench:
         wait_for(lambda: bench.seen().largest_v > 0.5, "the sine")
@@ -88,7 +88,7 @@ def test_while_the_actuator_is_depolarised_setpoints_move_nothing_and_no_start_u
 
 
 def test_a_service_in_mode_raw_plays_its_reference_after_the_tare(tmp_path):
-    """A sine from 1 V to 5 V, which the service entered at 0 V and then followed."""
+    """The reference is a sine from 1 V to 5 V; the service begins at 0 V and then follows the sine."""
     changes = (
         ("[loop]\n", '[loop]\nmode = "raw"\n'),
         ("amplitude = 8.0\noffset = 20.0\n", "amplitude = 2.0\noffset = 3.0\n"),

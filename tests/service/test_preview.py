@@ -1,4 +1,4 @@
-"""What a change would do, before it is applied, and the way back: figures, ticks, refusals, and nothing on the way."""
+"""Preview of a change and undo: figures, ticks and refusals. A preview leaves the running loop as it is."""
 
 from __future__ import annotations
 
@@ -16,81 +16,83 @@ from tests.paper_configuration import PAPER, TEXT, built
 from tests.service.http import answer
 
 
-def axis_as_it_runs(bench: Bench) -> dict:
+def running_axis(bench: Bench) -> dict:
+    """Return the configuration of the first axis that is in force."""
     return bench.client.get("/configuration")["values"]["axis"][0]
 
 
 def test_figures_are_those_of_check():
-    """Of the paper's loop, by the analysis that `rtloop check` prints."""
+    """The oracle is the analysis of the paper's loop that `rtloop check` prints."""
     prepared = prepare(parse(TEXT, "paper", PAPER.parent, "paper.toml"))
-    found, running = loop_figures(prepared, 0), prepared.checks[0].running
+    figures, running = loop_figures(prepared, 0), prepared.checks[0].running
     assert running is not None
-    assert found["phase_margin_deg"] == running.phase_margin_deg
-    assert 10 ** (found["gain_margin_db"] / 20) == pytest.approx(running.gain_margin)
-    assert found["modulus_margin"] == pytest.approx(1 / running.max_sensitivity)
-    low, high = found["tolerated_shift_percent"]
+    assert figures["phase_margin_deg"] == running.phase_margin_deg
+    assert 10 ** (figures["gain_margin_db"] / 20) == pytest.approx(running.gain_margin)
+    assert figures["modulus_margin"] == pytest.approx(1 / running.max_sensitivity)
+    low, high = figures["tolerated_shift_percent"]
     assert low < 0 < high
-    step = found["step"]
+    step = figures["step"]
     assert len(step["t_ms"]) == len(step["y"]) <= 400
     assert max(step["y"]) == pytest.approx((1 + running.overshoot_percent / 100) * step["y"][-1], rel=0.02)
     assert step["t_ms"][-1] >= 1e3 * running.settling_time_s
 
 
 def test_a_preview_changes_nothing_and_takes_no_lock(running: Bench):
-    before = axis_as_it_runs(running)
+    before = running_axis(running)
     body = {"axis": "x", "section": "controller", "values": {"gain": 0.008}}
-    found = running.client.post("/preview", body)
-    assert found["after"]["crossover_hz"] < 0.7 * found["before"]["crossover_hz"]
-    assert found["after"]["gain_margin_db"] > found["before"]["gain_margin_db"] + 3
-    assert axis_as_it_runs(running) == before
+    preview = running.client.post("/preview", body)
+    assert preview["after"]["crossover_hz"] < 0.7 * preview["before"]["crossover_hz"]
+    assert preview["after"]["gain_margin_db"] > preview["before"]["gain_margin_db"] + 3
+    assert running_axis(running) == before
     running.client.delete("/lock")
     running.client.post("/preview", body)
     assert running.status()["lock"] is None
-    # as `tune` would be refused
+    # A preview is refused like the change itself.
     unstable = {"axis": "x", "section": "controller", "values": {"gain": 5.0}}
     for path in ("/preview", "/tune"):
-        code, said = answer(running, "POST", path, unstable)
+        code, response = answer(running, "POST", path, unstable)
         assert code == 422
-        assert "unstable" in said["error"]
+        assert "unstable" in response["error"]
     assert answer(running, "POST", "/preview", body | {"axis": "y"})[0] == 422
     assert answer(running, "POST", "/preview", body | {"section": "driver"})[0] == 422
-    assert axis_as_it_runs(running) == before
+    assert running_axis(running) == before
 
 
 def test_back_step_by_step(running: Bench):
-    before = axis_as_it_runs(running)
-    code, said = answer(running, "POST", "/undo", {"axis": "x"})
+    before = running_axis(running)
+    code, response = answer(running, "POST", "/undo", {"axis": "x"})
     assert code == 409
-    assert "has no change since" in said["error"]
+    assert "has no change since" in response["error"]
     ticks = [
         running.client.post("/tune", {"axis": "x", "section": "controller", "values": {"gain": 0.012}})["tick"],
         running.client.post("/tune", {"axis": "x", "section": "limits", "values": {"command_um": 40.0}})["tick"],
     ]
     running.client.post("/setpoint", {"axis": "x", "value": 12.5})
     undone = [running.client.post("/undo", {"axis": "x"}) for _ in range(2)]
-    assert [one["undone"] for one in undone] == ["limits: command_um", "controller: gain"]
+    assert [change["undone"] for change in undone] == ["limits: command_um", "controller: gain"]
     assert ticks[0] < ticks[1] < undone[0]["tick"] < undone[1]["tick"]
-    assert axis_as_it_runs(running)["controller"] == before["controller"]
-    assert axis_as_it_runs(running)["limits"] == before["limits"]
+    assert running_axis(running)["controller"] == before["controller"]
+    assert running_axis(running)["limits"] == before["limits"]
     assert running.status()["axes"]["x"]["reference_um"] == 12.5
     assert answer(running, "POST", "/undo", {"axis": "x"})[0] == 409
 
 
 def test_changes_to_and_fro_are_taken_back_in_their_order():
     axis = prepare(parse(TEXT, "paper", PAPER.parent, "paper.toml")).configuration.axes[0]
-    other = axis.model_copy(update={"name": "other"})
-    changes, made = ChangeHistory(), [Change(0, one, "to and fro") for one in (axis, other, axis, other, axis)]
-    for change in made:
-        changes.add(change)
-    changes.add(Change(1, axis, "of another axis"))
-    taken = []
-    while (change := changes.newest((0,))) is not None:
-        taken.append(change.before.name)
-        changes.remove(change)
-    assert taken == ["x", "other", "x", "other", "x"]
-    assert changes.newest((0, 1)) is not None
-    changes.remove()
-    assert changes.newest((0, 1)) is None
+    changed_axis = axis.model_copy(update={"name": "other"})
+    versions = (axis, changed_axis, axis, changed_axis, axis)
+    history, changes = ChangeHistory(), [Change(0, version, "to and fro") for version in versions]
+    for change in changes:
+        history.add(change)
+    history.add(Change(1, axis, "of another axis"))
+    undone = []
+    while (change := history.newest((0,))) is not None:
+        undone.append(change.before.name)
+        history.remove(change)
+    assert undone == ["x", "other", "x", "other", "x"]
+    assert history.newest((0, 1)) is not None
+    history.remove()
+    assert history.newest((0, 1)) is None
 
 
 def test_a_refused_change_is_none_to_undo(running: Bench):
@@ -104,26 +106,26 @@ def test_a_refused_change_is_none_to_undo(running: Bench):
     [("1e-9", "the loop does not follow its reference"), ("-1e-5", "the loop's gain at 0 Hz has the wrong sign")],
 )
 def test_a_loop_that_does_not_control_is_a_problem_and_has_no_step_figures(gain: str, problem: str) -> None:
-    found = loop_figures(built(("gain = 0.016", f"gain = {gain}")), 0)
-    assert any(line.startswith("axis.x.controller: ") and line.endswith(problem) for line in found["problems"])
-    assert (found["settling_ms"], found["overshoot_percent"], found["step"]) == (None, None, None)
-    assert found["static_error_percent"] > 99.0
+    figures = loop_figures(built(("gain = 0.016", f"gain = {gain}")), 0)
+    assert any(line.startswith("axis.x.controller: ") and line.endswith(problem) for line in figures["problems"])
+    assert (figures["settling_ms"], figures["overshoot_percent"], figures["step"]) == (None, None, None)
+    assert figures["static_error_percent"] > 99.0
 
 
 def test_a_loop_that_controls_has_no_problem() -> None:
-    found = loop_figures(built(), 0)
-    assert found["problems"] == []
-    assert found["static_error_percent"] == pytest.approx(0.166384, abs=1e-5)
+    figures = loop_figures(built(), 0)
+    assert figures["problems"] == []
+    assert figures["static_error_percent"] == pytest.approx(0.166384, abs=1e-5)
 
 
 def test_both_steps_of_a_preview_end_at_one_time(running: Bench):
-    """A slower loop makes the present one's step longer, a faster one has its own made longer."""
+    """The shorter step is lengthened: the present one if the change makes the loop slower, else the new one."""
     for gain in (0.004, 0.02):
         body = {"axis": "x", "section": "controller", "values": {"gain": gain}}
-        found = running.client.post("/preview", body)
-        before, after = found["before"]["step"], found["after"]["step"]
+        preview = running.client.post("/preview", body)
+        before, after = preview["before"]["step"], preview["after"]["step"]
         assert before["t_ms"] == pytest.approx(after["t_ms"], abs=2e-6)
-        slowest_ms = max(found[which]["settling_ms"] for which in ("before", "after"))
+        slowest_ms = max(preview[key]["settling_ms"] for key in ("before", "after"))
         assert before["t_ms"][-1] == pytest.approx(3 * slowest_ms, rel=1e-6)
 
 
@@ -132,8 +134,8 @@ def test_a_longer_step_is_the_same_step():
     short = loop_figures(prepared, 0)
     longer = lengthen_step(short, prepared.checks[0], 2.5 * step_duration_ms(short))["step"]
     assert longer["t_ms"][-1] == pytest.approx(2.5 * step_duration_ms(short))
-    again = np.interp(short["step"]["t_ms"], longer["t_ms"], longer["y"])
-    assert np.allclose(again, short["step"]["y"], atol=0.02)
+    interpolated = np.interp(short["step"]["t_ms"], longer["t_ms"], longer["y"])
+    assert np.allclose(interpolated, short["step"]["y"], atol=0.02)
     assert lengthen_step(short, prepared.checks[0], 0.5) is short
 
 

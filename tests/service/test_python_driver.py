@@ -1,4 +1,4 @@
-"""A third party's driver in plain Python, found by its entry point, closes the loop at 10 kHz and replays."""
+"""A third-party driver in plain Python, found by its entry point, closes the loop at 10 kHz; its recording replays."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ dwell_s = 0.1
 
 
 def install(folder: Path, driver: str) -> tuple[Path, dict[str, str]]:
-    """The driver as a package in `folder`; a configuration that names it, and the environment that finds it."""
+    """Install the driver as a package in `folder`; return a configuration and an environment that use the package."""
     (folder / "lag_driver.py").write_text(driver)
     metadata = folder / "lag_driver-1.0.dist-info"
     metadata.mkdir()
@@ -83,9 +83,9 @@ def install(folder: Path, driver: str) -> tuple[Path, dict[str, str]]:
 def test_a_plain_python_driver_closes_the_loop_at_10_khz(tmp_path: Path) -> None:
     config, environment = install(tmp_path, DRIVER)
     command = [sys.executable, "-m", "rtloop", "run", str(config), "--duration", "2", "--out", str(tmp_path), "--json"]
-    done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=120, check=False)
-    assert done.returncode == 0, done.stderr
-    summary = json.loads(done.stdout)
+    result = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=120, check=False)
+    assert result.returncode == 0, result.stderr
+    summary = json.loads(result.stdout)
     assert summary["ticks_logged"] == summary["ticks_expected"] == 20_000
     assert summary["ticks_lost"] == 0
     recording = rtloop.load(summary["recording"])
