@@ -21,7 +21,7 @@ from tests.service.http import GOOD_CONTROLLER, answer
 
 
 def events(bench: Bench, kind: str) -> list[dict[str, Any]]:
-    """Return the events of a kind in the unfinished recording, as far as it is written."""
+    """Return the events of a kind that the unfinished recording contains so far."""
     path = next((bench.folder / "recordings").glob("*.mcap.part"))
     return [event for event in rtloop.load(path).events if event["kind"] == kind]
 

@@ -545,7 +545,7 @@ def test_a_service_that_died_is_parked_while_its_file_is_being_edited(tmp_path):
 def fork_exit_code(work: Callable[[], object]) -> int:
     """Call `work` in a forked process, and return its exit code: 0 unless the process ended in `work`."""
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", DeprecationWarning)  # of a fork beside threads of libraries
+        warnings.simplefilter("ignore", DeprecationWarning)  # a fork warns while threads of libraries run
         pid = os.fork()
     if pid == 0:
         try:

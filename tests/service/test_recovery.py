@@ -1,6 +1,6 @@
-"""A recovery on real processes: a board that stops and goes on, and a drive that is judged in the recording.
+"""A recovery on real processes: the board stops and continues; the recording shows the drive.
 
-The loop has no slew limit of its own, and a slow ramp of a trip: only the return's own ramp keeps the output slow. All
+The loop has no slew limit, and the ramp of a trip is slow: only the ramp of the return keeps the output slow. All
 causes and policies are in `make faults` (tests/faults/recovery.py).
 """
 
@@ -32,8 +32,8 @@ CHANGES = (
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Any, dict[str, Any]]]:
-    """Recording and last status of a service whose board stopped and went on while a client's waveform played, and
-    whose position interlock tripped afterwards.
+    """Yield recording and last status of a service: its board stopped and continued while a client's waveform played,
+    and its position interlock tripped afterwards.
     """
     with Bench(tmp_path_factory.mktemp("recover"), *CHANGES) as bench:
         bench.await_drive()
@@ -49,17 +49,15 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Any, dict[st
         yield rtloop.load(path), status
 
 
-def steps_of(recording: Any) -> dict[str, int]:
-    """Tick of each step of the recovery."""
+def recovery_ticks(recording: Any) -> dict[str, int]:
+    """Return the tick of each step of the recovery; of a repeated step the last one."""
     return {event["what"]["step"]: event["tick"] for event in recording.events if event["kind"] == "recovery"}
 
 
 def test_the_output_returns_within_the_ramp_of_a_trip(run):
-    """Where the host stalled loop or board, the position jumps and the controller answers: 10 ms from there are left
-    out.
-    """
+    """After a stall of loop or board, the position jumps and the controller responds: 10 ms are left out."""
     recording, _ = run
-    steps = steps_of(recording)
+    steps = recovery_ticks(recording)
     span = slice(steps["confirmed"], steps["recovered"])
     drive_v, missed, age_us = (
         np.asarray(recording[name])[span] for name in ("x_drive_v", "periods_missed", "sample_age_us")
@@ -76,7 +74,7 @@ def test_the_output_returns_within_the_ramp_of_a_trip(run):
 def test_the_reference_of_the_client_plays_from_its_beginning(run):
     recording, _ = run
     reference_um = np.asarray(recording["x_reference_um"])
-    assert reference_um[steps_of(recording)["recovered"]] == LEVELS_UM[0]
+    assert reference_um[recovery_ticks(recording)["recovered"]] == LEVELS_UM[0]
     settings = [event for event in recording.events if event["kind"] == "set_reference"]
     (first,) = [
         event for event in settings if event["who"] == "operator" and event["what"]["values"][2] == len(LEVELS_UM)
@@ -94,7 +92,7 @@ def test_each_step_is_an_event_of_the_loop_in_order(run):
     ]  # fmt: skip
     assert recoveries[0]["what"]["causes"] == ["stale"]
     commands = {event["kind"]: event["tick"] for event in recording.events if event["who"] == "supervisor"}
-    steps = steps_of(recording)
+    steps = recovery_ticks(recording)
     assert steps["confirmed"] <= commands["reset_trip"] <= steps["returning"]
 
 

@@ -1,6 +1,6 @@
-"""Recovery with a node behind UDP: killed and started again, and silent for longer than its watchdog waits.
+"""Recovery with a node behind UDP: the node is killed and restarted, then silent for longer than its watchdog's time.
 
-The node is a process that outlives the loops and keeps its output; a run takes half a minute, most of it waiting.
+The node's process outlives the loops and keeps its output. A run takes half a minute, most of it waiting.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ CODE_V = 20.0 / (1 << 24)
 
 
 def configuration(folder: Path, port: int) -> str:
-    """A loop of 500 Hz on the node."""
+    """Return the configuration of a loop at 500 Hz on the node at `port`."""
     return on_a_card(
         folder,
         ('rate_hz = 2000\nenable_input = "enable"', "rate_hz = 500"),
@@ -44,7 +44,7 @@ def configuration(folder: Path, port: int) -> str:
 
 
 def drives(bench: Bench, node: NodeProcess) -> bool:
-    """Whether the loop drives; a trip before its first drive, on a busy host, is reset, and the loop started."""
+    """Return whether the loop drives. Reset a trip before the first drive, as on a busy host, and start the loop."""
     with suppress(RtloopError):
         if bench.status().get("state") == "tripped":
             bench.client.post("/reset")
@@ -53,7 +53,7 @@ def drives(bench: Bench, node: NodeProcess) -> bool:
 
 
 def await_return(bench: Bench, node: NodeProcess, count: int) -> None:
-    """Wait for this many returns, and for a drive at the node."""
+    """Wait until `count` recoveries have ended in the log, and the loop drives the node."""
     wait_for(lambda: bench.log().count(": recovered") >= count, f"return {count}")
     wait_for(lambda: bench.status().get("state") == "running" and abs(node.output_v) > 1.0, "a drive")
 

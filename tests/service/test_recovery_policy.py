@@ -1,4 +1,4 @@
-"""The policy of a recovery against a service, a loop and a clock that the test moves."""
+"""Policy of a recovery, with a stand-in service and loop, and a clock that the test moves."""
 
 from __future__ import annotations
 
@@ -36,8 +36,8 @@ PREPARED = prepare(load(DEPLOY / "paper.toml"))
 TICKS_PER_STEP, STEP_S = 10, 0.125
 
 
-def with_interlocks(enable_input: str | None, **limits: Any) -> Prepared:
-    """The paper's loop with other interlocks."""
+def change_interlocks(enable_input: str | None, **limits: Any) -> Prepared:
+    """Return the paper's loop with this enable input and changed interlocks."""
     configuration = PREPARED.configuration
     (axis,), loop = configuration.axes, configuration.loop.model_copy(update={"enable_input": enable_input})
     axis = axis.model_copy(update={"interlocks": axis.interlocks.model_copy(update=limits)})
@@ -45,7 +45,7 @@ def with_interlocks(enable_input: str | None, **limits: Any) -> Prepared:
 
 
 def sound_rows(count: int, first_tick: int = 0) -> Any:
-    """Records (count, columns) of a loop at rest, outputs safe."""
+    """Return records (count, columns) of a loop at rest, with safe outputs."""
     rows = np.zeros((count, len(PREPARED.plan.columns)))
     rows[:, signals.TICK] = first_tick + np.arange(count)
     rows[:, signals.axis_column(0, signals.ADC)] = 0.01
@@ -54,7 +54,7 @@ def sound_rows(count: int, first_tick: int = 0) -> Any:
 
 
 class Loop:
-    """A loop of which the test says what it read: supervisor and live law in one."""
+    """Stand-in for a loop's supervisor and live law; the test determines its records and trips."""
 
     def __init__(self) -> None:
         self.rows: deque[Any] = deque(maxlen=1000)
@@ -75,16 +75,18 @@ class Loop:
     def newest(self, count: int) -> Any:
         return np.concatenate(list(self.rows)[-(count // TICKS_PER_STEP + 1) :])[-count:]
 
-    def has_tripped(self, *causes: Flag, mode: Mode | None = Mode.CLOSED_LOOP, tick: int = 0) -> None:
+    def record_trip(self, *causes: Flag, mode: Mode | None = Mode.CLOSED_LOOP, tick: int = 0) -> None:
+        """Begin a trip with these causes, in `mode` before it."""
         bits = sum(causes)
         self.trip = Trip(self.trip.number + 1, mode, tick, bits, bits, False)
 
-    def has_followed(self, cause: Flag) -> None:
+    def add_cause(self, cause: Flag) -> None:
+        """Add a cause to the present trip."""
         self.trip = self.trip._replace(causes=self.trip.causes | cause)
 
 
 class Bench:
-    """A service with a loop that runs, and its recovery."""
+    """A service with a running loop, and its recovery; `options` replace those of OPTIONS."""
 
     def __init__(self, **options: Any) -> None:
         self.now_s, self.loop = 100.0, Loop()
@@ -97,7 +99,7 @@ class Bench:
         self.host.configuration = SimpleNamespace(service=SimpleNamespace(recover=options))
 
     def trip(self, *causes: Flag, **more: Any) -> None:
-        self.loop.has_tripped(*causes, **more)
+        self.loop.record_trip(*causes, **more)
         self.recovery.observe()
 
     def replace_loop(self) -> None:
@@ -105,7 +107,7 @@ class Bench:
         self.recovery.observe()
 
     def run(self, seconds: float, change: Any = None) -> Any:
-        """Let time pass; `change` spoils the rows. Returns the return, once it is confirmed."""
+        """Execute ticks for a time, modified by `change`. Returns the confirmed return, or None if there was none."""
         for _ in range(round(seconds / STEP_S)):
             self.now_s += STEP_S
             rows = sound_rows(TICKS_PER_STEP, self.loop.ticks)
@@ -118,6 +120,7 @@ class Bench:
         return None
 
     def recover(self) -> None:
+        """Run until the return is confirmed, and finish the recovery."""
         confirmed = self.run(WAIT_S + (CONFIRMATIONS + 1) * PERIOD_S)
         assert confirmed is not None, self.report
         assert self.recovery.finish(confirmed.serial)
@@ -130,7 +133,7 @@ class Bench:
 
     @property
     def steps(self) -> list[tuple[RecoveryStep, StepReason]]:
-        """All steps since the last call."""
+        """Return all steps since the last call, each with its reason."""
         steps = []
         while (step := self.recovery.oldest_step) is not None:
             steps.append((step.step, step.reason))
@@ -219,7 +222,7 @@ def test_every_cause_of_a_trip_must_be_allowed(causes):
 def test_a_cause_that_follows_latches_unless_missing_samples_explain_it(first, follower, state):
     bench = Bench()
     bench.trip(first)
-    bench.loop.has_followed(follower)
+    bench.loop.add_cause(follower)
     bench.run(0.5)
     assert bench.report["state"] == state
 
@@ -246,7 +249,7 @@ def test_a_trip_in_the_middle_counts_and_keeps_the_state_before_the_first():
     bench = Bench()
     bench.trip(Flag.TRIP_STALE, mode=Mode.FEEDFORWARD)
     confirmed = bench.run(10.0)
-    bench.trip(Flag.TRIP_LATE, mode=Mode.RAW)  # in the middle of a depolarisation
+    bench.trip(Flag.TRIP_LATE, mode=Mode.RAW)  # during a depolarisation
     assert not bench.recovery.is_current(confirmed.serial)
     assert not bench.recovery.finish(confirmed.serial)
     assert (bench.report["state"], bench.report["left"]) == ("waiting", 0)
@@ -296,7 +299,7 @@ def test_a_client_that_takes_over_ends_it():
 
 
 def test_no_command_of_an_ended_recovery_reaches_the_loop():
-    """A client's stop came after the last confirmation, and before the first command of the return."""
+    """A client sends a stop after the last confirmation and before the first command of the return."""
     bench, block = Bench(), SharedBlock.create(SIZES)
     bench.trip(Flag.TRIP_STALE)
     confirmed = bench.run(10.0)
@@ -310,7 +313,7 @@ def test_no_command_of_an_ended_recovery_reaches_the_loop():
 
 @pytest.mark.parametrize("command", [(Kind.RESET_TRIP, ()), (Kind.SET_MODE, (0.0,)), (Kind.SET_MODE, (3.0,))])
 def test_a_recovery_without_permission_may_send_nothing(command):
-    """A client's stop and reset need no permission; those of a recovery do."""
+    """A client may always send a stop and a reset; a recovery needs permission for them."""
 
     def refuse() -> None:
         raise Refusal("ended")
@@ -327,7 +330,7 @@ def test_a_recovery_without_permission_may_send_nothing(command):
 
 def test_a_stop_that_came_before_the_service_saw_the_trip_ends_it():
     bench = Bench()
-    bench.loop.has_tripped(Flag.TRIP_STALE)
+    bench.loop.record_trip(Flag.TRIP_STALE)
     bench.loop.trip = bench.loop.trip._replace(is_stopped=True)
     bench.recovery.observe()
     assert bench.run(60.0) is None
@@ -353,7 +356,7 @@ def test_a_service_that_may_not_drive_does_not_return(change, reason):
 def test_another_law_is_not_returned_to():
     bench = Bench()
     bench.trip(Flag.TRIP_STALE)
-    bench.loop.prepared = with_interlocks(None, position_um=59.0)
+    bench.loop.prepared = change_interlocks(None, position_um=59.0)
     assert bench.run(60.0) is None
     assert "changed" in bench.report["reason"]
 
@@ -409,7 +412,7 @@ def test_the_pause_between_starts_doubles_up_to_a_limit():
 
 
 def set_column(column: int, value: float):
-    """A change of one tick among the rows."""
+    """Return a change that sets a column in one of the rows."""
 
     def change(rows: Any) -> None:
         rows[5, column] = value
@@ -447,7 +450,7 @@ AXIS = {name: signals.axis_column(0, column) for name, column in
 def test_a_reading_is_sound_within_the_limits_of_the_interlocks(column, value, reason):
     rows = sound_rows(10)
     rows[5, column] = value
-    assert unsound_reason(rows, with_interlocks(None, late_ticks=0, sample_age_us=1000.0)) is reason
+    assert unsound_reason(rows, change_interlocks(None, late_ticks=0, sample_age_us=1000.0)) is reason
 
 
 @pytest.mark.parametrize(
@@ -456,7 +459,7 @@ def test_a_reading_is_sound_within_the_limits_of_the_interlocks(column, value, r
      (signals.LATENESS, 499.0, None)],
 )  # fmt: skip
 def test_enable_and_lateness_are_judged_where_they_are_set(column, value, reason):
-    prepared = with_interlocks("adc0", late_ticks=2, late_us=500.0)
+    prepared = change_interlocks("adc0", late_ticks=2, late_us=500.0)
     rows = sound_rows(10)
     rows[:, signals.ENABLE] = 5.0
     assert unsound_reason(rows, prepared) is None
@@ -465,8 +468,8 @@ def test_enable_and_lateness_are_judged_where_they_are_set(column, value, reason
 
 
 def test_the_ramp_of_a_return_is_smooth_and_slow_enough():
-    """Its steepest part, by the derivative of the cosine: pi/2 of the mean; for a drive over its whole range that is
-    a sixth of the slew of a trip."""
+    """The steepest slope of the cosine is pi/2 of the mean slope: at most a sixth of the trip's slew rate, for a drive
+    from the end of its range."""
     ticks, limits = ramp_ticks(SimpleNamespace(prepared=PREPARED)), PREPARED.configuration.axes[0].limits  # type: ignore[arg-type]
     samples = raised_cosine(-limits.drive_v, 0.0, ticks)
     steepest_v_per_s = np.max(np.abs(np.diff(samples))) * PREPARED.plan.pacing.rate_hz

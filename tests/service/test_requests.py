@@ -1,4 +1,4 @@
-"""The table of requests: dispatch, description and the panel's proxy derive from it."""
+"""Dispatch, description and the panel's proxy derive from the table of requests."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ PATHS = openapi(["x", "y"])["paths"]
 
 
 def response(method: str, path: str, query: bytes = b"") -> tuple[int, dict[str, str]]:
-    """Status and headers of the API's answer to a request without a body."""
+    """Return status and headers of the API's response to a request without a body."""
     messages: list[Any] = []
 
     async def receive() -> dict[str, Any]:
@@ -62,10 +62,10 @@ def test_the_description_allows_the_names_that_the_service_takes(name: str):
 
 
 @pytest.mark.parametrize(
-    ("name", "shown"), [("/" + "x" * 39, "'/" + "x" * 39 + "';"), ("x" * 41, "x'…;"), ("ü/", "\\xfc/';")]
+    ("name", "text"), [("/" + "x" * 39, "'/" + "x" * 39 + "';"), ("x" * 41, "x'…;"), ("ü/", "\\xfc/';")]
 )
-def test_a_refused_name_is_shown_up_to_its_fortieth_character(name: str, shown: str):
-    assert shown in (name_problem(name) or "")
+def test_a_refused_name_is_shown_up_to_its_fortieth_character(name: str, text: str):
+    assert text in (name_problem(name) or "")
 
 
 def test_a_method_that_is_not_allowed_gets_all_that_are():

@@ -1,6 +1,6 @@
-"""Taps made anew for a resonance that was measured: what is shown, what is sent, and when nothing is.
+"""Retuning: new taps for a measured resonance and gain are shown, and sent only by consent and if they are better.
 
-The measurement itself is in test_response.py; here the service is one that answers what it is told to.
+The oracle is a simulation by scipy. The service is a stand-in; the measurement itself is tested in test_response.py.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ points_per_tick = 2
 
 
 class Service:
-    """Runs TEXT with `taps`, and measured `hz` and, where it is given, `gain` with its standard deviation."""
+    """Stand-in service that runs TEXT with `taps`, and measures `hz` and, if given, `gain` (value, std)."""
 
     def __init__(
         self,
@@ -99,49 +99,49 @@ REQUEST = RetuneRequest("x", within_percent=0.0)
 
 
 def overshoot(hz: float, taps: dict[str, list[float]], gain: float = 1.0) -> float:
-    """Of a step of the loop with another resonance and gain, by scipy, a tick at a time."""
+    """Return the overshoot (1 is 100 %) of a unit step with another resonance and gain, simulated with scipy."""
     omega = 2 * np.pi * hz
     plant = signal.tf2ss([gain * omega**2], [1.0, 2 * DAMPING * omega, omega**2])
     a, b, c, _, _ = signal.cont2discrete(plant, PERIOD_S, "zoh")
     step = np.ones(400)
-    wanted, added = (signal.lfilter(taps[name], 1.0, step) for name in ("taps", "command_taps"))
-    x, total, before, position = np.zeros((2, 1)), 0.0, 0.0, np.zeros(step.size)
+    reference_um, command_um = (signal.lfilter(taps[name], 1.0, step) for name in ("taps", "command_taps"))
+    x, integral, previous_error, position = np.zeros((2, 1)), 0.0, 0.0, np.zeros(step.size)
     for k in range(step.size):
         position[k] = (c @ x).item()
-        error = wanted[k] - position[k]
-        total, before = total + 30.0 * PERIOD_S * (error + before), error
-        x = a @ x + b * (total + added[k])
+        error = reference_um[k] - position[k]
+        integral, previous_error = integral + 30.0 * PERIOD_S * (error + previous_error), error
+        x = a @ x + b * (integral + command_um[k])
     return float(position.max() - 1)
 
 
 def test_the_taps_that_are_sent_fit_the_measured_resonance(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     service = Service(tmp_path, 1.06 * HZ)
     assert retune_axis(service, REQUEST, yes=True, as_json=False) == 0  # type: ignore[arg-type]
-    said = capsys.readouterr().out
-    assert "+6.00 % from the model's" in said
-    assert "swapped at tick 1234" in said
+    output = capsys.readouterr().out
+    assert "+6.00 % from the model's" in output
+    assert "swapped at tick 1234" in output
     assert overshoot(1.06 * HZ, service.tuned) < 0.011
     assert overshoot(HZ, service.tuned) > 0.02
 
 
 @pytest.fixture(scope="module")
-def sent(tmp_path_factory: pytest.TempPathFactory) -> Service:
-    """A service with a gain 5 % below its model's, after a retuning."""
+def retuned(tmp_path_factory: pytest.TempPathFactory) -> Service:
+    """Return a service whose gain is 5 % below its model's, after a retuning."""
     service = Service(tmp_path_factory.mktemp("gain"), HZ, LOW_GAIN)
     assert retune_axis(service, REQUEST, yes=True, as_json=True) == 0  # type: ignore[arg-type]
     return service
 
 
-def test_the_taps_that_are_sent_fit_the_measured_gain(sent: Service):
-    assert sent.gain_um == pytest.approx(2.5, rel=0.01)  # a quarter of the specification's largest step
-    assert overshoot(HZ, sent.tuned, LOW_GAIN[0]) < 0.011
-    assert overshoot(HZ, sent.tuned) > 0.02
+def test_the_taps_that_are_sent_fit_the_measured_gain(retuned: Service):
+    assert retuned.gain_um == pytest.approx(2.5, rel=0.01)  # a quarter of the specification's largest step
+    assert overshoot(HZ, retuned.tuned, LOW_GAIN[0]) < 0.011
+    assert overshoot(HZ, retuned.tuned) > 0.02
 
 
 def test_taps_that_are_no_better_are_not_sent_whatever_the_consent(
-    sent: Service, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    retuned: Service, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
-    service = Service(tmp_path, HZ, LOW_GAIN, sent.tuned)
+    service = Service(tmp_path, HZ, LOW_GAIN, retuned.tuned)
     assert retune_axis(service, REQUEST, yes=True, as_json=False) == 1  # type: ignore[arg-type]
     text = capsys.readouterr().out
     assert "static gain of the plant 0.9500 ± 0.0010 (standard deviation) between 0 and 2.5" in text
@@ -154,16 +154,16 @@ def test_taps_that_are_no_better_are_not_sent_whatever_the_consent(
 def test_a_gain_that_is_too_uncertain_is_not_taken(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, std: float, gain: float
 ):
-    made_for = list[float]()
+    design_gains = list[float]()
 
-    def no_taps(subject: Subject, **_: Any) -> None:
-        made_for.append(subject.plant.dc_gain)
+    def refuse_design(subject: Subject, **_: Any) -> None:
+        design_gains.append(subject.plant.dc_gain)
         raise NoDesign("none")
 
-    monkeypatch.setattr("rtloop.client.retuning.design_taps", no_taps)
+    monkeypatch.setattr("rtloop.client.retuning.design_taps", refuse_design)
     with pytest.raises(NoDesign):
         retune_axis(Service(tmp_path, HZ, (0.95, std)), REQUEST, yes=True, as_json=False)  # type: ignore[arg-type]
-    assert made_for == [pytest.approx(gain)]
+    assert design_gains == [pytest.approx(gain)]
 
 
 def test_a_gain_too_far_from_the_model_s_changes_nothing(tmp_path: Path):
@@ -176,21 +176,21 @@ def test_a_gain_too_far_from_the_model_s_changes_nothing(tmp_path: Path):
 def test_without_consent_nothing_is_sent(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     service = Service(tmp_path, 0.95 * HZ)
     assert retune_axis(service, REQUEST, yes=False, as_json=True) == 1  # type: ignore[arg-type]
-    said = json.loads(capsys.readouterr().out)
-    assert said["percent_from_model"] == pytest.approx(-5.0)
-    assert said["tick"] is None
-    assert said["after"]["overshoot"] <= 0.011
-    assert said["after"]["settling_ms"] < 3.2 < said["before"]["settling_ms"]
+    report = json.loads(capsys.readouterr().out)
+    assert report["percent_from_model"] == pytest.approx(-5.0)
+    assert report["tick"] is None
+    assert report["after"]["overshoot"] <= 0.011
+    assert report["after"]["settling_ms"] < 3.2 < report["before"]["settling_ms"]
     assert not service.tuned
 
 
 @pytest.mark.parametrize(
-    ("hz", "said"),
+    ("hz", "message"),
     [(None, "no lightly damped mode stands out"), (1.2 * HZ, r"720.00 Hz, \+20.00 % .*allowed: within ±15 %")],
 )
-def test_a_resonance_that_is_not_there_or_too_far_changes_nothing(tmp_path: Path, hz: float | None, said: str):
+def test_a_resonance_that_is_not_there_or_too_far_changes_nothing(tmp_path: Path, hz: float | None, message: str):
     service = Service(tmp_path, hz)
-    with pytest.raises(LoopFault, match=said):
+    with pytest.raises(LoopFault, match=message):
         retune_axis(service, REQUEST, yes=True, as_json=False)  # type: ignore[arg-type]
     assert not service.tuned
 
@@ -207,7 +207,7 @@ def test_a_proposal_is_swapped_in_by_consent_while_its_old_taps_are_in_force(
     assert overshoot(1.06 * HZ, service.tuned) < 0.011
 
     stale = proposal | {"replaces": proposal["prefilter"]}
-    for axis, text, error, said in (
+    for axis, text, error, message in (
         ("x", json.dumps(stale), LoopFault, "changed since the proposal"),
         ("z", json.dumps(proposal), ConfigError, "axis: 'z' is unknown; allowed: "),
         ("x", "{}", ConfigError, "proposal: not a proposal; allowed: the output of"),
@@ -219,6 +219,6 @@ def test_a_proposal_is_swapped_in_by_consent_while_its_old_taps_are_in_force(
         ),
     ):
         service.tuned = {}
-        with pytest.raises(error, match=said):
+        with pytest.raises(error, match=message):
             swap_proposal(service, axis, text, as_json=True)  # type: ignore[arg-type]
         assert not service.tuned

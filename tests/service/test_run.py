@@ -1,4 +1,4 @@
-"""`rtloop run` as a user meets it: real processes, real signals, a real recording."""
+"""`rtloop run` with real processes, signals and recordings."""
 
 from __future__ import annotations
 
@@ -26,37 +26,40 @@ ENVIRONMENT = os.environ | {"PYTHONPATH": str(ROOT)}
 
 
 def start(*arguments: str | Path, **options: object) -> subprocess.Popen[str]:
+    """Start an rtloop command as a process with captured output; `options` are those of Popen."""
     command = [sys.executable, "-m", "rtloop", *map(str, arguments)]
     settings: dict = {"env": ENVIRONMENT, "stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
     return subprocess.Popen(command, **(settings | options))
 
 
 def finish(process: subprocess.Popen[str]) -> tuple[int, dict, str]:
+    """Wait for the end of a process; return its exit code, its JSON summary ({} without one) and its stderr."""
     out, err = process.communicate(timeout=TIMEOUT_S)
     assert "Traceback" not in err, err
     return process.returncode, json.loads(out) if out.strip() else {}, err
 
 
 def run(*arguments: str | Path, **options: object) -> tuple[int, dict, str]:
+    """Execute `rtloop run --json`; return its exit code, summary and stderr."""
     return finish(start("run", *arguments, "--json", **options))
 
 
 def children(process: subprocess.Popen[str]) -> dict[str, int]:
-    """Process ids of loop and recorder, once both were started."""
-    found: dict[str, int] = {}
+    """Return the process IDs of loop and recorder, by their modules, as soon as both have started."""
+    pids: dict[str, int] = {}
     deadline = time.monotonic() + TIMEOUT_S
-    while len(found) < 2 and time.monotonic() < deadline:
+    while len(pids) < 2 and time.monotonic() < deadline:
         for child in Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split():
             command = Path(f"/proc/{child}/cmdline").read_bytes().decode()
             for name in ("engine.process", "capture.recorder"):
                 if name in command:
-                    found[name] = int(child)
+                    pids[name] = int(child)
         time.sleep(0.01)
-    return found
+    return pids
 
 
 def wait_for_ticks(folder: Path) -> None:
-    """Until the recorder has written ticks, so that the loop surely runs."""
+    """Wait until the recorder has written ticks, which proves that the loop runs."""
     deadline = time.monotonic() + TIMEOUT_S
     while time.monotonic() < deadline:
         if any(path.stat().st_size > 20_000 for path in folder.glob("*.part")):
@@ -75,7 +78,7 @@ def test_a_paced_run_accounts_for_every_tick(tmp_path: Path) -> None:
     assert summary["realtime"]["scheduler"] in ("SCHED_FIFO", "SCHED_OTHER")
     recording = rtloop.load(summary["recording"])
     assert np.array_equal(recording["tick"], np.arange(15_000))
-    # the grid of deadlines is fixed: what is skipped is said
+    # the grid of deadlines is fixed: skipped periods are counted
     periods = 1 + recording["periods_missed"][1:]
     assert np.array_equal(np.diff(recording["deadline_ns"]), periods * 100_000)
     assert np.all(recording["lateness_us"] >= 0)
@@ -110,7 +113,7 @@ def test_a_name_may_hold_what_patterns_and_markup_are_made_of(tmp_path: Path) ->
 
 @pytest.mark.parametrize("numbers", [[signal.SIGTERM], [signal.SIGINT, signal.SIGINT, signal.SIGTERM]])
 def test_signals_ramp_down_and_complete_the_recording(tmp_path: Path, numbers: list[signal.Signals]) -> None:
-    """However many come while the loop ramps down and the recorder writes the end."""
+    """More signals may arrive while the loop ramps down and the recorder writes the end."""
     process = start("run", PAPER, "--out", tmp_path, "--json")
     wait_for_ticks(tmp_path)
     for number in numbers:
@@ -191,15 +194,15 @@ def test_a_trip_is_recorded_and_ends_with_exit_1(tmp_path: Path) -> None:
 def test_realtime_that_is_required_and_refused_ends_with_77(tmp_path: Path) -> None:
     config = tmp_path / "strict.toml"
     config.write_text(PAPER.read_text().replace("# require_realtime = false", "require_realtime = true"))
-    code, summary, err = run(config, "--duration", "0.1", "--out", tmp_path, preexec_fn=_without_realtime)
+    code, summary, err = run(config, "--duration", "0.1", "--out", tmp_path, preexec_fn=_drop_realtime)
     assert code == 77
     assert "require_realtime" in err
     assert summary["exit_code"] == 77
     assert not list(tmp_path.glob("*.mcap*"))
 
 
-def _without_realtime() -> None:
-    """Take CAP_SYS_NICE and CAP_IPC_LOCK away for good, and the limits that would grant the same."""
+def _drop_realtime() -> None:
+    """Drop CAP_SYS_NICE and CAP_IPC_LOCK for good, and set the limit of real-time priority to 0."""
     import ctypes
     import resource
 
@@ -220,7 +223,7 @@ def test_eight_axes_lose_nothing(tmp_path: Path) -> None:
 
 
 def eight_axes() -> str:
-    """The paper's axis eight times, each on a plant of its own."""
+    """Return a configuration with the paper's axis eight times, each on a separate plant."""
     text = PAPER.read_text()
     head, axis = text[: text.index("[[axis]]")], text[text.index("[[axis]]") : text.index("[recording]")]
     channel = head[head.index("[driver.channels.x]") : head.index("# The rig's truth")]
@@ -242,12 +245,12 @@ def test_an_output_folder_that_cannot_be_made_ends_with_73(tmp_path: Path) -> No
 
 
 def test_a_recording_that_does_not_open_ends_the_start(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """As on a file system that does not answer; the loop and its recorder are ready by then."""
+    """Loop and recorder are ready, but the recording does not open, as on a file system that hangs."""
 
-    def begin_to_wait(*_: object) -> None:
+    def expire_start(*_: object) -> None:
         monkeypatch.setattr(supervisor, "START_TIMEOUT_S", 0.0)
 
-    monkeypatch.setattr(supervisor.RecorderKeeper, "start", begin_to_wait)
+    monkeypatch.setattr(supervisor.RecorderKeeper, "start", expire_start)
     with pytest.raises(UnavailableError, match="the recording was not open within 0 s"):
         rtloop.run(PAPER, duration_s=0.1, unpaced=True, folder=tmp_path)
     assert list(tmp_path.iterdir()) == []

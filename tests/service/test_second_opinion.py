@@ -1,4 +1,4 @@
-"""A service asks python-control about its loop before it may first be armed."""
+"""python-control verifies the loop of a service, as an independent oracle, before the service is first armed."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ PAPER = Path(__file__).parents[2] / "deploy" / "paper.toml"
 
 @pytest.fixture
 def prepared(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Prepared:
-    """The paper's loop, with an empty cache."""
+    """Return the paper's prepared loop; the cache of agreements is empty."""
     monkeypatch.setattr(second_opinion, "CACHE_FOLDER", tmp_path)
     return prepare(load(PAPER))
 
 
-def with_louder_controller(prepared: Prepared) -> Prepared:
-    """The same plan, whose controller has an output gain that is wrong by 1 %."""
+def increase_output_gain(prepared: Prepared) -> Prepared:
+    """Return the same plan with a controller whose output gain is 1 % too high."""
     controller = prepared.checks[0].law
     assert controller is not None
     dtype = controller.records().coefficients
@@ -39,7 +39,7 @@ def with_louder_controller(prepared: Prepared) -> Prepared:
 
 def test_a_controller_that_runs_with_a_wrong_gain_cannot_be_armed(prepared: Prepared) -> None:
     opinion = SecondOpinion()
-    opinion.compute(with_louder_controller(prepared))
+    opinion.compute(increase_output_gain(prepared))
     with pytest.raises(
         Refusal, match=r"arm: refused, because rtloop and python-control .* axis\.x: closed-loop poles: "
     ):
@@ -54,7 +54,7 @@ def test_an_agreement_is_stored_and_a_disagreement_is_not(prepared: Prepared, mo
         opinion.compute(prepared)
     assert [opinion.faults for opinion in opinions] == [["axis.x: wrong"], [], []]
     another = SecondOpinion()
-    another.compute(with_louder_controller(prepared))
+    another.compute(increase_output_gain(prepared))
     assert another.faults == ["never asked"]
 
 

@@ -1,4 +1,4 @@
-"""A service where the host refuses a system call that its loop does not need: it goes on, and its end comes."""
+"""A service whose host refuses a system call that the loop does not need: the loop continues, and the service ends."""
 
 from __future__ import annotations
 
@@ -25,6 +25,7 @@ from tests.service.test_run import PAPER
 
 
 def refuse(*_: object, **__: object) -> Any:
+    """Raise the error of a process that has too many open files."""
     raise OSError(errno.EMFILE, os.strerror(errno.EMFILE))
 
 
@@ -58,14 +59,14 @@ def test_a_child_whose_pipes_cannot_be_closed_has_ended():
 def test_a_refusal_after_a_trip_names_the_service_in_its_remedy(name: str | None, option: str):
     service = Service(PAPER, name=name)
     service.faults.append("a dead loop")
-    for refused in (service.arm, service.start):
+    for request in (service.arm, service.start):
         with pytest.raises(Refusal, match=f"the service is tripped; use reset first \\(`rtloop ctl {option}reset`\\)$"):
-            refused()
+            request()
 
 
 @pytest.mark.parametrize("flags", [0, int(Flag.WRITE_FAILED)])
 def test_mode_off_that_the_loop_refuses_is_a_success_only_where_the_outputs_move(flags: int):
-    """The loop refuses it while it is tripped or stops; it stops, too, while its driver refuses every write."""
+    """A tripped or stopping loop refuses mode off; a loop whose driver refuses every write is stopping, too."""
 
     def submit(*_: object, **__: object) -> int:
         raise RefusedByLoop(Kind.SET_MODE, 7)
@@ -81,19 +82,20 @@ def test_mode_off_that_the_loop_refuses_is_a_success_only_where_the_outputs_move
         service.set_mode("off")
 
 
-def fill_queue(*_: object, **__: object) -> Any:
+def refuse_command(*_: object, **__: object) -> Any:
+    """Raise the error of a full queue of commands."""
     raise QueueFull("256 commands wait for the loop already; try again")
 
 
 @pytest.fixture
 def busy_service() -> Service:
-    """A service whose loop takes no more commands."""
+    """Return a service whose loop accepts no more commands."""
     service = Service(PAPER)
-    service._desk = cast(Any, SimpleNamespace(submit=fill_queue))
+    service._desk = cast(Any, SimpleNamespace(submit=refuse_command))
     service.supervisor = cast(Any, SimpleNamespace(latest=lambda: np.zeros(max(FLAGS, MODE) + 1), error=None))
     service.armed = True
     prepared = SimpleNamespace(plan=SimpleNamespace(axes="x"))
-    references = SimpleNamespace(restore_configured=fill_queue)
+    references = SimpleNamespace(restore_configured=refuse_command)
     service.live = cast(Any, SimpleNamespace(prepared=prepared, references=references))
     return service
 
@@ -114,7 +116,7 @@ def test_a_reload_that_finds_the_queue_full_ends_for_systemd(busy_service: Servi
     sent: list[str] = []
     busy_service.notifier = cast(Any, SimpleNamespace(send=lambda **fields: sent.append(next(iter(fields)))))
     busy_service._is_ready = True
-    monkeypatch.setattr(busy_service, "reload_now", fill_queue)
+    monkeypatch.setattr(busy_service, "reload_now", refuse_command)
     busy_service._apply_reload()
     assert sent == ["RELOADING", "READY"]
 

@@ -1,4 +1,4 @@
-"""Runs that end as they begin: of no tick, one or two; tripped, stopped, or with a driver that fails at once."""
+"""Runs of 0, 1 or 2 ticks, and starts that end early: tripped, stopped, or with a driver that fails at once."""
 
 from __future__ import annotations
 
@@ -32,27 +32,27 @@ from tests.service.test_run import ROOT, start
 NOT_THERE = 66
 TRIPPING = ("position_um = 60.0", "position_um = 0.001")
 FAILING = ("    def read(self):\n", '    def read(self):\n        raise OSError("cable [off]\\n\\x1b[31m")\n')
-SECOND = (FAILING[0], f"{FAILING[0]}        if self.drive_v:\n            raise OSError('cable [off]')\n")
+FAILING_SECOND = (FAILING[0], f"{FAILING[0]}        if self.drive_v:\n            raise OSError('cable [off]')\n")
 
 
-def uses(path: Path) -> dict[str, int]:
-    """Exit codes of what can be done with a recording."""
-    name, out = str(path), str(path.with_suffix(""))
+def command_exit_codes(path: Path) -> dict[str, int]:
+    """Return the exit code of each command for a recording, by the command's name."""
+    file, out = str(path), str(path.with_suffix(""))
     commands = {
-        "info": ["info", name],
-        "info --json": ["info", name, "--json"],
-        "plot": ["plot", name],
-        "page": ["plot", name, "--html"],
-        **{to: ["export", name, "--to", to] for to in ("csv", "npz", "parquet")},
-        "replay": ["replay", name],
-        "recover": ["recover", name, "--out", f"{out}-again.mcap"],
+        "info": ["info", file],
+        "info --json": ["info", file, "--json"],
+        "plot": ["plot", file],
+        "page": ["plot", file, "--html"],
+        **{to: ["export", file, "--to", to] for to in ("csv", "npz", "parquet")},
+        "replay": ["replay", file],
+        "recover": ["recover", file, "--out", f"{out}-again.mcap"],
     }
     codes = {}
-    for use, command in commands.items():
-        done = CliRunner().invoke(main, command)
-        assert isinstance(done.exception, SystemExit | None), (use, done.exception)
-        assert "inf s" not in done.output
-        codes[use] = done.exit_code
+    for name, command in commands.items():
+        result = CliRunner().invoke(main, command)
+        assert isinstance(result.exception, SystemExit | None), (name, result.exception)
+        assert "inf s" not in result.output
+        codes[name] = result.exit_code
     return codes
 
 
@@ -70,44 +70,44 @@ def test_a_recording_of_hardly_any_ticks(tmp_path: Path, ticks: int, text: str, 
     else:
         session._write_all()
         path = Path(shutil.copy(f"{path}.part", tmp_path / "left.mcap.part"))
-    codes = uses(path)
+    codes = command_exit_codes(path)
     if ticks:
         assert codes == dict.fromkeys(codes, 0) | ({} if finished else {"replay": 1})
     else:
-        assert {use for use, code in codes.items() if code} == {"plot", "page", "replay"}
+        assert {name for name, code in codes.items() if code} == {"plot", "page", "replay"}
         assert {codes["plot"], codes["page"], codes["replay"]} == {NOT_THERE}
 
 
 @pytest.mark.parametrize(
     ("change", "ticks", "clock"),
-    [(None, 1, []), (FAILING, 1, ["--unpaced"]), (SECOND, 2, [])],
+    [(None, 1, []), (FAILING, 1, ["--unpaced"]), (FAILING_SECOND, 2, [])],
     ids=["one tick", "fails at once, unpaced", "fails then"],
 )
 def test_a_run_of_a_tick_or_two(tmp_path: Path, change: tuple[str, str] | None, ticks: int, clock: list[str]) -> None:
-    """What the driver raised is on the screen, in the summary and in the recording, with driver and tick."""
+    """The driver's error, with driver and tick, is on the screen, in the summary and in the recording."""
     config, environment = install(tmp_path, DRIVER.replace(*change) if change else DRIVER)
     command = [sys.executable, "-m", "rtloop", "run", str(config), "--out", str(tmp_path), *clock]
     command += ["--duration", f"{ticks / 10_000:g}"]
-    done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=120, check=False)
-    assert "Traceback" not in done.stderr, done.stderr
+    result = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=120, check=False)
+    assert "Traceback" not in result.stderr, result.stderr
     (path,) = tmp_path.glob("*.mcap")
     recording = rtloop.load(path)
     assert len(recording) == ticks
     final = recording.events[-1]["what"]
     summary = json.loads(CliRunner().invoke(main, ["info", str(path), "--json"]).output)
     if change is None:
-        assert (done.returncode, final["driver_error"]) == (0, None), done.stderr
+        assert (result.returncode, final["driver_error"]) == (0, None), result.stderr
     else:
-        said = f"driver 'lag': read failed at tick {ticks - 1}: OSError: cable [off]" + " ?[31m" * (change is FAILING)
-        assert done.returncode != 0
-        assert f"rtloop: {said}" in done.stderr
-        assert (final["driver_error"], summary["driver_error"]) == (said, said)
-        assert "cable [off]" in " ".join(done.stdout.split())
-    assert uses(path)["replay"] == 0
+        error = f"driver 'lag': read failed at tick {ticks - 1}: OSError: cable [off]" + " ?[31m" * (change is FAILING)
+        assert result.returncode != 0
+        assert f"rtloop: {error}" in result.stderr
+        assert (final["driver_error"], summary["driver_error"]) == (error, error)
+        assert "cable [off]" in " ".join(result.stdout.split())
+    assert command_exit_codes(path)["replay"] == 0
 
 
 def test_ctrl_c_before_the_loop_runs_ends_well(tmp_path: Path) -> None:
-    """At any instant of the start: nothing is left of it, or a recording that can be read."""
+    """Ctrl-C at a random instant of the start leaves no file, or a readable recording."""
     process = start("run", ROOT / "deploy" / "paper.toml", "--out", tmp_path / "out", start_new_session=True)
     time.sleep(random.SystemRandom().uniform(0.25, 3.5))
     os.killpg(process.pid, signal.SIGINT)
@@ -117,11 +117,11 @@ def test_ctrl_c_before_the_loop_runs_ends_well(tmp_path: Path) -> None:
     recorded = list((tmp_path / "out").glob("*"))
     assert recorded or "nothing was driven, nothing is recorded" in err
     for path in recorded:
-        assert uses(path)["info"] == 0
+        assert command_exit_codes(path)["info"] == 0
 
 
 class StoppedLoop:
-    """A loop's process that was stopped as soon as it was ready: its report comes with its end."""
+    """Process of a loop that was stopped as soon as it was ready: its report arrives with its end."""
 
     def __init__(self) -> None:
         self.exit_code, self.waited = 0, False
@@ -143,7 +143,7 @@ def test_a_loop_that_was_stopped_before_anybody_saw_it_ready_was_ready() -> None
 
 
 class CompilingLoop:
-    """A loop's process that stores a compiled function at each look, `count` in all, and is then ready if `ends`."""
+    """Process of a loop that stores a compiled function at each poll, `count` in all, and then is ready if `ends`."""
 
     def __init__(self, folder: Path, count: int, ends: bool) -> None:
         self.exit_code, self.folder, self.count, self.ends, self.stored = None, folder, count, ends, 0
@@ -160,7 +160,7 @@ class CompilingLoop:
 def test_the_limit_of_a_start_begins_again_with_each_compiled_function(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, is_quiet: bool
 ) -> None:
-    """With no time at all from one look to the next, a start ends only where nothing new was compiled."""
+    """With a limit of 0 s, a start is aborted only after a poll without a newly compiled function."""
     monkeypatch.setattr(cache, "CACHE_FOLDER", tmp_path)
     monkeypatch.setattr(supervisor_module, "START_TIMEOUT_S", 0.0)
     supervisor: Any = object.__new__(Supervisor)

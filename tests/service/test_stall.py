@@ -1,4 +1,4 @@
-"""When ticks stand still: judged in periods of the loop, and in time that the watcher was awake itself."""
+"""Detection of ticks that stand still, in periods of the loop, and in time during which the watcher itself ran."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from rtloop.supervision.stall import StallWatch, stall_limit_s
     ("rate_hz", "limit_s"), [(10_000.0, 0.05), (100.0, 0.05), (15.0, 0.2), (10.0, 0.3), (1.0, 3.0), (0.1, 30.0)]
 )
 def test_a_slow_loop_is_not_taken_for_one_that_stands_still(rate_hz, limit_s):
-    """50 ms are shorter than a period below 20 Hz."""
+    """Below 20 Hz, a period is longer than the limit of 50 ms."""
     assert stall_limit_s(0.05, rate_hz) == pytest.approx(limit_s)
 
 
@@ -30,7 +30,7 @@ def test_time_counts_from_the_last_advance() -> None:
 
 
 def test_a_stall_of_the_host_is_not_the_loops() -> None:
-    """Everybody stood still for a second: the watcher was awake for a moment of it."""
+    """All processes stood still for a second, of which the watcher counts its longest step only."""
     watch = StallWatch(limit_s=0.05, longest_step_s=0.02)
     watch.has_stalled(7, 0.0)
     assert not watch.has_stalled(7, 1.0)

@@ -1,4 +1,4 @@
-"""Parts of the supervisor by themselves: words for an end, folders and file names, a child that does not die."""
+"""Parts of the supervisor: text of a process's end, folders and file names, a child that does not die."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def test_an_end_is_told_as_a_signal_or_an_exit_code(code: int, text: str) -> Non
 
 
 def test_recordings_of_the_same_second_are_numbered_from_2(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The folder is created with those above it; an unfinished recording has its name, too."""
+    """The folder is created with its parent folders; the name of an unfinished recording is in use, too."""
     monkeypatch.setattr("time.strftime", lambda form: "20260101T120000")
     prepared, folder = prepare(load(PAPER), paced=False), tmp_path / "of" / "today"
     names = []
@@ -54,12 +54,12 @@ def test_a_folder_for_recordings_that_cannot_be_made_is_named(tmp_path: Path) ->
 
 
 def test_a_header_says_whether_every_tick_is_recorded() -> None:
-    whole, around = (
+    complete, windowed = (
         recording_header(prepare(parse(PAPER.read_text() + text, "test", PAPER.parent, "test"), paced=False), {})
         for text in ("", '\n[recording.around]\non = ["trip"]\nbefore_s = 1.0\nafter_s = 1.0\n')
     )
-    assert (whole["format"], around["format"]) == (1, 2)
-    assert ("around" in whole and whole["around"] is not None, around["around"]["on"]) == (False, ("trip",))
+    assert (complete["format"], windowed["format"]) == (1, 2)
+    assert ("around" in complete and complete["around"] is not None, windowed["around"]["on"]) == (False, ("trip",))
 
 
 @pytest.mark.parametrize("user", [0, 1000])
@@ -82,7 +82,7 @@ def test_a_measured_delay_that_cannot_be_stored_is_an_error_with_the_path(
 
 
 def test_a_child_that_outlives_its_signal_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A process hangs in the kernel, say in a driver; here nobody sends it the signal."""
+    """A process may hang in the kernel, for example in a driver; in this test no signal is sent."""
     monkeypatch.setattr(child_module, "END_TIMEOUT_S", 0.2)
     process = subprocess.Popen(["sleep", "60"], stdin=subprocess.PIPE, stdout=subprocess.PIPE)
     child: Any = SimpleNamespace(
