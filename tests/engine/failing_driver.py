@@ -1,4 +1,4 @@
-"""Driver in plain Python whose inputs and failures a test scripts."""
+"""Driver in plain Python with scripted readings and failures."""
 
 from __future__ import annotations
 
@@ -9,7 +9,10 @@ from rtloop.drivers.python import PythonDriver
 
 
 class ScriptedDriver(PythonDriver):
-    """Reads `volts(k)` at read number k and stores writes in `written`; `volts` and `refuse` may raise."""
+    """Driver that returns `volts(k)` V at read number k, from 0, and stores accepted writes (V) in `written`.
+
+    Each write first calls `refuse` with the number of accepted writes. Either function may raise an exception.
+    """
 
     kind = "scripted"
 
@@ -23,10 +26,10 @@ class ScriptedDriver(PythonDriver):
         return Facts((Channel("adc0"),), (Channel("dac0"),), ("x_true_position_um", "x_hysteresis_um"), real=False)
 
     def start(self) -> None:
-        """Has no resource to open."""
+        """Do nothing: a scripted driver has no resource to open."""
 
     def stop(self) -> None:
-        """Has no resource to close."""
+        """Do nothing: a scripted driver has no resource to close."""
 
     def read(self) -> Sequence[float]:
         self.reads += 1

@@ -1,4 +1,4 @@
-"""A whole loop in the test's process: from a configuration's text to records, in virtual or scripted time."""
+"""Complete control loop in the test's process, from a configuration's text to records, in virtual or scripted time."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ def text(*parts: str, mode: str = "closed_loop", rate_hz: float = 10_000, seed: 
 
 
 def prepare_text(configuration: str, folder: Path = Path()) -> Prepared:
-    """Prepare an unpaced run without end; files are relative to `folder`."""
+    """Return a prepared, unpaced run without end; its files are relative to `folder`."""
     return prepare(parse(configuration, "test", folder, "test"), paced=False)
 
 
@@ -90,7 +90,7 @@ def plan_of(configuration: str, folder: Path = Path()) -> Plan:
 
 
 class LoopBench:
-    """Loop whose records, events and snapshots the test reads; in virtual time, or by a scripted `clock`."""
+    """Control loop that a test runs in virtual time or by a scripted `clock`; methods return its records and events."""
 
     def __init__(self, plan: str | Plan, driver: Driver | None = None, clock: ScriptedClock | None = None) -> None:
         self.plan = plan_of(plan) if isinstance(plan, str) else plan
@@ -152,12 +152,12 @@ class LoopBench:
         send(self.block, message(kind, axis=axis, origin=origin, values=values))
 
     def column(self, rows: npt.NDArray[np.float64], name: str) -> npt.NDArray[np.float64]:
-        """Return one signal of the records."""
+        """Return the signal `name` (n,) of the records `rows` (n, columns)."""
         return rows[:, self.plan.columns.index(name)]
 
 
 SCRIPT = np.dtype(
-    [("rows", np.int64), ("row", np.int64), ("address", np.int64), ("looks", np.int64), ("now_ns", np.float64)]
+    [("rows", np.int64), ("row", np.int64), ("address", np.int64), ("readings", np.int64), ("now_ns", np.float64)]
 )
 
 
@@ -171,7 +171,7 @@ def scripted_wait(context, timing):
     out = carray(timing, 4)
     for i in range(4):
         out[i] = data[script.row, i]
-    script.now_ns, script.looks = out[1], 0
+    script.now_ns, script.readings = out[1], 0
     script.row += 1
     return 0
 
@@ -180,8 +180,8 @@ def scripted_wait(context, timing):
 def scripted_now(context, timing):
     """Advance by 4 µs before the first reading of the clock in a tick, by 8 µs before the second, and so on."""
     script = carray(context, 1, SCRIPT)[0]
-    script.looks += 1
-    script.now_ns += 4_000.0 * script.looks
+    script.readings += 1
+    script.now_ns += 4_000.0 * script.readings
     carray(timing, 4)[0] = script.now_ns
     return 0
 

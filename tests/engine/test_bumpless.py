@@ -1,4 +1,4 @@
-"""A change of mode under a sine, on the rig: no larger step of the demand than the sine itself makes."""
+"""Mode changes on the rig under a sine: the demand makes no larger step than under the sine alone."""
 
 from __future__ import annotations
 
@@ -15,21 +15,21 @@ PAPER_RIG = ""
 
 
 def reference(mode: str) -> str:
-    """A 5 Hz sine, in V for raw and in µm otherwise; not at rest when the mode changes."""
+    """Return a 5 Hz sine, in V for raw and in µm otherwise, that is not at rest when the mode changes."""
     amplitude, offset = SINES[mode]
     return f'{{ kind = "sine", amplitude = {amplitude}, offset = {offset}, frequency_hz = 5.0, phase_deg = 90.0 }}'
 
 
-def run(before: str, after: str | None, rig: str, lines: str) -> np.ndarray:
-    """Demand in V of each tick."""
+def run_mode_change(before: str, after: str | None, rig: str, lines: str) -> np.ndarray:
+    """Return the demand (V) of each tick; at SWITCH the mode changes to `after`, or stays the same if that is None."""
     schedule = f'[[schedule]]\nat_tick = {SWITCH}\nmode = "{after}"\n' if after else ""
     if after:
         schedule += f"[[schedule]]\nat_tick = {SWITCH}\nreference = {reference(after)}\n"
     axis = AXIS.replace('name = "x"', f'name = "x"\nreference = {reference(before)}')
     bench = LoopBench(text(rig, axis, CONTROLLER, lines, schedule, mode=before))
     rows = bench.run(TICKS)
-    names = ["off", "raw", "feedforward", "closed_loop"]
-    assert bench.column(rows, "mode")[-1] == names.index(after or before)
+    modes = ["off", "raw", "feedforward", "closed_loop"]
+    assert bench.column(rows, "mode")[-1] == modes.index(after or before)
     assert not np.any(bench.column(rows, "flags"))
     return bench.column(rows, "x_demand_v")
 
@@ -38,19 +38,19 @@ def run(before: str, after: str | None, rig: str, lines: str) -> np.ndarray:
 @pytest.mark.parametrize("lines", [MATCHED, TUSTIN], ids=["matched", "tustin"])
 @pytest.mark.parametrize(("before", "after"), [*permutations(SINES, 2)])
 def test_changes_are_bumpless(before, after, lines, rig):
-    switched = run(before, after, rig, lines)
-    unswitched = run(before, None, rig, lines)
+    switched = run_mode_change(before, after, rig, lines)
+    unswitched = run_mode_change(before, None, rig, lines)
     assert np.array_equal(switched[:SWITCH], unswitched[:SWITCH])
-    bump = abs(switched[SWITCH] - switched[SWITCH - 1])
-    usual = np.abs(np.diff(unswitched[SWITCH - 2000 :])).max()  # a period of the sine, long after the start
-    assert bump <= 1.1 * usual
+    bump_v = abs(switched[SWITCH] - switched[SWITCH - 1])
+    sine_step_v = np.abs(np.diff(unswitched[SWITCH - 2000 :])).max()  # one period of the sine, long after the start
+    assert bump_v <= 1.1 * sine_step_v
 
 
 @pytest.mark.parametrize("rig", [IDEAL, PAPER_RIG], ids=["ideal sensor", "paper's rig"])
 @pytest.mark.parametrize("lines", [MATCHED, TUSTIN], ids=["matched", "tustin"])
 @pytest.mark.parametrize("before", ["raw", "feedforward"])
 def test_closing_the_loop_on_a_large_error(before, lines, rig):
-    """12 µm away from the reference: the error dies out with bump_s = 20 ms, and the drive follows no faster."""
+    """The reference is 12 µm away: the error decays with bump_s = 20 ms, and the drive moves no faster."""
     schedule = f'[[schedule]]\nat_tick = {SWITCH}\nmode = "closed_loop"\n'
     schedule += f'[[schedule]]\nat_tick = {SWITCH}\nreference = {{ kind = "hold", value = 12.0 }}\n'
     axis = AXIS.replace('name = "x"', 'name = "x"\nreference = { kind = "hold", value = 0.0 }')

@@ -20,7 +20,7 @@ RAW = text(IDEAL, AXIS, mode="raw")
 
 
 def wait(clock: Clock) -> tuple[float, float, float, float]:
-    """Deadline, wake, periods missed, monotonic time, all in ns."""
+    """Wait for the next tick; return its deadline, wake, count of missed periods and monotonic time (times in ns)."""
     timing = (ctypes.c_double * 4)()
     assert FUNCTION(clock.wait)(clock.context, timing) == 0
     return tuple(timing)
@@ -51,22 +51,22 @@ def test_a_tick_on_time():
 
 
 def test_missed_periods_are_counted_and_skipped():
-    """The clock's start is set into the past instead of waiting: the same arithmetic, periods of 1000 s."""
+    """The test does not wait: it sets the clock's start into the past, with periods of 1000 s."""
     context = clock_context(1e9 / PERIOD_NS)
     clock = paced_clock(context, 0.0)
-    late = [0.5, 10.5, 13.25, 14.25, 14.75 + 1e3]  # in periods, at each wait
-    grid, missed_in_all = [], 0
-    for periods in late:
+    elapsed_periods = [0.5, 10.5, 13.25, 14.25, 14.75 + 1e3]  # since the start, at each wait
+    deadlines, missed_total = [], 0
+    for periods in elapsed_periods:
         context.start_ns = time.monotonic_ns() - round(periods * PERIOD_NS)
         if periods == 14.25:  # tick 14 was due 0.25 periods ago: late, yet no whole period has passed
             assert context["index"][0] == 14
         deadline, wake, missed, _ = wait(clock)
-        grid.append(deadline / PERIOD_NS)
-        missed_in_all += int(missed)
+        deadlines.append(deadline / PERIOD_NS)
+        missed_total += int(missed)
         assert wake >= deadline
         assert wake - deadline < PERIOD_NS
-        assert context["index"][0] == len(grid) + missed_in_all
-    assert grid == [0, 10, 13, 14, 1014]
+        assert context["index"][0] == len(deadlines) + missed_total
+    assert deadlines == [0, 10, 13, 14, 1014]
 
 
 @pytest.mark.parametrize("rate_hz", [3_000, 7, 44_100])
@@ -89,7 +89,7 @@ def test_a_late_tick_runs_once():
     assert bench.column(rows, "tick").tolist() == [0, 1, 2, 3, 4]
     assert bench.column(rows, "periods_missed").tolist() == [0, 0, 5, 0, 6]
     np.testing.assert_allclose(bench.column(rows, "lateness_us"), [20, 20, 90, 20, 10])
-    assert bench.events() == [(2, Kind.PERIODS_MISSED, 5.0, 0.0)]  # the second belongs to the same episode
+    assert bench.events() == [(2, Kind.PERIODS_MISSED, 5.0, 0.0)]  # the second late tick belongs to the same episode
 
 
 def test_an_episode_of_late_ticks_ends_with_its_totals():
@@ -97,7 +97,7 @@ def test_an_episode_of_late_ticks_ends_with_its_totals():
     ticks = 38_000
     missed = np.zeros(ticks)
     missed[[100, 105, 400]] = 5, 7, 611
-    missed[22_000] = 4  # alone: its first event says all
+    missed[22_000] = 4  # a single late tick: its first event has the total
     missed[33_000], missed[37_990] = 2, 3
     script = np.zeros((ticks, 4))
     script[:, 0] = 1e5 * (np.arange(ticks) + np.cumsum(missed))
@@ -126,9 +126,9 @@ def test_measured_times_and_overruns():
 
 
 def test_virtual_time_waits_for_the_recorder():
-    """No slot of the ring is overwritten before it was read: the writer waits at the reader's slack."""
+    """No slot of the ring is overwritten before it is read: the writer waits for the reader."""
     bench = LoopBench(RAW)
-    rows = bench.run(150_000)  # more than twice what the ring holds; `run` reads in between, and loses nothing
+    rows = bench.run(150_000)  # more than two rings; `run` drains the ring in between and loses no slot
     assert np.array_equal(bench.column(rows, "tick"), np.arange(150_000))
     assert np.array_equal(bench.column(rows, "deadline_ns"), np.arange(150_000) * 100_000.0)
     assert np.all(np.isnan(rows[:, 2:7]))

@@ -17,6 +17,7 @@ RAW = text(IDEAL, AXIS, CONTROLLER, mode="raw")
 
 
 def hold(bench: LoopBench, value: float) -> None:
+    """Send a command for a constant reference."""
     bench.send(Kind.SET_REFERENCE, Generator.HOLD, value)
 
 
@@ -109,7 +110,7 @@ def test_a_mode_is_refused_while_tripped_and_taken_after_a_reset():
 
 
 def test_into_closed_loop_the_position_in_force_is_held():
-    """From raw mode, with the output held: 3 V are some 7 µm, and the reference in volts is replaced."""
+    """The change from raw mode at 3 V holds the output: the position, some 7 µm, replaces the reference in volts."""
     bench = LoopBench(text(IDEAL, AXIS, CONTROLLER, mode="raw"))
     hold(bench, 3.0)
     before = bench.run(500)

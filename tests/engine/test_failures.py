@@ -1,4 +1,4 @@
-"""Trips, failing drivers, a silent supervisor: each ends in a ramp to the safe value and an event."""
+"""Trips, failing drivers and a lost heartbeat: each ends in a ramp to the safe value and an event."""
 
 from __future__ import annotations
 
@@ -26,10 +26,11 @@ from tests.engine.harness import AXIS, CONTROLLER, FOR_EVER, IDEAL, LoopBench, S
 
 RAW = text(IDEAL, AXIS, '[axis.reference]\nkind = "hold"\nvalue = 3.0\n', mode="raw")
 RAMP = 3.0 - 0.1 * np.arange(1, 31)
-"""The trip's 1000 V/s at 10 kHz, from 3 V."""
+"""Drive (V) of each tick of a ramp from 3 V, by the trip's 1000 V/s at 10 kHz."""
 
 
 def fail_at_40(tick: int) -> float:
+    """Return a reading of 0.1 V; raise OSError in tick 40."""
     if tick == 40:
         raise OSError("the cable is out")
     return 0.1
@@ -67,7 +68,7 @@ def test_stop_word_parks():
 
 
 def test_a_stop_names_who_stopped():
-    """The supervisor, or the loop itself after a write that failed."""
+    """The origin of a stop is the supervisor, or the loop after a write that failed."""
     bench = LoopBench(RAW)
     bench.run(10)
     bench.drain("events")
@@ -111,11 +112,11 @@ def test_a_read_that_fails_is_ramped_down_and_ends_the_run():
 
 @pytest.mark.parametrize("for_good", [False, True])
 def test_a_write_that_fails_is_ramped_down_by_further_writes(for_good: bool):
-    """A card may refuse one value and accept the next; the ramp is tried on a card that refuses all."""
+    """The ramp reaches 0 V on a card that refuses one value, and is tried for a second on a card that refuses all."""
     loop = RefusingLoop(lambda number: number == 26 or (for_good and number > 26))
     drive = loop.bench.column(loop.rows, "x_drive_v")
     assert np.all(drive[:26] == 3.0)  # the tick that failed is recorded
-    if for_good:  # and so are those after it, where the output stays; after a second of them nobody tries any more
+    if for_good:  # the later ticks too; after a second of refused writes the loop gives up
         assert np.all(drive == 3.0)
         assert len(drive) == 25 + 10_001
     else:
@@ -128,12 +129,12 @@ def test_a_write_that_fails_is_ramped_down_by_further_writes(for_good: bool):
 
 
 @pytest.mark.parametrize("refused", [1, 2, 20, 200])
-def test_a_card_that_refuses_for_a_while_is_not_stepped(refused: int):
+def test_a_card_that_refuses_for_a_while_is_not_stepped(refused_count: int):
     """The ramp continues from the last accepted value: each accepted value is one step further."""
-    loop = RefusingLoop(lambda number: 26 <= number < 26 + refused)
+    loop = RefusingLoop(lambda number: 26 <= number < 26 + refused_count)
     assert np.abs(np.diff([3.0, *loop.driver.written])).max() <= 0.1 + 1e-12
     assert loop.driver.written[-1] == 0.0
-    assert np.count_nonzero(loop.failed) == refused
+    assert np.count_nonzero(loop.failed) == refused_count
 
 
 def test_a_card_that_refuses_most_values_is_still_ramped_down():
@@ -179,7 +180,7 @@ def test_a_lost_heartbeat_parks():
 
 
 def test_the_trip_of_a_lost_heartbeat_tells_its_reason():
-    """Of no axis, and so without value and limit."""
+    """The trip belongs to no axis, so its event has no value and no limit."""
     clock = ScriptedClock(np.column_stack([np.zeros((9, 3)), np.full(9, 9e9)]))
     bench = LoopBench(RAW, clock=clock)
     bench.block.store(Word.HEARTBEAT_NS, 5_000_000_000)
@@ -202,6 +203,7 @@ def test_a_status_above_zero_is_recorded_and_no_trip(status, tripped):
 
 
 def refuse_options() -> LoopBack:
+    """Raise ValueError, as a driver does for a wrong option."""
     raise ValueError("device: '/dev/none'; allowed: /dev/card0")
 
 
@@ -225,14 +227,14 @@ def test_a_fault_of_the_plan_begins_with_its_own_key(driver: Callable[[], LoopBa
 
 
 def test_a_loop_in_process_that_ends_early_gives_its_ticks_once(monkeypatch: pytest.MonkeyPatch):
-    """4096 ticks fill its ring; this one ends after 5000 of 20,000."""
+    """The ring has room for 4096 ticks; the loop ends after 5000 of 20,000."""
     plan = plan_of(text(AXIS, CONTROLLER, IDEAL))
     blocks: list[tuple[int, int]] = []
 
-    class Ending(in_process.Assembly):
+    class EarlyEndingAssembly(in_process.Assembly):
         def run(self, tick: int) -> None:
             super().run(min(tick, 5_000))
 
-    monkeypatch.setattr(in_process, "Assembly", Ending)
+    monkeypatch.setattr(in_process, "Assembly", EarlyEndingAssembly)
     ticks = in_process.LoopsInProcess().run(plan, plan.driver(), 20_000, lambda n, rows: blocks.append((n, len(rows))))
     assert (ticks, blocks) == (5_000, [(0, 4_096), (4_096, 904)])

@@ -1,4 +1,7 @@
-"""Simulated lateness: ticks wake late by numbers of a table, and the rig advances by the periods that they miss."""
+"""Simulated lateness: each tick wakes late by a number of a table, and the rig advances by the missed periods.
+
+The oracles are xorshift in Python's integers, and python-control.
+"""
 
 from __future__ import annotations
 
@@ -62,7 +65,7 @@ def run_late(table_us: Sequence[float], ticks: int, *parts: str, **options: Any)
 
 
 def total_lateness_ns(columns: Columns, rate_hz: float) -> np.ndarray:
-    """Return the time from the grid point after the last tick's to the wake of each tick."""
+    """Return for each tick the time (ns) from the grid point after the previous deadline to its wake."""
     deadline_ns = columns["deadline_ns"]
     first_ns = np.floor(np.append(0, np.rint(deadline_ns[:-1] * rate_hz / 1e9) + 1) * (1e9 / rate_hz))
     return np.rint(columns["lateness_us"] * 1e3) + deadline_ns - first_ns
@@ -79,7 +82,7 @@ def test_ticks_draw_from_the_table_by_xorshift(seed):
 
 
 def test_each_number_is_drawn_as_often_as_the_table_has_it():
-    """Single numbers, and numbers of two ticks in a row, pass a test of chi-square; 30 stands twice."""
+    """Single numbers, and pairs of successive ticks, pass a chi-square test; the table has 30 twice."""
     table_us = [10.0, 20.0, 30.0, 30.0, 40.0, 0.0]
     lateness_us = np.rint(run_late(table_us, 60_000)[0]["lateness_us"]).astype(int) // 10
     shares = np.array([1, 1, 1, 2, 1]) / 6
@@ -89,14 +92,14 @@ def test_each_number_is_drawn_as_often_as_the_table_has_it():
 
 
 def test_another_seed_draws_others_and_the_order_of_ticks_is_no_pattern():
-    one, same, other = (run_late(MIXED_US, 2000, seed=seed)[1] for seed in (1, 1, 2))
-    assert one.tobytes() == same.tobytes()
-    assert one.tobytes() != other.tobytes()
+    first, same_seed, other_seed = (run_late(MIXED_US, 2000, seed=seed)[1] for seed in (1, 1, 2))
+    assert first.tobytes() == same_seed.tobytes()
+    assert first.tobytes() != other_seed.tobytes()
 
 
 @pytest.mark.parametrize("rate_hz", [10_000.0, 3_000.0, 44_100.0, 70.0])
 def test_deadlines_stay_on_the_grid(rate_hz):
-    """Tick k is due at k and the periods missed so far; its lateness is below a period, its wake is that drawn."""
+    """Tick k is due after k and the missed periods; its lateness is below a period, its wake is as drawn."""
     period_us = 1e6 / rate_hz
     table_us = np.rint(np.array([0.0, 0.3, 0.999, 1.5, 2.2, 7.25]) * period_us * 1e3) / 1e3
     plan = plan_of(late_text(table_us.tolist(), rate_hz=10_000))
@@ -137,16 +140,16 @@ def test_the_rig_advances_by_the_missed_periods_with_its_outputs_held():
 
 
 def test_a_tick_that_misses_nothing_leaves_the_rig_as_it_is():
-    """Numbers below a period change the column of lateness and nothing else; zeros write 0 in place of NaN."""
+    """Numbers below a period change only the column of lateness; zeros record 0 in place of NaN."""
     plan = plan_of(late_text([]))
-    without = run_in_process(plan, plan.driver(), 2000)
-    lateness = plan.columns.index("lateness_us")
-    assert np.all(np.isnan(without[:, lateness]))
+    rows_without_table = run_in_process(plan, plan.driver(), 2000)
+    lateness_column = plan.columns.index("lateness_us")
+    assert np.all(np.isnan(rows_without_table[:, lateness_column]))
     for table_us, recorded_us in (([0.0], [0.0]), ([0, 40, 99.9], [0.0, 40.0, 99.9])):
         columns, rows = run_late(table_us, 2000)
         assert np.unique(np.round(columns["lateness_us"], 9)).tolist() == recorded_us
-        others = np.delete(np.arange(rows.shape[1]), lateness)
-        assert rows[:, others].tobytes() == without[:, others].tobytes()
+        other_columns = np.delete(np.arange(rows.shape[1]), lateness_column)
+        assert rows[:, other_columns].tobytes() == rows_without_table[:, other_columns].tobytes()
 
 
 def test_loopback_and_delayed_drives_are_held_through_missed_periods():
@@ -161,7 +164,7 @@ def test_loopback_and_delayed_drives_are_held_through_missed_periods():
     timing, inputs = (ctypes.c_double * 4)(), (ctypes.c_double * 6)()
     write = FUNCTION(pointers.write)
     assert write(pointers.context, (ctypes.c_double * 3)(2.5, 3.0, -4.0)) == 0
-    assert not driver.rig[1]["hysteresis_um"][0]  # the drive is on its way
+    assert not driver.rig[1]["hysteresis_um"][0]  # the latency still delays the drive
     assert wait(virtual.clock, timing) == (400_000.0, 450_000.0, 4.0)
     assert driver.rig[1]["dac_v"][0] == 2.5
     assert driver.rig[1]["hysteresis_um"][0] > 1.0
@@ -177,21 +180,21 @@ def wait(clock: Clock, timing: ctypes.Array[ctypes.c_double]) -> tuple[float, fl
     return timing[0], timing[1], timing[2]
 
 
-def first_run_of(values: np.ndarray, length: int) -> int:
-    """Return the index at which `values` were true so many times in a row for the first time."""
+def end_of_first_run(values: np.ndarray, length: int) -> int:
+    """Return the index at which `values` have been true `length` times in a row for the first time."""
     count = 0
     for index, value in enumerate(values):
         count = count + 1 if value else 0
         if count == length:
             return index
-    raise AssertionError("there is no such run")
+    raise AssertionError(f"no run of {length} true values")
 
 
 def test_late_ticks_in_a_row_trip():
     columns, _ = run_late([10.0, 50.0, 250.0, 170.0, 20.0], 3000, TRIP_WHEN_LATE)
     flags = columns["flags"].astype(int)
     tripped = np.flatnonzero(flags & Flag.TRIP_LATE)
-    assert tripped[0] == first_run_of(np.round(columns["lateness_us"], 6) > 40.0, 5) > 4
+    assert tripped[0] == end_of_first_run(np.round(columns["lateness_us"], 6) > 40.0, 5) > 4
     assert trip_causes(int(np.bitwise_or.reduce(flags))) == ["late"]
 
 
@@ -223,9 +226,9 @@ def test_4096_numbers_are_allowed():
 
 
 def test_other_drivers_than_the_simulated_rig_are_refused():
-    text_of_board = late_text([1.0]).replace('kind = "sim"', 'kind = "shm"', 1).replace("latency_ticks = 0", "")
+    board_text = late_text([1.0]).replace('kind = "sim"', 'kind = "shm"', 1).replace("latency_ticks = 0", "")
     with pytest.raises(ConfigError) as raised:
-        prepare(parse(text_of_board, "late", Path(), "late.toml"))
+        prepare(parse(board_text, "late", Path(), "late.toml"))
     assert raised.value.faults == [
         "loop.simulated_lateness_us: set with driver.kind = 'shm'; allowed with the simulated rig only; "
         "set driver.kind = 'sim', or remove the key"
@@ -239,29 +242,29 @@ def test_other_drivers_than_the_simulated_rig_are_refused():
 
 
 def command(*arguments: object, code: int = 0) -> subprocess.CompletedProcess[str]:
-    """Run the command line to its end; it must return `code`."""
-    done = subprocess.run(
+    """Run `rtloop` with `arguments`, require the exit code `code`, and return the finished process."""
+    result = subprocess.run(
         [sys.executable, "-m", "rtloop", *map(str, arguments)], capture_output=True, text=True, timeout=200
     )
-    assert done.returncode == code, done.stderr
-    return done
+    assert result.returncode == code, result.stderr
+    return result
 
 
 def test_a_paced_run_is_refused(tmp_path):
     path = tmp_path / "late.toml"
     path.write_text(late_text([1.0]))
-    done = command("run", path, "--duration", 0.1, "--out", tmp_path, code=78)
+    result = command("run", path, "--duration", 0.1, "--out", tmp_path, code=78)
     message = "loop.simulated_lateness_us: set; allowed in virtual time only; add --unpaced, or remove the key"
-    assert message in " ".join(done.stderr.split())
+    assert message in " ".join(result.stderr.split())
     assert not list(tmp_path.glob("*.mcap*"))
 
 
 def record_late(folder: Path, table_us: tuple[float, ...], *parts: str, code: int = 0) -> Recording:
-    """Record a second of a late loop by the command line, which must return `code`; open the recording."""
+    """Record a second of a late loop by the command line, require the exit code `code`, and return the recording."""
     config = folder / "late.toml"
     config.write_text(late_text(list(table_us), *parts))
-    done = command("run", config, "--unpaced", "--duration", 1, "--out", folder, "--json", code=code)
-    summary = json.loads(done.stdout)
+    result = command("run", config, "--unpaced", "--duration", 1, "--out", folder, "--json", code=code)
+    summary = json.loads(result.stdout)
     assert summary["complete"]
     assert summary["ticks_logged"] == 10_000
     return rtloop.load(summary["recording"])
@@ -269,17 +272,17 @@ def record_late(folder: Path, table_us: tuple[float, ...], *parts: str, code: in
 
 def test_recordings_are_equal_in_bytes_and_replay_identical(tmp_path):
     """The loop's own process and a loop in this process give the same records."""
-    one, same = (record_late(tmp_path, MOSTLY_EARLY_US) for _ in range(2))
-    rows, rows_again = (rows_of([*recording.paths]) for recording in (one, same))
+    first, second = (record_late(tmp_path, MOSTLY_EARLY_US) for _ in range(2))
+    rows, rows_again = (rows_of([*recording.paths]) for recording in (first, second))
     assert rows.tobytes() == rows_again.tobytes() == run_late(MOSTLY_EARLY_US, 10_000)[1].tobytes()
     # The time of an event that the recorder reads before its tick's record is extrapolated.
-    assert len({str([{**event, "time_ns": 0} for event in recording.events]) for recording in (one, same)}) == 1
-    assert "periods_missed" in [event["kind"] for event in one.events]
-    assert np.unique(one["periods_missed"]).tolist() == [0, 1, 2, 12]
-    report = replay(one)
+    assert len({str([{**event, "time_ns": 0} for event in recording.events]) for recording in (first, second)}) == 1
+    assert "periods_missed" in [event["kind"] for event in first.events]
+    assert np.unique(first["periods_missed"]).tolist() == [0, 1, 2, 12]
+    report = replay(first)
     assert report.identical
     assert report.ticks == 10_000
-    assert "identical" in command("replay", one.paths[0]).stdout
+    assert "identical" in command("replay", first.paths[0]).stdout
 
 
 def test_a_trip_by_late_ticks_replays_identical(tmp_path):

@@ -26,7 +26,7 @@ def test_steps_against_the_linear_loop(method, lines, latency):
     bench = LoopBench(text(IDEAL, AXIS, EXACT, CONTROLLER, lines, STEPS, latency=latency))
     rows = bench.run(TICKS)
     assert rows.shape[0] == TICKS
-    assert not np.any(bench.column(rows, "flags"))  # nothing was limited
+    assert not np.any(bench.column(rows, "flags"))  # no limit was active
     reference = np.array([20.0, 0.0, -20.0, 0.0])[np.arange(TICKS) // 500 % 4]
     assert np.array_equal(bench.column(rows, "x_reference_um"), reference)
     oracle = closed_loop(reference, method, latency)
@@ -37,7 +37,7 @@ def test_steps_against_the_linear_loop(method, lines, latency):
 
 
 def test_the_oracle_can_tell():
-    """A latency or a method that is not the configured one is far outside the tolerance."""
+    """The oracle with another latency or method than the loop's is far outside the tolerance."""
     bench = LoopBench(text(IDEAL, AXIS, EXACT, CONTROLLER, MATCHED, STEPS))
     position = bench.column(bench.run(1000), "x_true_position_um")
     reference = np.repeat([20.0, 0.0], 500)

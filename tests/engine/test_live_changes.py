@@ -1,4 +1,4 @@
-"""Changes of a running law: its memory fits the new coefficients, whether longer or shorter than before."""
+"""Changes of a running law: its memory fits the new coefficients, whether they are more or fewer than before."""
 
 from __future__ import annotations
 
@@ -23,29 +23,30 @@ REFERENCE = '[axis.reference]\nkind = "hold"\nvalue = 20.0\n'
 
 
 def prefilter(taps: int, sections: int = 0) -> str:
-    """A configuration with a moving average over so many ticks, and so many low-passes."""
+    """Return the section of a pre-filter: a moving average over `taps` ticks, then `sections` low-passes."""
     average = ", ".join([repr(1 / taps)] * taps) if taps else ""
     return f"[axis.prefilter]\ntaps = [{average}]\nsections = [{', '.join([SECTION] * sections)}]\n"
 
 
 def configuration(taps: int, sections: int = 0, mode: str = "closed_loop") -> str:
+    """Return the configuration of a loop that holds 20 µm behind such a pre-filter."""
     return text(IDEAL, AXIS, CONTROLLER, prefilter(taps, sections), REFERENCE, mode=mode)
 
 
 OTHER_SECTION = configuration(0, 1).replace(SECTION, "[0.25, 0.5, 0.25, 0.0, 0.0]")
-"""A filter of another bandwidth, to which the memory of the one before would be a jump."""
+"""Configuration with a low-pass of another bandwidth, whose output would jump with the memory of SECTION."""
 
 
 @pytest.mark.parametrize(
     ("before", "after"),
     [
-        *((configuration(taps), configuration(others)) for taps, others in permutations(LENGTHS, 2)),
-        *((configuration(5, count), configuration(7, other)) for count, other in permutations((0, 1, 2, 12), 2)),
+        *((configuration(taps), configuration(new_taps)) for taps, new_taps in permutations(LENGTHS, 2)),
+        *((configuration(5, count), configuration(7, added)) for count, added in permutations((0, 1, 2, 12), 2)),
         (configuration(0, 1), OTHER_SECTION),
     ],
 )
 def test_a_constant_reference_stays_where_it_is_under_any_other_prefilter(before: str, after: str):
-    """The index stays within the taps."""
+    """The index into the taps also stays within their record."""
     bench = LoopBench(before)
     bench.run(3999)
     bench.load_law(after)
@@ -56,8 +57,8 @@ def test_a_constant_reference_stays_where_it_is_under_any_other_prefilter(before
         np.testing.assert_allclose(bench.column(rows, "x_error_um") + bench.column(rows, "x_position_um"), 20.0)
 
 
-def swept(taps: str, command_taps: str) -> str:
-    """A loop that follows a sine through two rows of taps."""
+def sine_through_taps(taps: str, command_taps: str) -> str:
+    """Return the configuration of a loop that follows a sine through two rows of taps."""
     rows = f"[axis.prefilter]\ntaps = [{taps}]\ncommand_taps = [{command_taps}]\n"
     sine = '[axis.reference]\nkind = "sine"\namplitude = 15.0\nfrequency_hz = 20.0\n'
     return text(IDEAL, AXIS, CONTROLLER, rows, sine, mode="closed_loop")
@@ -68,18 +69,18 @@ def swept(taps: str, command_taps: str) -> str:
     [("0.5, 0.5", "0.9"), ("0.2, 0.2, 0.2, 0.2, 0.2, 0.0, 0.0, 0.0, 0.0", "0.1, -0.1, 0.3"), ("1.0", "")],
 )
 def test_other_taps_take_over_without_a_jump(taps: str, command_taps: str):
-    """During a sine, the command makes no larger step in any tick than the sine makes elsewhere."""
-    bench = LoopBench(swept("0.25, 0.25, 0.25, 0.25", "0.6, -0.1"))
+    """The command of a sine makes no larger step at and after the change than before it."""
+    bench = LoopBench(sine_through_taps("0.25, 0.25, 0.25, 0.25", "0.6, -0.1"))
     commands_um = bench.column(bench.run(4321), "x_command_um")
     before = np.diff(commands_um[1000:])
-    bench.load_law(swept(taps, command_taps))
+    bench.load_law(sine_through_taps(taps, command_taps))
     after = np.diff(bench.column(bench.run(3000), "x_command_um"), prepend=commands_um[-1])
     assert np.abs(after).max() < 1.1 * np.abs(before).max()
     assert np.abs(after[-500:]).max() > 0.1 * np.abs(before).max()
 
 
 def test_sections_that_stay_the_same_go_on():
-    """Under a sine, a change of another key is nothing to the filter: its outputs are the same to the last bit."""
+    """A change of another key leaves the filter alone: its outputs for a sine are the same to the last bit."""
     sine = '[axis.reference]\nkind = "sine"\namplitude = 15.0\nfrequency_hz = 20.0\n'
     parts = text(IDEAL, AXIS, CONTROLLER, prefilter(3, 2), sine, mode="off")
     changed, unchanged = LoopBench(parts), LoopBench(parts)
@@ -110,7 +111,7 @@ def test_another_law_for_one_of_two_axes_leaves_the_other_as_it_is(axis: int):
 
 @pytest.mark.parametrize("sections", [0, 2])
 def test_a_closed_loop_is_entered_without_the_volts_that_the_taps_hold(sections: int):
-    """After raw mode at −5 V, the position in closed loop reaches 20 µm without overshoot."""
+    """The position reaches 20 µm without overshoot in closed loop after raw mode at −5 V."""
     bench = LoopBench(configuration(128, sections, mode="raw"))
     bench.send(Kind.SET_REFERENCE, Generator.HOLD, -5.0)
     bench.run(2000)
@@ -128,20 +129,20 @@ def test_a_closed_loop_is_entered_without_the_volts_that_the_taps_hold(sections:
     [("play_count", 255), ("order", 32), ("tap_count", 4096), ("section_count", 1000), ("row_stop", 255)],
 )
 def test_a_count_beyond_its_record_is_a_trip_and_not_a_write(name: str, value: int):
-    """A forged count ends the run by a status; the bytes behind the state do not change."""
+    """A forged count ends the run with LAW_FAILED; the reserved bytes and the mode do not change."""
     bench = LoopBench(configuration(4, 1))
     bench.run(100)
     bench.events()
     drive_v = float(bench.block["last_drive_v"][0])
-    state = bench.law.axes["reserved"].tobytes() + bench.law.state["mode"].tobytes()
+    guard_bytes = bench.law.axes["reserved"].tobytes() + bench.law.state["mode"].tobytes()
     controller, plays = (bench.law.slot_record(0, slot, "coefficients") for slot in ("controller", "feedforward"))
     controller.coupled = 1
-    owner = next(record for record in (controller, plays, bench.law.coefficients[0]) if name in record.dtype.names)
-    owner[name] = value
+    forged = next(record for record in (controller, plays, bench.law.coefficients[0]) if name in record.dtype.names)
+    forged[name] = value
     bench.run(10)
     assert bench.outcome is Outcome.LAW_FAILED
     assert bench.kinds() == [Kind.TRIPPED]
-    assert bench.law.axes["reserved"].tobytes() + bench.law.state["mode"].tobytes() == state
+    assert bench.law.axes["reserved"].tobytes() + bench.law.state["mode"].tobytes() == guard_bytes
     assert bench.block["last_drive_v"][0] == pytest.approx(drive_v, abs=0.05)
 
 

@@ -1,4 +1,4 @@
-"""The shared block: every process with the file sees the same arrays; a pickled plan is the same plan."""
+"""The shared block: all mappings of its file show the same arrays; an unpickled plan equals the original."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ SIZES = Sizes(columns=21, axes=1, rate_hz=10_000, snapshot_bytes=1000, table_sam
 
 def test_a_second_mapping_sees_what_the_first_writes():
     block = SharedBlock.create(SIZES)
-    other = SharedBlock(os.dup(block.fd))
+    second = SharedBlock(os.dup(block.fd))
     block.store(Word.STOP, 3)
     block["last_drive_v"][0] = -2.5
     block.ring("ticks").slots[-1, -1] = 7.0
     block["commands"]["values"][255, 11] = 1.5
-    assert other.load(Word.STOP) == 3
-    assert other["last_drive_v"].tolist() == [-2.5]
-    assert other.ring("ticks").slots[-1, -1] == 7.0
-    assert other["commands"]["values"][255, 11] == 1.5
+    assert second.load(Word.STOP) == 3
+    assert second["last_drive_v"].tolist() == [-2.5]
+    assert second.ring("ticks").slots[-1, -1] == 7.0
+    assert second["commands"]["values"][255, 11] == 1.5
 
 
 def test_a_block_in_a_file_outlives_its_maker(tmp_path):
@@ -33,8 +33,8 @@ def test_a_block_in_a_file_outlives_its_maker(tmp_path):
     block = SharedBlock.create(SIZES, os.open(path, os.O_RDWR | os.O_CREAT, 0o600))
     block["last_drive_v"][0] = 4.0
     del block
-    again = SharedBlock(os.open(path, os.O_RDWR))
-    assert again["last_drive_v"].tolist() == [4.0]
+    reopened = SharedBlock(os.open(path, os.O_RDWR))
+    assert reopened["last_drive_v"].tolist() == [4.0]
 
 
 def test_arrays_do_not_overlap():
@@ -55,11 +55,11 @@ def test_the_ring_holds_its_seconds(rate_hz):
 
 def test_a_plan_survives_pickling():
     plan = plan_of(text(IDEAL, AXIS, CONTROLLER, MATCHED))
-    again = pickle.loads(pickle.dumps(plan))
-    assert again.columns == plan.columns
-    first, second = LoopBench(plan).run(500), LoopBench(again).run(500)
+    unpickled = pickle.loads(pickle.dumps(plan))
+    assert unpickled.columns == plan.columns
+    first, second = LoopBench(plan).run(500), LoopBench(unpickled).run(500)
     assert first.tobytes() == second.tobytes()
-    assert np.array_equal(again.coefficients, plan.coefficients)
+    assert np.array_equal(unpickled.coefficients, plan.coefficients)
 
 
 def test_a_shorter_fault_leaves_nothing_of_the_one_before():

@@ -24,18 +24,19 @@ print(json.dumps([report, kernel]))
 CPU = max(os.sched_getaffinity(0))
 
 
-def prepared(**pacing):
-    done = subprocess.run([sys.executable, "-c", PROGRAM, json.dumps(pacing)], capture_output=True, check=True)
-    return json.loads(done.stdout)
+def prepare_process(**pacing):
+    """Prepare a new process for real time; return its report and the kernel's values for it, both dicts."""
+    result = subprocess.run([sys.executable, "-c", PROGRAM, json.dumps(pacing)], capture_output=True, check=True)
+    return json.loads(result.stdout)
 
 
 def test_the_report_of_a_paced_loop_is_what_the_kernel_says():
-    report, kernel = prepared(cpu=CPU, priority=3)
+    report, kernel = prepare_process(cpu=CPU, priority=3)
     assert report["affinity"] == kernel["affinity"] == [CPU]
     assert report["mlock"] is kernel["locked"]
     granted = report["scheduler"] == "SCHED_FIFO"
     assert report["timer_slack_ns"] == 1
-    assert kernel["slack_ns"] in ((0, 1) if granted else (1,))  # newer kernels show none for a real-time thread
+    assert kernel["slack_ns"] in ((0, 1) if granted else (1,))  # newer kernels show 0 for a real-time thread
     assert (report["priority"], kernel["priority"]) == ((3, 3) if granted else (0, 0))
     assert kernel["policy"] == (os.SCHED_FIFO if granted else os.SCHED_OTHER)
     refused = {entry.partition(":")[0] for entry in report["refused"]}
@@ -47,13 +48,13 @@ def test_the_report_of_a_paced_loop_is_what_the_kernel_says():
 
 
 def test_a_processor_that_is_not_there_is_refused_and_nothing_else_for_it():
-    report, kernel = prepared(cpu=1023)
+    report, kernel = prepare_process(cpu=1023)
     assert report["affinity"] == kernel["affinity"] == sorted(os.sched_getaffinity(0))
     assert "affinity: Invalid argument" in report["refused"]
 
 
 def test_virtual_time_asks_for_nothing():
-    report, kernel = prepared(paced=False, cpu=CPU)
+    report, kernel = prepare_process(paced=False, cpu=CPU)
     assert report["affinity"] == kernel["affinity"] == sorted(os.sched_getaffinity(0))
     assert (report["timer_slack_ns"], report["refused"], report["priority"]) == (None, [], 0)
     assert kernel["slack_ns"] != 1

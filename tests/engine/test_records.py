@@ -18,16 +18,16 @@ def bench(seed: int = 1, rate_hz: float = 10_000) -> LoopBench:
 
 
 def test_the_same_seed_gives_the_same_bytes():
-    first, again, other = (bench(seed).run(TICKS) for seed in (1, 1, 2))
-    assert first.tobytes() == again.tobytes()
-    assert first.tobytes() != other.tobytes()
+    first, same_seed, other_seed = (bench(seed).run(TICKS) for seed in (1, 1, 2))
+    assert first.tobytes() == same_seed.tobytes()
+    assert first.tobytes() != other_seed.tobytes()
     assert np.array_equal(first[:, 0], np.arange(TICKS))
 
 
 def test_pieces_give_the_same_bytes_as_a_whole():
-    whole, pieces = bench(), bench()
-    parts = [pieces.run(count) for count in (1, 999, 1, 7000, 16_999)]
-    assert np.concatenate(parts).tobytes() == whole.run(TICKS).tobytes()
+    in_one_piece, in_pieces = bench(), bench()
+    parts = [in_pieces.run(count) for count in (1, 999, 1, 7000, 16_999)]
+    assert np.concatenate(parts).tobytes() == in_one_piece.run(TICKS).tobytes()
 
 
 def test_a_snapshot_a_second_each_at_the_state_before_its_tick():
@@ -58,12 +58,12 @@ def test_records_agree_with_each_other():
 
 
 def test_two_axes_do_not_touch_each_other():
-    """An axis beside another one gives the bits that it gives alone."""
-    both = text(AXIS, CONTROLLER, MATCHED, SINE, AXIS.replace('"x"', '"y"'), CONTROLLER, MATCHED)
+    """An axis gives the same bits with a second axis as alone."""
+    configuration = text(AXIS, CONTROLLER, MATCHED, SINE, AXIS.replace('"x"', '"y"'), CONTROLLER, MATCHED)
     channels = '[driver.channels.y]\ninput = "adc1"\noutput = "dac1"\num_per_v = 10.0\n[[axis]]'
-    two = LoopBench(both.replace("[[axis]]", channels, 1))
-    single = LoopBench(text(AXIS, CONTROLLER, MATCHED, SINE))
-    rows, alone = two.run(3000), single.run(3000)
+    two_axes = LoopBench(configuration.replace("[[axis]]", channels, 1))
+    one_axis = LoopBench(text(AXIS, CONTROLLER, MATCHED, SINE))
+    rows, one_axis_rows = two_axes.run(3000), one_axis.run(3000)
     for name in ("x_adc_v", "x_drive_v", "x_true_position_um"):
-        assert two.column(rows, name).tobytes() == single.column(alone, name).tobytes()
-    assert np.abs(two.column(rows, "y_true_position_um")).max() < 1.0
+        assert two_axes.column(rows, name).tobytes() == one_axis.column(one_axis_rows, name).tobytes()
+    assert np.abs(two_axes.column(rows, "y_true_position_um")).max() < 1.0

@@ -1,4 +1,4 @@
-"""Ramp to safe on a card that refuses a write: the output makes no larger step afterwards."""
+"""The ramp to the safe value on a card that refuses writes: no step of the output is larger than the ramp's."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ DRIVE_V, STEP_V, RATE_HZ = 1.0, 0.125, 10_000.0
 
 
 class RefusingCard(PythonDriver):
-    """Refuses the writes whose numbers are in `refused`, counted from 0."""
+    """Card that refuses the writes whose numbers, from 0, are in `refused`; `written_v` has the accepted ones."""
 
     kind = "refusing"
     options_model = Options
@@ -24,7 +24,7 @@ class RefusingCard(PythonDriver):
 
     def __init__(self) -> None:
         super().__init__(Options(), {"x": Wiring("in", "out")}, RATE_HZ)
-        self.asked, self.written_v = 0, [DRIVE_V]
+        self.write_count, self.written_v = 0, [DRIVE_V]
 
     @property
     def facts(self) -> Facts:
@@ -37,8 +37,8 @@ class RefusingCard(PythonDriver):
         return (0.0,)
 
     def write(self, volts: list[float]) -> None:
-        self.asked += 1
-        if self.asked - 1 in self.refused:
+        self.write_count += 1
+        if self.write_count - 1 in self.refused:
             raise OSError("the card refuses")
         self.written_v.append(volts[0])
 
@@ -47,6 +47,7 @@ class RefusingCard(PythonDriver):
 
 
 def park(card: RefusingCard) -> None:
+    """Open the card, ramp its output from DRIVE_V to 0 V, and close it."""
     pointers = card.open()
     try:
         ramp_to_safe(card, pointers, np.array([DRIVE_V]), STEP_V * RATE_HZ)

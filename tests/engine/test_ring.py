@@ -20,13 +20,14 @@ def new_ring(slots: int = 8) -> Ring:
 
 
 def write(ring: Ring, first: int, count: int) -> None:
+    """Publish `count` slots from position `first` on, each filled with its position."""
     for position in range(first, first + count):
         ring.slots[claim(ring, np.uint64(position))] = position
         publish(ring, np.uint64(position))
 
 
 def read(ring: Ring, cursor: int, room: int = 100) -> tuple[list[float], int, int]:
-    """(values, first, lost); each slot must be of one piece."""
+    """Return the values of the slots, the first position and the number of lost slots; a torn slot fails the test."""
     out = np.full((room, COLUMNS), np.nan)
     copied, first, lost = drain(ring, cursor, out)
     assert np.all(out[:copied] == out[:copied, :1])
@@ -35,6 +36,7 @@ def read(ring: Ring, cursor: int, room: int = 100) -> tuple[list[float], int, in
 
 @pytest.fixture
 def ring() -> Ring:
+    """Return an empty ring of 8 slots."""
     return new_ring()
 
 
@@ -56,7 +58,7 @@ def test_a_lapped_reader_knows_what_it_lost(ring):
 
 def test_a_slot_that_is_being_written_is_not_read(ring):
     write(ring, 0, 8)
-    ring.slots[claim(ring, np.uint64(8))][: COLUMNS // 2] = 8  # torn: position 0 overwritten by half
+    ring.slots[claim(ring, np.uint64(8))][: COLUMNS // 2] = 8  # a torn slot: position 0 is half overwritten
     assert read(ring, 0) == ([1, 2, 3, 4, 5, 6, 7], 1, 1)
     publish(ring, np.uint64(8))
     ring.slots[0] = 8
@@ -71,7 +73,7 @@ def test_a_reader_may_come_late_to_a_long_run(ring):
 
 @numba.njit(nogil=True)
 def hammer(ring, stop):
-    """Publish slots of one value each as fast as it goes, until told to stop."""
+    """Publish slots without a pause, each filled with its position, until `stop` is set."""
     position = np.uint64(0)
     while load_acquire(stop, 0) == np.uint64(0):
         slot = claim(ring, position)
@@ -85,15 +87,15 @@ _POINTERS, _NUMBER = [ctypes.c_ssize_t] * 3, ctypes.c_int64
 DRAIN = ctypes.CFUNCTYPE(
     ctypes.c_int32, *_POINTERS[:2], *_POINTERS, _NUMBER, _NUMBER, ctypes.c_ssize_t, _NUMBER, ctypes.c_ssize_t
 )(_drain.address)
-"""The reader's machine code, as `drain` calls it: compiled code calls it often enough to meet the writer."""
+"""The machine code that `drain` calls; only compiled code calls it often enough to meet the writer."""
 
 
 @numba.njit(nogil=True)
 def watch(ring, out, needed):
-    """Drain until `wanted` slots were read: slots torn or out of place, lost, laps."""
-    cursor, read_, wrong, lost, laps = np.uint64(0), 0, 0, 0, 0
+    """Drain until `needed` slots are read; return the numbers of wrong values, of lost slots and of lossy drains."""
+    cursor, read_count, wrong_values, lost, laps = np.uint64(0), 0, 0, 0, 0
     first, copied, raised = np.zeros(1, np.uint64), np.zeros(1, np.int64), np.zeros(1, np.int64)
-    while read_ < needed:
+    while read_count < needed:
         first[0] = cursor
         DRAIN(
             copied.ctypes.data, raised.ctypes.data, ring.head.ctypes.data, ring.marks.ctypes.data,
@@ -105,25 +107,25 @@ def watch(ring, out, needed):
         for i in range(copied[0]):
             for j in range(out.shape[1]):
                 if out[i, j] != float(first[0] + np.uint64(i)):
-                    wrong += 1
+                    wrong_values += 1
         cursor = first[0] + np.uint64(copied[0])
-        read_ += copied[0]
-    return wrong, lost, laps
+        read_count += copied[0]
+    return wrong_values, lost, laps
 
 
 @pytest.mark.parametrize("slots", [4, 64])
 def test_no_torn_read_under_a_writer_that_never_waits(slots):
     ring, stop, out = new_ring(slots), np.zeros(1, np.uint64), np.empty((64, COLUMNS))
-    warm = np.ones(1, np.uint64)
-    hammer(ring, warm)  # compiles
+    stopped = np.ones(1, np.uint64)
+    hammer(ring, stopped)  # compiles
     write(ring, 0, 1)
     watch(ring, out, 1)
     ring = new_ring(slots)
     writer = threading.Thread(target=hammer, args=(ring, stop))
     writer.start()
     try:
-        wrong, lost, laps = watch(ring, out, 100_000)
+        wrong_values, lost, laps = watch(ring, out, 100_000)
     finally:
         stop[0] = 1
         writer.join()
-    assert (wrong, lost > 0, laps > 0) == (0, True, True)
+    assert (wrong_values, lost > 0, laps > 0) == (0, True, True)

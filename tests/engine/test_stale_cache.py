@@ -1,6 +1,6 @@
-"""An edited law is the law that runs: the compiler's cache cannot serve the one from before the edit.
+"""An edited law runs as edited: the compiler's cache does not return the machine code from before the edit.
 
-The compiler itself looks only at the file of the outermost function; the edit here is in a module below it.
+The compiler itself checks only the file of the outermost function; the tests edit a module that it imports.
 """
 
 from __future__ import annotations
@@ -28,12 +28,13 @@ set_mode(law.law, 1, False)
 hits = sum(set_mode.stats.cache_hits.values())
 print(json.dumps({"tap_index": int(law.axes["tap_index"][0]), "from_cache": hits == 1}))
 """
-"""A change of mode, whose kernel calls another in `prefilter.py`."""
+"""Program that changes the mode: the kernel calls another one in `prefilter.py`."""
 EDIT = ("rtloop/kernel/prefilter.py", "state.tap_index = REFILL", "state.tap_index = -2")
 
 
 @pytest.fixture
 def project(tmp_path: Path) -> Path:
+    """Return a folder with a copy of the package, without caches."""
     shutil.copytree(ROOT / "rtloop", tmp_path / "rtloop", ignore=shutil.ignore_patterns("__pycache__"))
     return tmp_path
 
@@ -47,6 +48,7 @@ def run(project: Path) -> dict[str, object]:
 
 
 def edit(project: Path, path: str, old: str, new: str) -> None:
+    """Replace the only occurrence of `old` in a file of the project."""
     source = (project / path).read_text()
     assert source.count(old) == 1
     (project / path).write_text(source.replace(old, new))

@@ -26,18 +26,19 @@ LAWS = (
     (('method = "tustin"', 'method = "matched"'), ("prewarp_hz = 595.5\n", "\n")),
     (("[1.0, 974.0]", "[1.0, 900.0]"),),
 )
-"""The paper's controller, another gain, another discretisation, another pole."""
+"""Changes to the paper's configuration: none, another gain, another discretisation, another pole."""
 MODES = (Mode.FEEDFORWARD, Mode.CLOSED_LOOP)
 
 
-def run(path: Path, swaps: int) -> tuple[Path, list[int]]:
-    """Record a run of so many swaps, or as long a one without; its file, and the ticks of the swaps."""
+def record_swaps(path: Path, swaps: int) -> tuple[Path, list[int]]:
+    """Record a run with `swaps` swaps, equally long for any number; return its file and the ticks of the swaps."""
     loop = RealLoop(changed(SINE))
     laws = [prepare(parse(changed(SINE, *law), "law", ROOT, "law"), paced=False).plan.coefficients for law in LAWS]
     session = Session(loop.block, path, loop.header, Options(min_free_bytes=0))
     ticks = []
 
     def advance(count: int) -> None:
+        """Run `count` ticks and record them."""
         loop.run(count)
         while session.cursor < loop.tick:
             session.drain()
@@ -61,25 +62,26 @@ def run(path: Path, swaps: int) -> tuple[Path, list[int]]:
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a new folder for the recordings."""
     return tmp_path_factory.mktemp("swaps")
 
 
 def test_a_thousand_swaps(folder: Path):
-    swapped, ticks = run(folder / "swapped.mcap", SWAPS)
-    steady, _ = run(folder / "steady.mcap", 0)
+    swapped, ticks = record_swaps(folder / "swapped.mcap", SWAPS)
+    steady, _ = record_swaps(folder / "steady.mcap", 0)
     recording = load(swapped)
     events = [event["kind"] for event in recording.events]
     assert events.count("load_law") == events.count("set_mode") == SWAPS // 2
     assert not np.any(recording["flags"].astype(int) & TRIP_MASK)
     steps_v = np.abs(np.diff(recording["x_demand_v"]))
-    usual_v = np.abs(np.diff(load(steady)["x_demand_v"]))[SETTLE_TICKS:].max()
-    at_v, after_v = steps_v[np.array(ticks) - 1].max(), steps_v[np.array(ticks)].max()
+    steady_v = np.abs(np.diff(load(steady)["x_demand_v"]))[SETTLE_TICKS:].max()
+    at_swap_v, next_v = steps_v[np.array(ticks) - 1].max(), steps_v[np.array(ticks)].max()
     print(
-        f"{len(ticks)} swaps, largest |Δdemand|: at a swap {at_v:.2g} V, in the tick after it {after_v:.4f} V, in the "
-        f"whole run {steps_v[SETTLE_TICKS:].max():.4f} V; in the run without swaps {usual_v:.4f} V"
+        f"{len(ticks)} swaps, largest |Δdemand|: at a swap {at_swap_v:.2g} V, in the tick after it {next_v:.4f} V, "
+        f"in the whole run {steps_v[SETTLE_TICKS:].max():.4f} V; in the run without swaps {steady_v:.4f} V"
     )
-    assert at_v <= 1.1 * usual_v
-    assert after_v <= 1.3 * usual_v  # the tick of the swap stood still; the next one moves for both
+    assert at_swap_v <= 1.1 * steady_v
+    assert next_v <= 1.3 * steady_v  # the demand stands still in the swap's tick and catches up in the next
     verdict = replay(recording)
     assert verdict.identical, verdict.first_difference
     assert verdict.ticks == SETTLE_TICKS + SWAPS * SPACING

@@ -28,13 +28,14 @@ frozen_drive_v = 0.01
 
 
 def bench(volts: Callable[[int], float], age_us: float = 0.0) -> LoopBench:
+    """Return a loop whose driver reads `volts(k)` V at read number k, from samples of age `age_us`."""
     driver = ScriptedDriver(volts)
     driver.sample_age_us = age_us
     return LoopBench(text(IDEAL, AXIS, CONTROLLER, TUSTIN, INTERLOCKS), driver)
 
 
 def flicker(level: float) -> Callable[[int], float]:
-    """A reading that does not stand still."""
+    """Return scripted readings that alternate between `level` and 0.1 mV above it, so that they are not frozen."""
     return lambda k: level + 1e-4 * (k % 2)
 
 
@@ -72,11 +73,11 @@ def test_axis_value_and_limit(
 
 
 def test_a_trip_names_the_axis_that_is_to_blame() -> None:
-    """The second of two axes is driven beyond its limit; the first rests."""
+    """The second of two axes moves beyond its limit; the first rests."""
     channel = '[driver.channels.y]\ninput = "adc1"\noutput = "dac1"\num_per_v = 10.0\n'
     second = AXIS.replace('name = "x"', 'name = "y"') + "[axis.interlocks]\nposition_um = 5.0\n"
-    driven = '[axis.reference]\nkind = "hold"\nvalue = 4.0\n'
-    loop = LoopBench(text(channel, IDEAL, AXIS, second, driven, mode="raw"))
+    reference = '[axis.reference]\nkind = "hold"\nvalue = 4.0\n'
+    loop = LoopBench(text(channel, IDEAL, AXIS, second, reference, mode="raw"))
     loop.run(400)
     (event,) = loop.trips()
     assert (event["axis"], event["what"]["values"][2]) == ("y", 5.0)

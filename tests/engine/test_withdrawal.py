@@ -22,6 +22,7 @@ RAW = text(IDEAL, AXIS, CONTROLLER, mode="raw")
 
 
 def hold(value: float):
+    """Return the command for a constant reference."""
     return message(Kind.SET_REFERENCE, values=[0.0, value])
 
 
@@ -37,7 +38,7 @@ def test_what_was_refused_is_not_applied_when_the_loop_goes_on(monkeypatch):
 
 
 def test_what_the_loop_has_taken_is_not_called_refused(monkeypatch):
-    """The loop stopped between claim and acknowledgement: the answer must not be that the command had no effect."""
+    """The loop stopped between claim and acknowledgement: the answer must not deny that the command had an effect."""
     monkeypatch.setattr(desk_module, "ANSWER_TIMEOUT_S", 0.02)
     bench = LoopBench(RAW)
     monkeypatch.setattr(desk_module, "withdraw", lambda block, position: False)
@@ -57,12 +58,12 @@ def test_others_around_it_take_effect_in_their_order():
 
 
 def test_exactly_one_of_loop_and_producer_gets_each_command():
-    """Both try at the same time, in two processes."""
+    """Loop and producer claim commands at the same time, in two processes."""
     bench = LoopBench(RAW)
     bench.run(1)
     producer = os.getpid()
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", DeprecationWarning)  # of a fork beside threads, none of which is ours
+        warnings.simplefilter("ignore", DeprecationWarning)  # about a fork in a process with threads
         pid = os.fork()
     if pid == 0:
         while os.getppid() == producer:
@@ -80,8 +81,8 @@ def test_exactly_one_of_loop_and_producer_gets_each_command():
     finally:
         os.kill(pid, signal.SIGKILL)
         os.waitpid(pid, 0)
-    taken = sum(event == Kind.SET_REFERENCE for event in bench.drain("events")["kind"])
-    assert taken + withdrawn == TRIES
+    applied = sum(event == Kind.SET_REFERENCE for event in bench.drain("events")["kind"])
+    assert applied + withdrawn == TRIES
     assert withdrawn > 0
 
 

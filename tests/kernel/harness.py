@@ -1,4 +1,4 @@
-"""Bench for one axis of the compiled law, which runs over arrays of inputs."""
+"""Bench that runs the compiled law of one axis over arrays of inputs."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ EQ_20 = {
 }
 LAWS = DEFAULT_LAWS
 KEEP = -1
-"""Value in `modes` for a tick without a change."""
+"""Value in `modes` for a tick without a change of mode."""
 
 
 class Signals(NamedTuple):
@@ -53,7 +53,7 @@ class Signals(NamedTuple):
 
 @jit
 def run_law(law, modes, resets, adc_v, references, feeds_um, conditions, out):
-    """Evaluate, update and record each tick in `out`."""
+    """Evaluate and update the law in each tick; write its signals to `out`, shape (signals, ticks)."""
     adc, reference, feed = np.empty(1), np.empty(1), np.empty(1)
     for k in range(modes.size):
         if resets[k] != 0:
@@ -69,15 +69,15 @@ def run_law(law, modes, resets, adc_v, references, feeds_um, conditions, out):
         out[5, k], out[6, k] = float(loop.tick_flags), float(loop.mode)
 
 
-def coefficients_of(output: Channel | None = None, **parts: Any) -> Records:
-    """Return coefficients (1,) of an axis with eq (4), 10 µm/V and the sections `parts` of a configuration."""
+def make_coefficients(output: Channel | None = None, **parts: Any) -> Records:
+    """Return the coefficients (1,) of an axis with eq (4), 10 µm/V and the sections `parts` of a configuration."""
     axis = AxisOptions.model_validate({"name": "x", "feedforward": EQ_4, **parts})
     controller = make_controller(axis, PERIOD_S)
     return axis_coefficients(LAWS, axis, controller, 10.0, 0.0, output or Channel("dac0"), PERIOD_S)
 
 
 class LawBench:
-    """Law at rest in `mode`; its memory persists from one call to the next."""
+    """Law of one axis, at rest in `mode` at first; its memory persists from one call of `run` to the next."""
 
     def __init__(self, coefficients: Records, mode: Mode = Mode.OFF) -> None:
         self.law = LawMemory.create_at_rest(law_layout(LAWS), bind_functions(LAWS), coefficients)
@@ -130,7 +130,7 @@ class LawBench:
         return Signals(*out)
 
     def memory(self) -> dict[str, bytes]:
-        """Return the bytes of the memory of the law by name, without signals."""
+        """Return the bytes of each field of the law's memory by its name, without the signals of the last tick."""
         names = ("tap_index", "tap_history", "section_history", "bump", "command_bump_um", "applied_command_um")
         memory = {name: self.axes[name].tobytes() for name in names}
         for name in ("inverse_plays_um", "model_plays_v", "dead_band_direction"):
@@ -148,4 +148,5 @@ class LawBench:
 
 
 def _spread(value: npt.ArrayLike, like: npt.NDArray[Any], dtype: type) -> npt.NDArray[Any]:
+    """Return a copy of one number or an array, in the shape of `like`."""
     return np.broadcast_to(np.asarray(value, dtype), like.shape).copy()

@@ -20,20 +20,22 @@ G = (0.39, -0.072, -0.094, 0.12, -0.11, 0.0033, 0.002, -0.035, -0.007, 0.04, -0.
 
 
 class Hysteresis:
-    """Σ w_i F_{r_i} with its memory; (4) unless told otherwise, from rest."""
+    """Hysteresis Σ w_i F_{r_i}[u] with its memory, at rest at first; eq (4) by default."""
 
     def __init__(self, thresholds: npt.ArrayLike = R, weights: npt.ArrayLike = P) -> None:
         self.thresholds, self.weights = np.asarray(thresholds, float), np.asarray(weights, float)
         self.plays = np.zeros(self.thresholds.size)
 
     def step(self, value: float) -> float:
+        """Return the output for the next input."""
         self.plays = np.maximum(value - self.thresholds, np.minimum(value + self.thresholds, self.plays))
         return float(self.weights @ self.plays)
 
     def run(self, values: npt.ArrayLike) -> Real:
+        """Return the outputs (n,) for the inputs (n,) in turn."""
         return np.array([self.step(value) for value in np.asarray(values, float)])
 
 
 def sine(amplitude: float, points: int = 20001, periods: float = 2.0) -> Real:
-    """`periods` of a sine, from 0."""
+    """Return `points` samples of `periods` of a sine that begins at 0, both ends included."""
     return amplitude * np.sin(2 * np.pi * periods * np.arange(points) / (points - 1))

@@ -14,7 +14,7 @@ from rtloop.kernel.layout import COEFFICIENTS, CONTROL, FUNCTIONS, LAW, LOOP_STA
 from rtloop.kernel.reference import GENERATOR
 from rtloop.laws.shipped import prandtl_ishlinskii, transfer
 from rtloop.signals import Mode
-from tests.kernel.harness import EQ_20, EXACT, LawBench, coefficients_of
+from tests.kernel.harness import EQ_20, EXACT, LawBench, make_coefficients
 
 ROOT = Path(__file__).resolve().parents[2]
 TICKS = 600
@@ -25,8 +25,8 @@ RECORDS = [
 
 
 def mixed_run() -> bytes:
-    """All signals and the final state of a run through every mode, limit, filter and interlock."""
-    axis = coefficients_of(
+    """Return the bytes of all signals and of the final state of a run through modes, limits, filters and interlocks."""
+    axis = make_coefficients(
         controller=EQ_20,
         feedforward=EXACT,
         prefilter={"taps": [0.6, 0.3, 0.1], "sections": [[0.02, 0.04, 0.02, -1.5, 0.58]]},

@@ -12,11 +12,11 @@ from rtloop.drivers.base import Channel
 from rtloop.kernel.memory import slot_view
 from rtloop.laws.shipped.transfer import COEFFICIENTS
 from rtloop.signals import Flag, Mode
-from tests.kernel.harness import EQ_4, EQ_20, EXACT, PERIOD_S, LawBench, coefficients_of
+from tests.kernel.harness import EQ_4, EQ_20, EXACT, PERIOD_S, LawBench, make_coefficients
 from tests.kernel.oracle import Hysteresis, P, R, sine
 
-PLAIN = coefficients_of(controller=EQ_20)
-PI = coefficients_of(
+PLAIN = make_coefficients(controller=EQ_20)
+PI = make_coefficients(
     controller={"form": "transfer_function", "numerator": [0.5, 40.0], "denominator": [1.0, 0.0], "method": "tustin"}
 )
 
@@ -50,9 +50,9 @@ def test_the_controller_is_the_difference_equation():
 
 
 def test_a_controller_without_integrator_goes_on_beside_a_feed():
-    """Entered at a command of 10 µm with a feed of 4 µm, the controller rests with the other 6 µm."""
+    """The controller is entered at a command of 10 µm with a feed of 4 µm, and rests with the other 6 µm."""
     lag = {"form": "transfer_function", "numerator": [40.0], "denominator": [1.0, 50.0]}
-    bench = LawBench(coefficients_of(controller=lag, feedforward=EXACT, limits={"bump_s": 1e9}), Mode.FEEDFORWARD)
+    bench = LawBench(make_coefficients(controller=lag, feedforward=EXACT, limits={"bump_s": 1e9}), Mode.FEEDFORWARD)
     bench.run(np.full(50, 10.0))
     signals = bench.run(np.full(600, 1.0), mode=Mode.CLOSED_LOOP, feed_um=4.0)
     np.testing.assert_allclose(signals.command_um, 10.0, rtol=0, atol=1e-6)
@@ -60,9 +60,9 @@ def test_a_controller_without_integrator_goes_on_beside_a_feed():
 
 
 def test_a_controller_without_states_continues_by_an_offset_that_dies_out():
-    """v = 0.5 e, entered at 10 µm: what is missing shrinks by exp(−T/bump_s) in each tick."""
+    """v = 0.5 e = 4 µm, entered at 10 µm: the offset of 6 µm decays by exp(−T/bump_s) in each tick."""
     gain = {"form": "transfer_function", "numerator": [0.5], "denominator": [1.0]}
-    bench = LawBench(coefficients_of(controller=gain, feedforward=EXACT, limits={"bump_s": 0.01}), Mode.FEEDFORWARD)
+    bench = LawBench(make_coefficients(controller=gain, feedforward=EXACT, limits={"bump_s": 0.01}), Mode.FEEDFORWARD)
     bench.run(np.full(50, 10.0))
     command_um = bench.run(np.full(1500, 8.0), mode=Mode.CLOSED_LOOP).command_um
     assert command_um[0] == pytest.approx(10.0, abs=1e-9)
@@ -71,7 +71,7 @@ def test_a_controller_without_states_continues_by_an_offset_that_dies_out():
 
 
 def test_limited_commands_and_drives_say_so():
-    bench = LawBench(coefficients_of(limits={"command_um": 30.0, "drive_v": 5.0}), Mode.FEEDFORWARD)
+    bench = LawBench(make_coefficients(limits={"command_um": 30.0, "drive_v": 5.0}), Mode.FEEDFORWARD)
     flags = [Flag(int(value)) for value in bench.run([10.0, 30.0, 30.1, -30.1]).flags]
     assert flags[0] == 0
     assert flags[1] == Flag.DRIVE_LIMITED
@@ -80,9 +80,9 @@ def test_limited_commands_and_drives_say_so():
 
 
 def test_an_amplifier_without_a_negative_side():
-    """0 … 5 V: below and above it is limited, and each limit that leaves the channel is refused by its name."""
+    """The drive is limited to the channel's 0 … 5 V, and the message about a limit beyond them names the limit."""
     channel = Channel("ao0", 0.0, 5.0)
-    bench = LawBench(coefficients_of(channel, limits={"drive_v": 5.0, "drive_min_v": 0.0}), Mode.RAW)
+    bench = LawBench(make_coefficients(channel, limits={"drive_v": 5.0, "drive_min_v": 0.0}), Mode.RAW)
     signals = bench.run([3.0, -0.1, 5.0, 7.0])
     assert list(signals.drive_v) == [3.0, 0.0, 5.0, 5.0]
     assert list(signals.flags) == [0, Flag.DRIVE_LIMITED, 0, Flag.DRIVE_LIMITED]
@@ -92,7 +92,7 @@ def test_an_amplifier_without_a_negative_side():
         ({"drive_v": 5.0, "drive_min_v": -1.0}, "limits.drive_min_v: −1.0 V; allowed: within the driver's 0.0 … 5.0 V"),
     ):
         with pytest.raises(ValueError, match=re.escape(fault)):
-            coefficients_of(channel, limits=limits)
+            make_coefficients(channel, limits=limits)
 
 
 def test_off_ramps_to_the_safe_value_and_stays():
@@ -118,7 +118,7 @@ def test_tick_zero_starts_from_zero_state():
 @pytest.mark.parametrize("dead_band", ["none", "exact"])
 def test_a_new_mode_continues_where_the_old_one_was(before, after, dead_band):
     """The demand continues in any mode and from any drive, also from one outside its limits, and in the same mode."""
-    axis = coefficients_of(controller=EQ_20, feedforward=EQ_4 | {"dead_band": dead_band})
+    axis = make_coefficients(controller=EQ_20, feedforward=EQ_4 | {"dead_band": dead_band})
     for level in (0.3, 5.0, -8.0):
         for pause in (1, 50):
             bench = LawBench(axis, before)
@@ -132,9 +132,9 @@ def test_the_offset_of_a_change_dies_out():
     bench = LawBench(PLAIN, Mode.RAW)
     bench.run([6.0])
     signals = bench.run(np.full(6000, 1.0), mode=Mode.FEEDFORWARD)
-    offset = signals.command_um - 1.0
-    np.testing.assert_allclose(offset[:2000], offset[0] * np.exp(-np.arange(2000) / 200), rtol=1e-9)
-    assert offset[-1] == 0.0
+    offset_um = signals.command_um - 1.0
+    np.testing.assert_allclose(offset_um[:2000], offset_um[0] * np.exp(-np.arange(2000) / 200), rtol=1e-9)
+    assert offset_um[-1] == 0.0
 
 
 def test_a_trip_refuses_nothing_but_ends_the_mode():

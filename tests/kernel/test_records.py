@@ -33,7 +33,7 @@ def test_kinds_of_generators_are_numbered_as_they_are_recorded():
 
 
 def test_records_begin_at_a_cache_line():
-    """64 bytes: the kernels' loads of a record touch no line more than they must, wherever numpy found the memory."""
-    held = [new_records(CONTROL, count) for count in range(1, 40)]
-    assert {array.ctypes.data % 64 for array in held} == {0}
-    assert [array.size for array in held] == list(range(1, 40))
+    """Records begin at multiples of 64 bytes, wherever numpy allocates them: loads touch the fewest cache lines."""
+    arrays = [new_records(CONTROL, count) for count in range(1, 40)]
+    assert {array.ctypes.data % 64 for array in arrays} == {0}
+    assert [array.size for array in arrays] == list(range(1, 40))

@@ -21,19 +21,20 @@ TIME_S = np.arange(TICKS) / RATE_HZ
 
 
 @jit
-def samples(generators, first, period_s, table, volts, out, added):
+def write_samples(generators, first, period_s, table, volts, out, feed):
+    """Write the reference's samples from tick `first` on to `out`, and its additions to the command to `feed`."""
     for k in range(out.size):
         out[k] = reference_sample(generators[0], first + k, period_s, table, volts[k])
-        added[k] = generators[0].feed_um
+        feed[k] = generators[0].feed_um
 
 
 def generate(options: dict, ticks: int = TICKS, volts: np.ndarray | None = None, folder: Path = Path()) -> np.ndarray:
-    """Samples of a reference that begins at tick START, as a configuration says it."""
-    return both(options, ticks, volts, folder)[0]
+    """Return the samples of a reference with these configured options, which begins at tick START."""
+    return generate_both(options, ticks, volts, folder)[0]
 
 
-def both(options: dict, ticks: int, volts: np.ndarray | None, folder: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Return the samples of `generate`, and the additions to the command."""
+def generate_both(options: dict, ticks: int, volts: np.ndarray | None, folder: Path) -> tuple[np.ndarray, np.ndarray]:
+    """Return the samples of `generate`, and the additions to the command in the same ticks."""
     checked = TypeAdapter(ReferenceOptions).validate_python(options)
     table = TableOfSamples()
     table.add(np.full(5, 1e6))  # another axis's samples
@@ -41,16 +42,16 @@ def both(options: dict, ticks: int, volts: np.ndarray | None, folder: Path) -> t
     generators = np.zeros(1, GENERATOR).view(np.recarray)
     generators.kind, generators.start_tick = values[0], START
     generators.parameters[0, : len(values) - 1] = values[1:]
-    out, added = np.empty(ticks), np.empty(ticks)
+    out, feed = np.empty(ticks), np.empty(ticks)
     volts = np.zeros((ticks, 3)) if volts is None else volts
-    samples(generators, START, 1 / RATE_HZ, table.samples, volts, out, added)
-    return out, added
+    write_samples(generators, START, 1 / RATE_HZ, table.samples, volts, out, feed)
+    return out, feed
 
 
 VOLTS = np.random.default_rng(4).normal(0, 3, (TICKS, 3))
 FORMULAS = [
     ({"kind": "hold", "value": -3.25}, np.full(TICKS, -3.25), 0.0),
-    # level number floor(t / dwell), from the first again
+    # level number floor(t / dwell), then the first level again
     (
         {"kind": "steps", "levels": [20.0, 0.0, -20.0], "dwell_s": 0.25},
         np.array([20.0, 0.0, -20.0])[np.arange(TICKS) // 2500 % 3],
@@ -66,7 +67,7 @@ FORMULAS = [
         1.5 + 20 * np.sin(2 * np.pi * 17.3 * TIME_S + np.radians(40)),
         1e-9,
     ),
-    # a sine's zeros and peaks, with straight lines between: 2/π · arcsin(sin)
+    # straight lines between the zeros and peaks of a sine: 2/π · arcsin(sin)
     (
         {"kind": "triangle", "amplitude": 20, "frequency_hz": 17.3, "offset": -2, "phase_deg": -30},
         -2 + 20 * 2 / np.pi * np.arcsin(np.sin(2 * np.pi * 17.3 * TIME_S + np.radians(-30))),
@@ -94,9 +95,9 @@ def test_table(tmp_path, suffix, columns, repeat):
     index = np.arange(TICKS) // 3
     expected = recorded[index % 701 if repeat else np.minimum(index, 700)]
     options = {"kind": "table", "file": path.name, "hold_ticks": 3, "repeat": repeat}
-    reference, added = both(options, TICKS, None, tmp_path)
+    reference, feed = generate_both(options, TICKS, None, tmp_path)
     assert np.array_equal(reference, expected[:, 0])
-    assert np.array_equal(added, expected[:, 1] if columns == 2 else np.zeros(TICKS))
+    assert np.array_equal(feed, expected[:, 1] if columns == 2 else np.zeros(TICKS))
 
 
 @pytest.mark.parametrize("logarithmic", [True, False])
@@ -105,8 +106,8 @@ def test_chirp(logarithmic, start_hz, end_hz):
     """The phase is the integral of the frequency, here by Gauss-Legendre quadrature tick by tick."""
     duration_s = 2.0
     nodes, weights = np.polynomial.legendre.leggauss(8)
-    inside = TIME_S[:-1, None] + (nodes + 1) / 2 / RATE_HZ
-    share = np.minimum(inside / duration_s, 1.0)
+    node_times_s = TIME_S[:-1, None] + (nodes + 1) / 2 / RATE_HZ
+    share = np.minimum(node_times_s / duration_s, 1.0)
     hz = start_hz * (end_hz / start_hz) ** share if logarithmic else start_hz + (end_hz - start_hz) * share
     turns = np.concatenate([[0.0], np.cumsum(hz @ weights / 2 / RATE_HZ)])
     options = {"kind": "chirp", "amplitude": 4.0, "start_hz": start_hz, "end_hz": end_hz, "duration_s": duration_s}
@@ -120,7 +121,7 @@ def test_a_long_run_keeps_its_phase():
     generators = np.zeros(1, GENERATOR).view(np.recarray)
     generators.kind, generators.parameters[0, :2] = 2, (1.0, 0.5)
     out = np.empty(20_000)
-    samples(generators, week, 1e-4, np.zeros(1), np.zeros((20_000, 1)), out, np.empty(20_000))
+    write_samples(generators, week, 1e-4, np.zeros(1), np.zeros((20_000, 1)), out, np.empty(20_000))
     np.testing.assert_allclose(out, np.sin(np.pi * np.arange(20_000) / 10_000), rtol=0, atol=1e-6)
 
 
@@ -186,5 +187,5 @@ def test_references_that_cannot_be(tmp_path, options, message):
 def test_how_far_each_kind_comes_is_known_beforehand(options: dict) -> None:
     table = TableOfSamples()
     values = generator_values(TypeAdapter(ReferenceOptions).validate_python(options), RATE_HZ, INPUTS, Path(), table)
-    made = generate(options)
-    assert extent(values, table.samples) == pytest.approx((made.min(), made.max()), abs=1e-3)
+    samples = generate(options)
+    assert extent(values, table.samples) == pytest.approx((samples.min(), samples.max()), abs=1e-3)

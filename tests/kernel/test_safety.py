@@ -1,4 +1,4 @@
-"""For any input the drive is finite and keeps limit and slew rates; a NaN does not change the memory."""
+"""The drive is finite and keeps its limit and slew rates for any input; a NaN does not change the memory."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rtloop.signals import Flag, Mode
-from tests.kernel.harness import EQ_20, EXACT, PERIOD_S, LawBench, Signals, coefficients_of
+from tests.kernel.harness import EQ_20, EXACT, PERIOD_S, LawBench, Signals, make_coefficients
 
 DRIVE_V, SLEW, TRIP_SLEW = 10.0, 0.7, 0.1
 ULPS_V = 8 * np.spacing(DRIVE_V)
-FULL = coefficients_of(
+FULL = make_coefficients(
     controller=EQ_20,
     feedforward=EXACT,
     prefilter={"taps": [0.5, 0.3, 0.2], "sections": [[0.02, 0.04, 0.02, -1.5, 0.58]]},
@@ -35,6 +35,7 @@ ticks = st.tuples(
 
 
 def check_drive(signals: Signals, last_v: float = 0.0) -> None:
+    """Assert that the drive, which was `last_v` before, is finite and keeps its limit and the slew rate of its mode."""
     assert np.all(np.isfinite(signals.drive_v))
     assert np.all(np.abs(signals.drive_v) <= DRIVE_V)
     steps_v = np.abs(np.diff(signals.drive_v, prepend=last_v))
@@ -55,9 +56,9 @@ def test_any_inputs(steps):
 
 @pytest.mark.parametrize("mode", [Mode.RAW, Mode.FEEDFORWARD, Mode.CLOSED_LOOP])
 def test_square_waves_at_the_resonance(mode):
-    """Full scale at 595.5 Hz, where ±10 V would take the cantilever to 376 µm: the voltage keeps its promise."""
+    """The drive keeps its limits for full scale at 595.5 Hz, where ±10 V would move the cantilever by 376 µm."""
     square = np.sign(np.sin(2 * np.pi * 595.5 * PERIOD_S * np.arange(20000) + 0.1))
-    unslewed = coefficients_of(controller=EQ_20, feedforward=EXACT)
+    unslewed = make_coefficients(controller=EQ_20, feedforward=EXACT)
     for coefficients in (FULL, unslewed):
         signals = LawBench(coefficients, mode).run(1e6 * square, 5.0 * square)
         assert np.all(np.abs(signals.drive_v) <= DRIVE_V)
@@ -121,8 +122,8 @@ def test_each_cause_trips_and_stays(inputs, cause):
     bench = LawBench(FULL, Mode.RAW)
     assert bench.run(np.full(10, 3.0), 5.99, age_us=1000.0, status=1).flags[-1] == 0
     assert int(bench.run(3.0, **inputs).flags[0]) & cause
-    gone = bench.run(np.full(50, 3.0))
-    assert np.all(gone.flags.astype(int) & cause)
-    assert np.all(gone.mode == Mode.OFF)
-    assert gone.drive_v[-1] == 0.0
+    after_cause = bench.run(np.full(50, 3.0))
+    assert np.all(after_cause.flags.astype(int) & cause)
+    assert np.all(after_cause.mode == Mode.OFF)
+    assert after_cause.drive_v[-1] == 0.0
     assert bench.run(3.0, reset=True, mode=Mode.RAW).flags[0] == 0
