@@ -1,4 +1,4 @@
-"""Hosts made of files: one where everything is as it should be, to be spoilt piece by piece."""
+"""Simulated hosts made of files: a host in good condition, whose files and grants tests replace."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ GRANTED = {
 
 
 def host(root: Path, files: dict[str, str] | None = None, granted: dict[str, object] | None = None, **facts) -> Host:
-    """The good host below `root`, with other files and other grants."""
+    """Return the good host below `root`, with `files`, `granted` and `facts` replaced."""
     for path, text in (FILES | (files or {})).items():
         (root / path).parent.mkdir(parents=True, exist_ok=True)
         (root / path).write_text(text, encoding="utf-8")

@@ -1,4 +1,4 @@
-"""Each condition broken in turn, on a host of files: it is reported with its remedy, and the others are not."""
+"""Each condition broken in turn on a host of files: only the broken condition is reported, with its remedy."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from rtloop.doctor.examine import check_conditions
 from rtloop.doctor.host import Host, format_cpus, parse_cpus
 from rtloop.doctor.remedy import apply_remedies
 from rtloop.engine.plan import Pacing
-from rtloop.foundation.native import cache_files as stored
+from rtloop.foundation.native import cache_files
 from tests.doctor.hosts import CPUS, GRANTED, host
 
 SPINNING = Pacing(10_000.0, spin_us=95.0, cpu=3)
@@ -36,7 +36,7 @@ BROKEN = {
     "timer slack": ({}, {**REFUSED, "timer_slack_ns": 50_000}, {}),
 }
 ALONGSIDE = {"swap": {"locked memory"}, "control groups": {"SCHED_FIFO"}, "timer slack": {"SCHED_FIFO"}}
-"""Conditions that are bad whenever the key is."""
+"""Further conditions that are bad whenever the condition in the key is."""
 MENDABLE = {
     "interrupts",
     "frequency governor",
@@ -47,8 +47,8 @@ MENDABLE = {
 }
 
 
-def bad(findings) -> set[str]:
-    """Names of bad conditions, without the cache of compiled code, which depends on this machine."""
+def bad_conditions(findings) -> set[str]:
+    """Return the names of bad conditions, except the cache of compiled code, which depends on this machine."""
     return {finding.condition for finding in findings if finding.good is False} - {"compiled code"}
 
 
@@ -65,7 +65,7 @@ def test_a_broken_condition_is_named_and_mended(condition, tmp_path):
     broken = host(tmp_path, files, grants, **facts)
     findings = {finding.condition: finding for finding in check_conditions(broken, SPINNING)}
     finding = findings[condition]
-    assert bad(findings.values()) == {condition} | ALONGSIDE.get(condition, set())
+    assert bad_conditions(findings.values()) == {condition} | ALONGSIDE.get(condition, set())
     assert finding.late_us > 0
     assert all((finding.consequence, finding.fix, finding.value))
     assert finding.value != finding.wanted
@@ -75,8 +75,8 @@ def test_a_broken_condition_is_named_and_mended(condition, tmp_path):
     assert changed == {write.path for write in writes}
     assert not any(write.refused for write in writes)
     assert bool(writes) == (condition in MENDABLE)
-    if condition in MENDABLE - {"hyper-threading"}:  # there the kernel takes the sibling away
-        assert condition not in bad(check_conditions(broken, SPINNING))
+    if condition in MENDABLE - {"hyper-threading"}:  # there the kernel removes the sibling
+        assert condition not in bad_conditions(check_conditions(broken, SPINNING))
 
 
 @pytest.mark.parametrize(("condition", "path", "runtime", "lost_us", "text"), [
@@ -99,7 +99,7 @@ def test_a_refused_write_is_reported(tmp_path):
 
 def test_a_sleeping_loop_is_not_throttled(tmp_path):
     files = {**BROKEN["real-time throttling"][0], **BROKEN["fair server"][0]}
-    assert not bad(check_conditions(host(tmp_path, files), Pacing(10_000.0, spin_us=60.0, cpu=3)))
+    assert not bad_conditions(check_conditions(host(tmp_path, files), Pacing(10_000.0, spin_us=60.0, cpu=3)))
 
 
 def test_a_condition_that_the_host_does_not_show_is_neither_good_nor_bad(tmp_path):
@@ -126,11 +126,11 @@ def test_damaged_files_of_the_cache_are_reported(tmp_path, monkeypatch, state):
     cache.mkdir()
     monkeypatch.setattr(software, "CACHE_FOLDER", cache)
     monkeypatch.setattr(software, "CACHE_IS_PERSISTENT", True)
-    stored.write(cache / "kernel.nbc", b"code")
+    cache_files.write(cache / "kernel.nbc", b"code")
     if state != "whole":
         (cache / "kernel.nbc").write_bytes(b"")
     if state == "set aside":
-        stored.read(cache / "kernel.nbc")
+        cache_files.read(cache / "kernel.nbc")
     finding = software.compiled_code(host(tmp_path), Pacing(10_000.0))
     assert finding.good == (state == "whole")
     assert ("1 damaged file" in finding.value) == (state != "whole")

@@ -40,19 +40,21 @@ def test_a_measurement_of_the_clock_that_does_not_end_is_a_fault_in_a_sentence(m
 
 @pytest.fixture(autouse=True)
 def run_folder(tmp_path, monkeypatch):
+    """Set and return the folder of runtime files."""
     monkeypatch.setenv("RUNTIME_DIRECTORY", str(tmp_path / "run"))
     return tmp_path / "run"
 
 
 def doctor(*arguments: str, before=None) -> tuple[int, dict, str]:
-    ran = subprocess.run(
+    """Run `rtloop doctor` in a process that first calls `before`; return exit code, report and stderr."""
+    result = subprocess.run(
         [sys.executable, "-m", "rtloop", "doctor", "--json", *arguments],
         capture_output=True, text=True, preexec_fn=before, check=False,
     )  # fmt: skip
-    return ran.returncode, json.loads(ran.stdout), ran.stderr
+    return result.returncode, json.loads(result.stdout), result.stderr
 
 
-def without_privileges() -> None:
+def drop_privileges() -> None:
     """Drop the real-time rights of this process."""
     libc = ctypes.CDLL(None)
     for capability in (CAP_IPC_LOCK, CAP_SYS_NICE) if os.getuid() == 0 else ():
@@ -75,7 +77,7 @@ def test_the_report_on_this_host_is_complete(tmp_path, run_folder):
 
 
 def test_refused_rights_are_reported():
-    code, report, _ = doctor("--seconds", "0.1", before=without_privileges)
+    code, report, _ = doctor("--seconds", "0.1", before=drop_privileges)
     findings = {finding["condition"]: finding for finding in report["findings"]}
     assert (code, report["suitable"]) == (1, False)
     assert findings["SCHED_FIFO"]["value"] == "refused: Operation not permitted"
@@ -89,6 +91,7 @@ def test_a_missing_configuration_ends_with_66():
 
 
 def latency(values_us, rate_hz: float = 10_000.0) -> Latency:
+    """Return a measurement with these latenesses (µs), one a tick."""
     values_us = np.asarray(values_us, float)
     return Latency(Pacing(rate_hz, cpu=3), values_us, np.floor(values_us * rate_hz * 1e-6), 0.0)
 
@@ -116,15 +119,15 @@ def test_a_stall_and_steady_lateness_are_told_apart_on_a_good_host(case, tmp_pat
 
 @pytest.mark.parametrize(("rate_hz", "reasons"), [(10_000.0, ["kernel"]), (10.0, [])])
 def test_conditions_count_against_the_period(rate_hz, reasons, tmp_path):
-    """Milliseconds of a kernel without PREEMPT_RT forbid 10 kHz, and not 10 Hz."""
+    """A kernel without PREEMPT_RT, late by milliseconds, is a reason at 10 kHz and none at 10 Hz."""
     plain = host(tmp_path, {"sys/kernel/realtime": "0"}, version="#1 SMP PREEMPT_DYNAMIC")
     examination = Examination(latency(QUIET_US, rate_hz), check_conditions(plain, Pacing(10_000.0, cpu=3)))
     assert [reason.partition(":")[0] for reason in reasons_unsuitable(examination)] == reasons
 
 
-@pytest.mark.parametrize(("good", "count"), [(None, 0), (True, 0), (False, 1)])
-def test_only_a_condition_that_is_known_to_be_bad_is_a_reason(good, count):
-    finding = Finding("kernel", "unknown", "PREEMPT_RT", good, 5000.0, "late ticks", "")
+@pytest.mark.parametrize(("is_good", "count"), [(None, 0), (True, 0), (False, 1)])
+def test_only_a_condition_that_is_known_to_be_bad_is_a_reason(is_good, count):
+    finding = Finding("kernel", "unknown", "PREEMPT_RT", is_good, 5000.0, "late ticks", "")
     assert len(reasons_unsuitable(Examination(latency(QUIET_US), (finding,)))) == count
 
 
@@ -135,7 +138,7 @@ def test_a_delay_beyond_the_margin_of_a_loop_is_a_reason():
 
 
 def test_the_papers_loop_bears_two_milliseconds():
-    """Its C(z) has 73.05° left at 95.09 Hz, one sample of delay included in neither."""
+    """The paper's C(z) has a phase margin of 73.05° at 95.09 Hz, without a sample of delay."""
     prepared = prepare(parse(changed(), "paper", ROOT, "paper"))
     (delay,) = axis_delays(prepared, latency(np.linspace(0, 100, 10_001)))
     assert delay.crossover_hz == pytest.approx(95.09, abs=0.01)
@@ -153,7 +156,7 @@ def test_tolerated_delay_of_three_equal_poles(gain):
 
 
 def test_tolerated_delay_at_the_tightest_of_several_crossovers():
-    """A resonance at 600 Hz that crosses 1 again bears less than the slow crossover, by L written out."""
+    """A resonance at 600 Hz, where |L| crosses 1 again, tolerates less delay than the slow crossover."""
     w0, zeta, k = 2 * math.pi * 600, 0.01, 100.0
     pair = [complex(-zeta * w0, s * w0 * math.sqrt(1 - zeta**2)) for s in (1, -1)]
     loop = continuous_loop(Transfer.from_zpk([], [0.0], k), Transfer.from_zpk([], pair, w0**2))

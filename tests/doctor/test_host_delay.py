@@ -23,19 +23,21 @@ MARGIN_US = 73.05 / 360 / 95.09 * 1e6
 
 @pytest.fixture(autouse=True)
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Set and return the folder of runtime files; no other folder is searched."""
     monkeypatch.setenv("RUNTIME_DIRECTORY", str(tmp_path / "run"))
     monkeypatch.setattr(host_delay, "client_folders", list)  # not the folders of this machine
     return tmp_path / "run"
 
 
-def configured(*changes: tuple[str, str]) -> Configuration:
+def make_configuration(*changes: tuple[str, str]) -> Configuration:
+    """Return the paper's configuration after replacements of texts."""
     return parse(changed(*changes), "host-delay-test", ROOT / "deploy", "paper.toml")
 
 
 @pytest.fixture
 def measured() -> Configuration:
-    """A configuration with a stored lateness of 40 µs."""
-    configuration = configured()
+    """Return a configuration with a stored lateness of 40 µs."""
+    configuration = make_configuration()
     store_host_delay(configuration, lateness_us=40.0)
     return configuration
 
@@ -44,12 +46,12 @@ REQUIRED = ("# [axis.margins]  ", "[axis.margins]\nrequire_margin = true\n# ")
 
 
 def test_measured_delays_are_stored_for_their_rate() -> None:
-    configuration = configured()
+    configuration = make_configuration()
     assert load_host_delay(configuration) is None
     store_host_delay(configuration, lateness_us=40.0)
     store_host_delay(configuration, wire_ticks={"x": 3})
     assert load_host_delay(configuration) == HostDelay(rate_hz=10_000, lateness_us=40.0, wire_ticks={"x": 3})
-    assert load_host_delay(configured(("rate_hz = 10000\n", "rate_hz = 5000\n"))) is None
+    assert load_host_delay(make_configuration(("rate_hz = 10000\n", "rate_hz = 5000\n"))) is None
 
 
 @pytest.mark.parametrize("content", ["", "{", "[]", '{"rate_hz": -1}', '{"rate_hz": 1e4, "lateness_us": "x"}'])
@@ -71,7 +73,7 @@ def test_a_broken_file_does_not_hide_the_file_of_the_next_folder(
 def test_the_file_is_read_by_the_group_and_written_by_its_owner_alone(folder: Path) -> None:
     before = os.umask(0)
     try:
-        store_host_delay(configured(), lateness_us=40.0)
+        store_host_delay(make_configuration(), lateness_us=40.0)
     finally:
         os.umask(before)
     assert (folder / "host-delay-test.host.json").stat().st_mode & 0o777 == 0o640
@@ -87,7 +89,7 @@ def test_a_file_that_others_may_write_is_ignored(folder: Path, measured: Configu
 
 def test_lateness_and_ticks_beyond_the_model_are_spent() -> None:
     """A held output takes one tick through a wire; the rig's latency of one is in the loop already."""
-    configuration = configured(("latency_ticks = 0", "latency_ticks = 1"))
+    configuration = make_configuration(("latency_ticks = 0", "latency_ticks = 1"))
     store_host_delay(configuration, lateness_us=40.0, wire_ticks={"x": 4})
     (check,), host = prepare(configuration).checks, load_host_delay(configuration)
     assert host is not None
@@ -102,30 +104,30 @@ def test_lateness_and_ticks_beyond_the_model_are_spent() -> None:
 
 
 def test_a_required_margin_needs_a_known_delay_that_leaves_some() -> None:
-    require_margins(prepare(configured()))
-    asking = prepare(configured(REQUIRED))
-    require_margins(prepare(configured(REQUIRED), paced=False))
+    require_margins(prepare(make_configuration()))
+    prepared = prepare(make_configuration(REQUIRED))
+    require_margins(prepare(make_configuration(REQUIRED), paced=False))
     with pytest.raises(ConfigError, match="delay of this host is unknown"):
-        require_margins(asking)
-    store_host_delay(asking.configuration, lateness_us=MARGIN_US - 20.0)
-    require_margins(asking)
-    store_host_delay(asking.configuration, lateness_us=MARGIN_US + 20.0)
+        require_margins(prepared)
+    store_host_delay(prepared.configuration, lateness_us=MARGIN_US - 20.0)
+    require_margins(prepared)
+    store_host_delay(prepared.configuration, lateness_us=MARGIN_US + 20.0)
     with pytest.raises(
         ConfigError, match=r"require_margin: measured on this host: 215\d µs = .* no margin of stability is left"
     ):
-        require_margins(asking)
+        require_margins(prepared)
     with pytest.raises(ConfigError, match="the axis's margin is unknown"):
-        require_margins(replace(asking, checks=(replace(asking.checks[0], on_model=None),)))
+        require_margins(replace(prepared, checks=(replace(prepared.checks[0], on_model=None),)))
 
 
 @pytest.mark.parametrize("exchange_us", [100.0, 300.0, 1000.0, MARGIN_US - 20.0, MARGIN_US + 20.0])
 def test_the_delay_of_an_exchange_is_spent_and_forbids_a_run_where_it_is_all(exchange_us: float) -> None:
-    """Delays that a network adds, as the self-test stores them."""
-    asking = prepare(configured(REQUIRED))
-    store_host_delay(asking.configuration, exchange_us=exchange_us)
-    host = load_host_delay(asking.configuration)
+    """A network adds such delays; the self-test stores them."""
+    prepared = prepare(make_configuration(REQUIRED))
+    store_host_delay(prepared.configuration, exchange_us=exchange_us)
+    host = load_host_delay(prepared.configuration)
     assert host is not None
-    spent = spent_margin(asking.checks[0], host)
+    spent = spent_margin(prepared.checks[0], host)
     assert spent is not None
     assert (spent.exchange_us, spent.more_us, spent.more_ticks) == pytest.approx(
         (exchange_us, exchange_us, exchange_us / 100.0)
@@ -133,9 +135,9 @@ def test_the_delay_of_an_exchange_is_spent_and_forbids_a_run_where_it_is_all(exc
     assert spent.is_spent == (exchange_us > MARGIN_US)
     if spent.is_spent:
         with pytest.raises(ConfigError, match=r"require_margin: .* no margin of stability is left"):
-            require_margins(asking)
+            require_margins(prepared)
     else:
-        require_margins(asking)
+        require_margins(prepared)
 
 
 def test_the_page_of_a_verification_shows_the_delay_of_this_host(folder: Path) -> None:

@@ -57,8 +57,8 @@ BROKEN = {
 }  # fmt: skip
 
 
-def bad(findings) -> list[tuple[str, str]]:
-    """Conditions and remedies of the bad findings."""
+def bad_findings(findings) -> list[tuple[str, str]]:
+    """Return conditions and remedies of the bad findings."""
     return [(finding.condition, finding.fix) for finding in findings if finding.good is False]
 
 
@@ -70,7 +70,7 @@ def test_a_good_cable_has_five_good_findings(tmp_path):
 @pytest.mark.parametrize("case", BROKEN)
 def test_a_broken_condition_alone_is_bad_and_names_its_command(case, tmp_path):
     files, line, condition, command = BROKEN[case]
-    ((name, fix),) = bad(check_line(line, host(tmp_path, WIRED | files), PACING))
+    ((name, fix),) = bad_findings(check_line(line, host(tmp_path, WIRED | files), PACING))
     assert name == condition
     assert command in fix
 
@@ -82,10 +82,10 @@ def test_what_a_card_does_not_tell_is_unknown(tmp_path):
 
 def test_interrupts_of_the_card_are_moved_on_request(tmp_path):
     files = WIRED | {"proc/irq/24/smp_affinity_list": "0-3\n"}
-    spoilt = host(tmp_path, files)
-    (write,) = apply_remedies(check_line(ETH1, spoilt, PACING), tmp_path)
+    broken_host = host(tmp_path, files)
+    (write,) = apply_remedies(check_line(ETH1, broken_host, PACING), tmp_path)
     assert (write.condition, write.text, write.refused) == ("card's interrupts", "0-2", "")
-    assert bad(check_line(ETH1, spoilt, PACING)) == []
+    assert bad_findings(check_line(ETH1, broken_host, PACING)) == []
 
 
 def test_nothing_is_judged_on_the_loopback_interface(tmp_path):
@@ -98,7 +98,7 @@ def test_nothing_is_judged_on_the_loopback_interface(tmp_path):
 
 def test_an_address_that_does_not_exist_has_no_route(tmp_path):
     line = find_network_line("192.168.10.2", 5747, "203.0.113.1")  # no address of this computer
-    assert bad(check_line(line, host(tmp_path), PACING))[0][0] == "node's network"
+    assert bad_findings(check_line(line, host(tmp_path), PACING))[0][0] == "node's network"
 
 
 SERIAL = SerialLine("/dev/ttyUSB0")
@@ -107,7 +107,7 @@ FLAGS = "sys/class/tty/ttyUSB0/flags"
 
 
 @pytest.mark.parametrize(
-    ("files", "good", "command"),
+    ("files", "states", "command"),
     [
         ({TIMER: "1\n", FLAGS: "0x2000\n"}, [True, True], ""),
         ({TIMER: "16\n"}, [False, None], f"echo 1 | sudo tee /{TIMER}"),
@@ -115,10 +115,10 @@ FLAGS = "sys/class/tty/ttyUSB0/flags"
         ({}, [None, None], ""),
     ],
 )
-def test_a_terminal_must_hand_bytes_on_at_once(files, good, command, tmp_path):
+def test_a_terminal_must_hand_bytes_on_at_once(files, states, command, tmp_path):
     findings = check_line(SERIAL, host(tmp_path, files), PACING)
-    assert [finding.good for finding in findings] == good
-    assert "".join(fix for _, fix in bad(findings)) == command
+    assert [finding.good for finding in findings] == states
+    assert "".join(fix for _, fix in bad_findings(findings)) == command
 
 
 HEAD = """

@@ -20,8 +20,8 @@ IDEAL: dict[str, Any] = {
 }
 
 
-class Run(NamedTuple):
-    """Signals of a run, each of shape (ticks,): at tick k, before the drive of tick k."""
+class RigSignals(NamedTuple):
+    """Signals of a run, each of shape (ticks,); entry k is from before the drive of tick k."""
 
     adc_v: np.ndarray
     true_um: np.ndarray
@@ -29,7 +29,8 @@ class Run(NamedTuple):
 
 
 @jit
-def _run(coefficients, state, drive_v, adc_v, true_um, hysteresis_um):
+def _simulate(coefficients, state, drive_v, adc_v, true_um, hysteresis_um):
+    """Run one axis over the drives and write its signals to the last three arrays."""
     for k in range(drive_v.size):
         adc_v[k] = sample(coefficients[0], state[0])
         true_um[k] = state[0].true_position_um
@@ -38,22 +39,22 @@ def _run(coefficients, state, drive_v, adc_v, true_um, hysteresis_um):
 
 
 @pytest.fixture(scope="session")
-def run() -> Callable[..., Run]:
-    """Drive one axis, `x`, of a rig from rest."""
+def run() -> Callable[..., RigSignals]:
+    """Return a function that drives one axis, `x`, of a rig from rest and returns its signals."""
 
-    def run_rig(drive_v: Any, options: RigOptions | None = None, period_s: float = 1e-4) -> Run:
+    def drive_rig(drive_v: Any, options: RigOptions | None = None, period_s: float = 1e-4) -> RigSignals:
         drive = np.asarray(drive_v, dtype=float)
         coefficients, state = build_rig(options or RigOptions(), ["x"], period_s)
-        signals = Run(*(np.empty(drive.size) for _ in Run._fields))
-        _run(coefficients, state, drive, *signals)
+        signals = RigSignals(*(np.empty(drive.size) for _ in RigSignals._fields))
+        _simulate(coefficients, state, drive, *signals)
         return signals
 
-    return run_rig
+    return drive_rig
 
 
 @pytest.fixture(scope="session")
 def ideal() -> Callable[..., RigOptions]:
-    """Options of a rig that is linear, exact and free of noise, except for the parts given."""
+    """Return a function for options of a rig that is linear, exact and free of noise, except for the given parts."""
 
     def make(latency_ticks: int = 0, **parts: Any) -> RigOptions:
         return RigOptions(plant=PlantOptions(**{**IDEAL, **parts}), latency_ticks=latency_ticks)

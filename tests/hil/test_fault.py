@@ -1,3 +1,5 @@
+"""Simulated faults of sensor and drive, compared with a healthy rig."""
+
 from __future__ import annotations
 
 import numpy as np

@@ -14,7 +14,7 @@ import pytest
 from rtloop.foundation.native import cache, machine_code
 from rtloop.foundation.native.c_function import CFunction, Entry, ExportedKernel
 
-OUTWARD = ("rtloop.engine.assembly", *(f"rtloop.drivers.{name}" for name in ("sim", "shm", "comedi", "playback")))
+EXPORTERS = ("rtloop.engine.assembly", *(f"rtloop.drivers.{name}" for name in ("sim", "shm", "comedi", "playback")))
 ROOT = Path(__file__).parents[2]
 WITHOUT_COMPILER = """
 import sys
@@ -37,25 +37,26 @@ print("numba" in sys.modules)
 
 
 def halved(number):
-    """Half of an even number."""
+    """Return half of an even number; raise IndexError for an odd one."""
     if number % 2 != 0:
         raise IndexError("an odd number")
     return number // 2
 
 
 def doubled(number):
-    """Twice a number."""
+    """Return twice a whole number."""
     return number * 2
 
 
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Make a new folder the cache of compiled code, and return it."""
     monkeypatch.setattr(cache, "CACHE_FOLDER", tmp_path)
     return tmp_path
 
 
-def compilations(kind: type[Entry | CFunction], monkeypatch) -> list[str]:
-    """Names of the kernels that are compiled from here on."""
+def record_compilations(kind: type[Entry | CFunction], monkeypatch) -> list[str]:
+    """Return a list to which each kernel that is compiled from here on adds its name."""
     names, compile_original = [], kind._compile
 
     def compile_and_record(kernel):
@@ -67,7 +68,7 @@ def compilations(kind: type[Entry | CFunction], monkeypatch) -> list[str]:
 
 
 def test_a_run_needs_no_compiler() -> None:
-    """Neither the command nor the recorder nor the loop, once their kernels have been compiled."""
+    """Command, recorder and loop do not import numba once their kernels are in the cache."""
     for _ in range(2):
         result = subprocess.run([sys.executable, "-c", WITHOUT_COMPILER], cwd=ROOT, capture_output=True, text=True)
         assert result.returncode == 0, result.stderr
@@ -75,7 +76,7 @@ def test_a_run_needs_no_compiler() -> None:
 
 
 def test_all_exported_kernels_are_stored() -> None:
-    for module in OUTWARD:
+    for module in EXPORTERS:
         import_module(module)
     exported = [item for item in gc.get_objects() if issubclass(type(item), ExportedKernel)]
     kernels = [kernel for kernel in exported if kernel._name.startswith("rtloop.")]
@@ -84,7 +85,7 @@ def test_all_exported_kernels_are_stored() -> None:
 
 
 def test_a_kernel_is_compiled_once_and_keeps_its_exceptions(folder, monkeypatch) -> None:
-    compiled = compilations(Entry, monkeypatch)
+    compiled = record_compilations(Entry, monkeypatch)
     for _ in range(2):
         entry = Entry(halved, "int64(int64)")
         assert entry(14) == 7
@@ -96,7 +97,7 @@ def test_a_kernel_is_compiled_once_and_keeps_its_exceptions(folder, monkeypatch)
 
 @pytest.mark.parametrize("damage", [lambda data: data[:-1], lambda data: b"", lambda data: data[:99] + b"\0" * 99])
 def test_a_damaged_file_is_compiled_again(folder, monkeypatch, damage) -> None:
-    compiled = compilations(Entry, monkeypatch)
+    compiled = record_compilations(Entry, monkeypatch)
     assert Entry(doubled, "int64(int64)")(4) == 8
     (file,) = folder.glob("*.o")
     file.write_bytes(damage(file.read_bytes()))
@@ -105,7 +106,7 @@ def test_a_damaged_file_is_compiled_again(folder, monkeypatch, damage) -> None:
 
 
 def test_a_c_function_is_called_by_its_address(folder, monkeypatch) -> None:
-    compiled = compilations(CFunction, monkeypatch)
+    compiled = record_compilations(CFunction, monkeypatch)
     for _ in range(2):
         address = CFunction(doubled, "int64(int64)").address
         assert ctypes.CFUNCTYPE(ctypes.c_int64, ctypes.c_int64)(address)(21) == 42

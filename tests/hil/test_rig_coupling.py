@@ -16,17 +16,17 @@ COUPLING = {"x": {"y": 0.2}, "y": {"x": -0.1}}
 POLES = {"x": 300.0, "y": 150.0}
 
 
-def rig(ideal: Any, **more: Any) -> RigOptions:
-    """Two linear axes whose positions follow their displacements with one pole each."""
+def rig(ideal: Any, **options: Any) -> RigOptions:
+    """Return options of two coupled linear axes, whose positions follow their displacements with one pole each."""
     plants = {
         name: ideal(dynamics=DynamicsOptions(form="zpk", poles=[[-pole, 0.0]], gain=pole)).plant
         for name, pole in POLES.items()
     }
-    return RigOptions(plants=plants, coupling=COUPLING, **more)
+    return RigOptions(plants=plants, coupling=COUPLING, **options)
 
 
 def run(options: RigOptions, drives_v: np.ndarray, axes: tuple[str, ...] = ("x", "y")) -> np.ndarray:
-    """True positions (ticks, axes) for drives (ticks, axes)."""
+    """Return the true positions (ticks, axes) in µm for drives (ticks, axes) in V."""
     coefficients, state = build_rig(options, axes, PERIOD_S)
     positions_um = np.empty_like(drives_v)
     for k, drive_v in enumerate(drives_v):
@@ -54,7 +54,7 @@ def test_without_a_coupling_nothing_is_added(ideal):
 
 
 def test_a_history_moves_the_neighbour_too(ideal):
-    """An actuator left displaced by its past displaces what it is coupled to, from the first sample on."""
+    """An actuator that its history left displaced also displaces the coupled axis, from the first sample on."""
     aged = PlantOptions.model_validate({"hysteresis": {"history_v": [10.0, -4.0]}, "dynamics": {"form": "paper"}})
     options = RigOptions(plants={"y": aged}, coupling={"x": {"y": 0.5}})
     positions_um = run(options, np.zeros((20, 2)))

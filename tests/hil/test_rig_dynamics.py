@@ -24,42 +24,42 @@ PERIOD = 1e-4
 
 
 def product(factors):
-    """Coefficients of a product of polynomials in the precision of mpmath's context, highest power first."""
+    """Return the product of polynomials in the precision of mpmath's context; coefficients, highest power first."""
     return reduce(np.convolve, [np.array([mpmath.mpf(number) for number in factor]) for factor in factors])
 
 
-def held_response(numerator, denominator, drive, period):
-    """Output at each instant k·period of a strictly proper system: companion form and its matrix exponential."""
+def simulate_hold(numerator, denominator, drive, period):
+    """Return the output at each k·period of a strictly proper system with held inputs, by a matrix exponential."""
     order = len(denominator) - 1
     # In units of the period the coefficients stay moderate.
-    scaled = [c * mpmath.mpf(period) ** i for i, c in enumerate(denominator)]
-    above = [c * mpmath.mpf(period) ** (order - len(numerator) + 1 + i) for i, c in enumerate(numerator)]
+    scaled_denominator = [c * mpmath.mpf(period) ** i for i, c in enumerate(denominator)]
+    scaled_numerator = [c * mpmath.mpf(period) ** (order - len(numerator) + 1 + i) for i, c in enumerate(numerator)]
     companion = mpmath.matrix(np.eye(order + 1, k=1).tolist())  # its last column is the input
     for i in range(order):
-        companion[order - 1, i] = -scaled[order - i]
+        companion[order - 1, i] = -scaled_denominator[order - i]
     transition = mpmath.expm(companion, method="taylor")
     state, out = mpmath.zeros(order, 1), []
     for u in drive:
-        out.append(float(mpmath.fsum(c * part for c, part in zip(above[::-1], state, strict=False))))
+        out.append(float(mpmath.fsum(c * part for c, part in zip(scaled_numerator[::-1], state, strict=False))))
         state = transition[:order, :order] * state + transition[:order, order] * mpmath.mpf(u)
     return np.array(out)
 
 
 def eq_5(s):
-    """D(s) in complex doubles."""
-    above, below = (np.prod([np.polyval(f, s) for f in factors], 0) for factors in (NUMERATOR, DENOMINATOR))
-    return GAIN * above / below
+    """Return D(s) of eq (5) in complex doubles."""
+    numerator, denominator = (np.prod([np.polyval(f, s) for f in factors], 0) for factors in (NUMERATOR, DENOMINATOR))
+    return GAIN * numerator / denominator
 
 
 def kernel_poles(options, period=PERIOD):
-    """The modes' poles in z as the kernel holds them."""
+    """Return the poles in z of the modes that the kernel uses, one of each conjugate pair."""
     coefficients, _ = build_rig(options, ["x"], period)
     count = coefficients[0].mode_count
     return coefficients[0].mode_real[:count] + 1j * coefficients[0].mode_imag[:count]
 
 
 def is_among(pole, poles):
-    """Whether a pole, or its conjugate, is one of `poles`."""
+    """Return whether a pole, or its conjugate, is one of `poles`."""
     return min(np.abs(poles - pole).min(), np.abs(poles - np.conj(pole)).min()) < 1e-12
 
 
@@ -67,7 +67,7 @@ def is_among(pole, poles):
 def test_hold_is_exact(run, ideal, period):
     drive = np.random.default_rng(2).normal(0, 5, 80)
     with mpmath.workdps(60):
-        expected = held_response([GAIN * c for c in product(NUMERATOR)], product(DENOMINATOR), drive, period)
+        expected = simulate_hold([GAIN * c for c in product(NUMERATOR)], product(DENOMINATOR), drive, period)
     np.testing.assert_allclose(run(drive, ideal(), period).true_um, expected, rtol=0, atol=1e-9)
 
 
@@ -91,14 +91,14 @@ def test_resonance_peak(run, ideal):
 
 
 def test_sensor_bandwidth_hides_nothing_of_the_truth(run, ideal):
-    """With a lag the true position is the same; the sensed one is D(s)·ω/(s + ω), at 60 digits."""
+    """The sensor's lag leaves the true position the same; the reading is D(s)·ω/(s + ω), at 60 digits."""
     drive = np.random.default_rng(3).normal(0, 5, 60)
     sensor = SensorOptions(um_per_v=1.0, noise_um=0.0, resolution_um=0.0, bandwidth_hz=1000.0)
     lagged = run(drive, ideal(sensor=sensor))
     corner = 2 * np.pi * 1000.0
     with mpmath.workdps(60):
         numerator = [GAIN * corner * c for c in product(NUMERATOR)]
-        expected = held_response(numerator, product([*DENOMINATOR, [1, corner]]), drive, PERIOD)
+        expected = simulate_hold(numerator, product([*DENOMINATOR, [1, corner]]), drive, PERIOD)
     np.testing.assert_allclose(lagged.adc_v, expected, rtol=0, atol=1e-9)
     np.testing.assert_allclose(lagged.true_um, run(drive, ideal()).true_um, rtol=0, atol=1e-12)
 
@@ -116,13 +116,13 @@ def test_own_factors_and_bandwidth_against_scipy(run, ideal, damping):
         (signals.true_um, factors, 3 * natural**2),
         (signals.adc_v, np.polymul(factors, [1, corner]), 3 * natural**2 * corner),
     ):
-        held: Any = scipy.signal.cont2discrete(([gain], denominator), PERIOD)
-        expected = scipy.signal.lfilter(np.ravel(held[0]), held[1], drive)
+        discrete: Any = scipy.signal.cont2discrete(([gain], denominator), PERIOD)
+        expected = scipy.signal.lfilter(np.ravel(discrete[0]), discrete[1], drive)
         np.testing.assert_allclose(output, expected, rtol=0, atol=1e-8)
 
 
 def test_zeros_and_poles_are_the_same_plant(run, ideal):
-    """(s + 10) / ((s + 20)(s² + 40 s + 2500)) either way."""
+    """Both forms give (s + 10) / ((s + 20)(s² + 40 s + 2500))."""
     factors = DynamicsOptions(form="factors", gain=4e4, numerator=((1, 10),), denominator=((2, 40), (0.5, 20, 1250)))
     imag = np.sqrt(2500 - 400)
     zpk = DynamicsOptions(form="zpk", gain=4e4, zeros=((-10, 0),), poles=((-20, 0), (-20, imag), (-20, -imag)))
@@ -146,20 +146,20 @@ def test_a_direct_path_does_not_pass_a_sensor_of_finite_bandwidth(run, ideal):
     sensor = SensorOptions(um_per_v=1.0, noise_um=0.0, resolution_um=0.0, bandwidth_hz=200.0)
     corner, drive = 2 * np.pi * 200, np.random.default_rng(5).normal(0, 1, 200)
     sensed = run(drive, ideal(dynamics=dynamics, sensor=sensor)).adc_v
-    held: Any = scipy.signal.cont2discrete(([corner, 200 * corner], np.polymul([1, 100], [1, corner])), PERIOD)
-    np.testing.assert_allclose(sensed, scipy.signal.lfilter(np.ravel(held[0]), held[1], drive), atol=1e-10)
+    discrete: Any = scipy.signal.cont2discrete(([corner, 200 * corner], np.polymul([1, 100], [1, corner])), PERIOD)
+    np.testing.assert_allclose(sensed, scipy.signal.lfilter(np.ravel(discrete[0]), discrete[1], drive), atol=1e-10)
 
 
 def test_a_mode_slower_than_a_radian_a_second_is_one_pair(run, ideal):
     """s² + 0.2 s + 0.26, of poles −0.1 ± 0.5j: a rig that counts the second pole as another mode answers twice."""
     dynamics = DynamicsOptions(form="zpk", gain=0.26, poles=((-0.1, 0.5), (-0.1, -0.5)))
-    held: Any = scipy.signal.cont2discrete(([0.26], [1, 0.2, 0.26]), 0.01)
-    expected = scipy.signal.lfilter(np.ravel(held[0]), held[1], np.ones(2000))
+    discrete: Any = scipy.signal.cont2discrete(([0.26], [1, 0.2, 0.26]), 0.01)
+    expected = scipy.signal.lfilter(np.ravel(discrete[0]), discrete[1], np.ones(2000))
     poles = kernel_poles(ideal(dynamics=dynamics), 0.01)
     assert len(poles) == 1
     coefficients, _ = build_rig(ideal(dynamics=dynamics), ["x"], 0.01)
-    one = coefficients[0]
-    residue = one.true_real[0] - 1j * one.true_imag[0]
+    axis = coefficients[0]
+    residue = axis.true_real[0] - 1j * axis.true_imag[0]
     ticks = np.arange(2000)
     step = np.real(residue * (1 - poles[0] ** ticks) / (1 - poles[0]))
     np.testing.assert_allclose(step, expected, atol=1e-9)
@@ -175,13 +175,13 @@ def test_integrator(run, ideal):
 def test_shift_moves_the_resonance_only(ideal, shift):
     """The pair of s² + 55 s + 1.4e7 goes to (1 + shift) times its place (constant damping ratio); D(0) stays."""
     shifted = ideal(dynamics=DynamicsOptions(resonance_shift=shift))
-    moved = kernel_poles(shifted)
+    shifted_poles = kernel_poles(shifted)
     for i, (_, b, c) in enumerate(DENOMINATOR):
         pole = complex(-b / 2, np.sqrt(c - b * b / 4))
-        assert is_among(np.exp((1 + shift if i == 1 else 1) * pole * PERIOD), moved)
+        assert is_among(np.exp((1 + shift if i == 1 else 1) * pole * PERIOD), shifted_poles)
     coefficients, _ = build_rig(shifted, ["x"], PERIOD)
-    real, imag = coefficients[0].true_real[: moved.size], coefficients[0].true_imag[: moved.size]
-    dc = ((real - 1j * imag) / (1 - moved)).real.sum()
+    real, imag = coefficients[0].true_real[: shifted_poles.size], coefficients[0].true_imag[: shifted_poles.size]
+    dc = ((real - 1j * imag) / (1 - shifted_poles)).real.sum()
     assert dc == pytest.approx(1.01086419, abs=1e-8)
 
 

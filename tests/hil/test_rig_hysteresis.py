@@ -22,25 +22,25 @@ volts = st.floats(-20, 20)
 thresholds = st.floats(0, 10)
 
 
-def forward(drive: np.ndarray, weights: np.ndarray, thresholds: np.ndarray = R) -> np.ndarray:
-    """Σ p_i F_{r_i}[u] from rest, F as in the text under eq (1): max(u − r, min(u + r, F₋))."""
-    held, out = np.zeros(thresholds.size), []
+def model_output(drive: np.ndarray, weights: np.ndarray, thresholds: np.ndarray = R) -> np.ndarray:
+    """Return Σ p_i F_{r_i}[u] from rest, F as in the text under eq (1): max(u − r, min(u + r, F₋))."""
+    plays, out = np.zeros(thresholds.size), []
     for u in drive:
-        held = np.maximum(u - thresholds, np.minimum(u + thresholds, held))
-        out.append(weights @ held)
+        plays = np.maximum(u - thresholds, np.minimum(u + thresholds, plays))
+        out.append(weights @ plays)
     return np.array(out)
 
 
 def inverse_of_eq_4(command: np.ndarray) -> np.ndarray:
-    """Kuhnen's exact inverse (2003) of eq (4), r_0 taken as 0: z_j = Σ_{i<=j} p_i (r_j − r_i), g from partial sums."""
+    """Return Kuhnen's inverse (2003) of eq (4), r_0 taken as 0: z_j = Σ_{i<=j} p_i (r_j − r_i), g by partial sums."""
     sums = np.cumsum(P)
     z = np.array([P[: j + 1] @ (R[j] - R[: j + 1]) for j in range(R.size)])
     g = np.array([1 / P[0], *(-P[1:] / (sums[1:] * sums[:-1]))])
-    return forward(command, g, z)
+    return model_output(command, g, z)
 
 
 def height_percent(drive: np.ndarray, output: np.ndarray) -> float:
-    """100·h/H of the last closed loop of `periods`, from the sine's minimum: largest opening over total height."""
+    """Return 100·h/H, largest opening over total height, of the last closed loop of `periods`, from the minimum on."""
     x, y = drive[3000:7001], output[3000:7001]
     half = x.size // 2
     up, down = y[: half + 1], y[half:][::-1]
@@ -49,12 +49,12 @@ def height_percent(drive: np.ndarray, output: np.ndarray) -> float:
 
 
 def periods(amplitude: float) -> np.ndarray:
-    """Three periods of a sine, from 0, 4000 points each."""
+    """Return three periods of a sine, from 0, 4000 points each."""
     return amplitude * np.sin(2 * np.pi * np.arange(12001) / 4000)
 
 
 def displacement(run, ideal, truth: str, drive: np.ndarray, **options) -> np.ndarray:
-    """y of the rig for each drive, without the period of delay."""
+    """Return y (µm) of the rig for each drive (V), without the period of delay."""
     options = ideal(hysteresis=HysteresisOptions(truth=truth, **options), dynamics=RIGID)
     return run(np.append(drive, 0.0), options).hysteresis_um[1:]
 
@@ -91,7 +91,7 @@ def test_nominal_truth_leaves_the_dead_band_only(run, ideal):
 def test_both_truths_are_the_operator_written_out(run, ideal, truth, weights):
     drive = np.cumsum(np.random.default_rng(1).normal(0, 2, 3000))
     drive = np.abs((drive + 10) % 40 - 20) - 10
-    np.testing.assert_allclose(displacement(run, ideal, truth, drive), forward(drive, weights), rtol=0, atol=1e-12)
+    np.testing.assert_allclose(displacement(run, ideal, truth, drive), model_output(drive, weights), rtol=0, atol=1e-12)
 
 
 def test_custom_model(run, ideal):
@@ -103,7 +103,7 @@ def test_custom_model(run, ideal):
 def test_history_is_remembered(run, ideal):
     """A drive to 10 V and back leaves y = Σ p_i max(F, −r_i) there, at rest, which the sensor shows at once."""
     options = ideal(hysteresis=HysteresisOptions(truth="nominal", history_v=(10.0,)))
-    remanent = forward(np.array([10.0, 0.0]), P)[1]
+    remanent = model_output(np.array([10.0, 0.0]), P)[1]
     signals = run(np.zeros(500), options)
     np.testing.assert_allclose(signals.hysteresis_um, remanent, rtol=1e-13)
     # D(0) of eq (5) is 1.01086419: at rest from the first tick on.
@@ -112,61 +112,61 @@ def test_history_is_remembered(run, ideal):
 
 
 @given(volts, thresholds, volts)
-def test_play_is_the_definition_and_stays_within_its_threshold(drive, threshold, held):
+def test_play_is_the_definition_and_stays_within_its_threshold(drive, threshold, previous):
     """Krasnosel'skii & Pokrovskii 1989: max(u − r, min(u + r, y₋))."""
-    output = play_output(drive, threshold, held)
-    assert output == max(drive - threshold, min(drive + threshold, held))
+    output = play_output(drive, threshold, previous)
+    assert output == max(drive - threshold, min(drive + threshold, previous))
     assert abs(output - drive) <= threshold + 1e-14
 
 
 @given(volts, volts, thresholds, volts)
-def test_play_is_monotone(first, second, threshold, held):
+def test_play_is_monotone(first, second, threshold, previous):
     low, high = sorted((first, second))
-    assert play_output(low, threshold, held) <= play_output(high, threshold, held)
+    assert play_output(low, threshold, previous) <= play_output(high, threshold, previous)
 
 
 @given(volts, volts, thresholds, st.lists(st.floats(0, 1), max_size=8))
 def test_play_does_not_depend_on_the_rate(start, end, threshold, stops):
-    """Monotone stops between two drives do not change the output."""
-    held = play_output(start, threshold, 0.0)
-    walked = held
+    """Intermediate drives, in ascending or descending order, do not change the output."""
+    previous = play_output(start, threshold, 0.0)
+    output = previous
     for share in (*sorted(stops), 1.0):
-        walked = play_output(end if share == 1.0 else start + share * (end - start), threshold, walked)
-    assert walked == pytest.approx(play_output(end, threshold, held), abs=1e-13)
+        output = play_output(end if share == 1.0 else start + share * (end - start), threshold, output)
+    assert output == pytest.approx(play_output(end, threshold, previous), abs=1e-13)
 
 
 @given(thresholds, volts)
-def test_play_holds_on_nan(threshold, held):
-    assert play_output(float("nan"), threshold, held) == held
+def test_play_holds_on_nan(threshold, previous):
+    assert play_output(float("nan"), threshold, previous) == previous
 
 
 BOUC_WEN = {"um_per_v": 4.4, "rise_um_per_v": 0.9, "decay_per_v": 0.3, "lean_per_v": 0.1}
 
 
 def bouc_wen(run, ideal, drive: np.ndarray) -> np.ndarray:
-    """y of a rig of that kind for each drive."""
+    """Return y (µm) of a Bouc-Wen rig for each drive (V)."""
     return displacement(run, ideal, "bouc-wen", drive, bouc_wen=BoucWenOptions(**BOUC_WEN))
 
 
-def integrated(turns_v: list[float], points: int) -> np.ndarray:
-    """y along straight ways from turn to turn, by scipy's integrator of the equation itself."""
+def integrate_bouc_wen(turns_v: list[float], points: int) -> np.ndarray:
+    """Return y (µm) along straight ways between the turns, by scipy's integration of the equation."""
     d, rise, decay, lean = BOUC_WEN.values()
-    left, outputs = 0.0, []
+    state_um, outputs = 0.0, []
     for start, end in pairwise(turns_v):
         way = end - start
         slope = lambda _, h, way=way: rise * way - decay * abs(way) * h - lean * way * np.abs(h)
-        part = solve_ivp(slope, (0, 1), [left], rtol=1e-10, atol=1e-12, t_eval=np.linspace(0, 1, points + 1)[1:])
-        left = part.y[0, -1]
+        part = solve_ivp(slope, (0, 1), [state_um], rtol=1e-10, atol=1e-12, t_eval=np.linspace(0, 1, points + 1)[1:])
+        state_um = part.y[0, -1]
         outputs.append(d * (start + way * part.t) - part.y[0])
     return np.concatenate(outputs)
 
 
 @pytest.mark.parametrize("points", [1, 7, 400])
 def test_bouc_wen_is_its_equation_at_any_rate(run, ideal, points):
-    """One step of 20 V and 400 steps of 50 mV give the same output."""
+    """A single step of 20 V and 400 steps of 50 mV give the same output."""
     turns = [0.0, 10.0, -10.0, 6.0, -2.0, 3.0, -10.0, 10.0]
     drive = np.concatenate([a + (b - a) * np.arange(1, points + 1) / points for a, b in pairwise(turns)])
-    np.testing.assert_allclose(bouc_wen(run, ideal, drive), integrated(turns, points), rtol=0, atol=2e-3)
+    np.testing.assert_allclose(bouc_wen(run, ideal, drive), integrate_bouc_wen(turns, points), rtol=0, atol=2e-3)
 
 
 def test_bouc_wen_does_not_move_on_nan(run, ideal):

@@ -1,4 +1,4 @@
-"""Options of the rig in TOML, and the messages for wrong ones."""
+"""Options of the rig in TOML, and the messages about wrong options."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ poles = [[-100, 0]]
 
 
 def rig(text: str) -> RigOptions:
-    """Options from TOML."""
+    """Return the options of a rig from a TOML text."""
     return RigOptions.model_validate(tomllib.loads(text))
 
 

@@ -22,19 +22,20 @@ RIGID = DynamicsOptions(form="zpk", gain=1.0)
 
 @jit
 def _draws(word, out):
+    """Fill `out` with numbers of the stream that begins at `word`."""
     for i in range(out.size):
         out[i], word = draw_normal(word)
 
 
 def draws(seed: int, stream: str, count: int) -> np.ndarray:
-    """`count` numbers of a stream."""
+    """Return the first `count` numbers of a stream of noise."""
     out = np.empty(count)
     _draws(np.uint64(seed_word(seed, stream)), out)
     return out
 
 
 def expected_draws(word: int, count: int) -> list[float]:
-    """Twelve 16-bit fields of three successive states of xorshift64 summed, then standardised."""
+    """Return numbers by definition: sums of twelve 16-bit fields of three states of xorshift64, standardised."""
     sums = [sum(word >> shift & 0xFFFF for shift in (0, 16, 32, 48)) for word in islice(xorshift64(word), 3 * count)]
     return [(sum(sums[i : i + 3]) - 393210) / float(np.sqrt(2.0**32 - 1)) for i in range(0, 3 * count, 3)]
 
@@ -67,13 +68,13 @@ def test_streams_do_not_depend_on_each_other():
 
 
 def test_seed_changes_samples_and_nothing_else_does(run):
-    first, same, other = (run(np.zeros(100), RigOptions(seed=seed)).adc_v.tobytes() for seed in (1, 1, 2))
-    assert first == same != other
+    first, same_seed, other_seed = (run(np.zeros(100), RigOptions(seed=seed)).adc_v.tobytes() for seed in (1, 1, 2))
+    assert first == same_seed != other_seed
 
 
 def test_an_axis_keeps_its_noise_beside_others():
-    alone, both = (build_rig(RigOptions(), axes, 1e-4)[1] for axes in (["y"], ["x", "y"]))
-    assert alone[0].noise_word == both[1].noise_word != both[0].noise_word
+    single, pair = (build_rig(RigOptions(), axes, 1e-4)[1] for axes in (["y"], ["x", "y"]))
+    assert single[0].noise_word == pair[1].noise_word != pair[0].noise_word
 
 
 def test_sensor_noise_has_the_configured_rms(run, ideal):
@@ -121,7 +122,7 @@ def test_nan_stays_visible_in_the_adc(bits):
 
 @pytest.mark.parametrize("latency", [0, 1, 3, 16])
 def test_latency(run, ideal, latency):
-    """Written in tick k, signals in tick k + 1 + latency; 0 V before."""
+    """A drive written in tick k is in the signals of tick k + 1 + latency; earlier signals are 0 V."""
     drive = np.arange(1.0, 61.0)
     signals = run(drive, ideal(latency_ticks=latency, dynamics=RIGID)).adc_v
     np.testing.assert_array_equal(signals, np.concatenate([np.zeros(1 + latency), drive])[: drive.size])

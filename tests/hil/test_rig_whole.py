@@ -1,4 +1,4 @@
-"""The rig as a whole: what it does at its limits, and that it does the same in bytes, compiled or not."""
+"""The complete rig: its behaviour at limits, and equal bytes with compiled and uncompiled kernels."""
 
 from __future__ import annotations
 
@@ -40,26 +40,26 @@ print(hasattr(sample, "py_func"), hashlib.sha256(np.array(out).tobytes() + state
 """
 
 
-def exercise(disable_jit: bool) -> list[str]:
-    """Whether the kernels were compiled, and a digest of all samples and the last state, in a process of its own."""
+def run_exercise(disable_jit: bool) -> list[str]:
+    """Run EXERCISE in a new process; return its output: "True" if the kernels were compiled, digest of all bytes."""
     environment = dict(os.environ, PYTHONPATH=os.pathsep.join(sys.path), NUMBA_DISABLE_JIT=str(int(disable_jit)))
     command = [sys.executable, "-W", "error", "-c", EXERCISE]
     return subprocess.run(command, env=environment, check=True, capture_output=True, text=True).stdout.split()
 
 
 def test_uncompiled_kernels_give_the_same_bytes():
-    compiled, uncompiled = exercise(disable_jit=False), exercise(disable_jit=True)
+    compiled, uncompiled = run_exercise(disable_jit=False), run_exercise(disable_jit=True)
     assert (compiled[0], uncompiled[0]) == ("True", "False")
     assert compiled[1] == uncompiled[1]
 
 
 def test_the_comparison_in_bytes_can_fail(run):
-    """One LSB of the DAC in one tick of 200 shows."""
+    """A difference of one LSB of the DAC in one tick of 200 changes the bytes."""
     drive = 9 * np.sin(np.arange(200) / 20)
     changed = drive + 20 / 2**16 * (np.arange(200) == 20)
     quiet = RigOptions(plant=PlantOptions(sensor=SensorOptions(noise_um=0.0, resolution_um=0.0)))
-    first, same, other = (run(signal, quiet).true_um.tobytes() for signal in (drive, drive, changed))
-    assert first == same != other
+    first, same, different = (run(signal, quiet).true_um.tobytes() for signal in (drive, drive, changed))
+    assert first == same != different
 
 
 def test_full_square_wave_at_the_resonance(run):
@@ -123,7 +123,7 @@ def test_infinite_drive_is_clipped(run):
 
 
 def test_memory_of_creep_and_hysteresis_is_at_rest(run):
-    """With creep too, an aged actuator neither moves nor creeps at 0 V."""
+    """An actuator with a history and creep neither moves nor creeps at 0 V."""
     plant = PlantOptions(
         hysteresis=HysteresisOptions(history_v=(10.0, -4.0)), creep=CreepOptions(gains=(0.2,), time_constants_s=(0.01,))
     )
@@ -133,7 +133,7 @@ def test_memory_of_creep_and_hysteresis_is_at_rest(run):
 
 
 def test_axes_are_independent():
-    """Two axes, one driven: the other stays; replacements apply to their own axis."""
+    """A drive of x does not move y; options in `plants` apply only to the axis that they name."""
     options = RigOptions(plants={"y": PlantOptions(hysteresis=HysteresisOptions(truth="nominal"))})
     coefficients, state = build_rig(options, ["x", "y"], 1e-4)
     assert coefficients[0].weights_um_per_v[0] == 2.3834

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from rtloop.foundation.native import cache_files as stored
+from rtloop.foundation.native import cache_files
 from tests.full_pipe import fill
 
 KERNEL = """
@@ -46,7 +46,7 @@ def run(folder: Path) -> tuple[str, str]:
 
 
 def test_a_damaged_file_is_named_renamed_and_compiled_again(tmp_path: Path):
-    """An index that is empty, then code of which one bit is wrong: neither is run."""
+    """First the index is empty, then one bit of the code is wrong: neither file is used."""
     (tmp_path / "kernel.py").write_text(KERNEL)
     assert run(tmp_path) == ("42 0", "")
     for suffix, damage in ((".nbi", "empty"), (".nbc", "one bit")):
@@ -57,7 +57,7 @@ def test_a_damaged_file_is_named_renamed_and_compiled_again(tmp_path: Path):
         assert printed == "42 0"
         assert complaint.count("\n") == 1
         assert f"the cache of compiled code is damaged: {path}" in complaint
-        assert Path(f"{path}{stored.DAMAGED}").read_bytes() == torn
+        assert Path(f"{path}{cache_files.DAMAGED}").read_bytes() == torn
     assert run(tmp_path) == ("42 1", "")
 
 
@@ -66,22 +66,22 @@ def test_only_a_whole_file_is_read(
     tmp_path: Path, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, damage: str
 ):
     path = tmp_path / "code.o"
-    assert stored.read(path) is None
-    monkeypatch.setattr(stored, "_quarantined", [])
-    stored.write(path, b"machine code" * 100)
-    assert stored.read(path) == b"machine code" * 100
+    assert cache_files.read(path) is None
+    monkeypatch.setattr(cache_files, "_quarantined", [])
+    cache_files.write(path, b"machine code" * 100)
+    assert cache_files.read(path) == b"machine code" * 100
     assert capfd.readouterr().err == ""
     path.write_bytes(DAMAGE[damage](path.read_bytes()))
-    assert stored.damaged_files(tmp_path) == [path]
-    assert stored.read(path) is None
+    assert cache_files.damaged_files(tmp_path) == [path]
+    assert cache_files.read(path) is None
     assert str(path) in capfd.readouterr().err
     assert not path.exists()
-    assert stored.damaged_files(tmp_path) == []
-    assert stored.quarantined_files(tmp_path) == [Path(f"{path}{stored.DAMAGED}")]
+    assert cache_files.damaged_files(tmp_path) == []
+    assert cache_files.quarantined_files(tmp_path) == [Path(f"{path}{cache_files.DAMAGED}")]
 
 
 def test_a_writer_that_dies_leaves_the_file_as_it_was(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """At the instant before the rename nothing can be seen, and what will be seen is on the disk already."""
+    """Just before the rename the file does not exist, and its content is on the disk already."""
     path, synced = tmp_path / "code.o", list[int]()
 
     def die(source: str, target: Path) -> None:
@@ -92,14 +92,14 @@ def test_a_writer_that_dies_leaves_the_file_as_it_was(tmp_path: Path, monkeypatc
     monkeypatch.setattr(os, "fsync", lambda fd: synced.append(os.fstat(fd).st_ino))
     monkeypatch.setattr(os, "replace", die)
     with pytest.raises(SystemExit):
-        stored.write(path, b"machine code")
+        cache_files.write(path, b"machine code")
 
 
 @pytest.mark.parametrize("place", ["missing/code.o", "folder"])
 def test_a_file_that_cannot_be_stored_is_omitted(tmp_path: Path, place: str):
     (tmp_path / "folder").mkdir()
     (tmp_path / "folder" / "file").touch()
-    stored.write(tmp_path / place, b"machine code")
+    cache_files.write(tmp_path / place, b"machine code")
     assert sorted(path.name for path in tmp_path.iterdir()) == ["folder"]
 
 
@@ -107,9 +107,9 @@ def test_a_full_or_closed_pipe_at_stderr_does_not_block(tmp_path: Path, monkeypa
     """The warning is lost, and parking continues."""
     reading, writing = os.pipe()
     fill(writing)
-    monkeypatch.setattr(stored, "STDERR", writing)
+    monkeypatch.setattr(cache_files, "STDERR", writing)
     for end in (reading, writing):
-        monkeypatch.setattr(stored, "_quarantined", [])
+        monkeypatch.setattr(cache_files, "_quarantined", [])
         (tmp_path / "code.o").write_bytes(b"")
-        assert stored.read(tmp_path / "code.o") is None
+        assert cache_files.read(tmp_path / "code.o") is None
         os.close(end)

@@ -8,7 +8,7 @@ WORDS = 2**64
 
 
 def xorshift64(word: int) -> Iterator[int]:
-    """Yield the states that follow `word`."""
+    """Yield the states of the generator that follow the state `word`."""
     while True:
         word ^= (word << 13) % WORDS
         word ^= word >> 7

@@ -1,4 +1,4 @@
-"""A loop whose law, its numbers and its modes are changed at random by the code that a service uses, tick by tick.
+"""Random changes of a loop's law, of its numbers and of its mode, made between ticks by the code of the service.
 
 The loop runs in the caller's process and in virtual time: the same seed gives the same recording.
 """
@@ -42,7 +42,7 @@ TOGETHER = {
     "coupled": TWO_AXES[TWO_AXES.index("[axis.controller]\n") : TWO_AXES.index("[axis.model]")],
     "pair": '[axis.controller]\nfile = "pair.py"\naxes = ["x", "y"]\nki_per_s = 100.0\nshared = 0.1\n\n',
 }
-"""The shipped one of several axes, and one of one's own (PAIR) beside it."""
+"""The section of each controller of two axes: the shipped one, and the user law PAIR."""
 PAIR = """
 from rtloop.laws import ControllerOptions, CoupledController
 
@@ -77,25 +77,27 @@ LIMITED = int(Flag.COMMAND_LIMITED | Flag.DRIVE_LIMITED | Flag.SLEW_LIMITED)
 
 
 def configuration(controller: str, standby: Sequence[str], *, model: bool) -> str:
-    """The paper's loop, holding 5 µm without a slew limit, with a controller and others standing by.
+    """Return a loop that holds 5 µm without a slew limit, with a controller's section and the loaded laws `standby`.
 
-    Without its `model` there are no margins to find, and a change takes milliseconds.
+    It is the paper's loop, or the shipped one of two axes. Without `model` no margins are computed at a change, which
+    then takes milliseconds.
     """
     if "\naxes =" in controller:
         text = TWO_AXES.replace(TOGETHER["coupled"], controller)
         for section in re.findall(r"\[axis\.reference\]\n.*?\n\n", text, re.DOTALL):
             text = text.replace(section, HOLD + "\n", 1)
-        text = text.replace("rate_hz = 10000\n", f"rate_hz = 10000\n{_standing_by(standby)}", 1)
+        text = text.replace("rate_hz = 10000\n", f"rate_hz = 10000\n{_standby_line(standby)}", 1)
         return text if model else MODEL.sub("", text)
     start, end = PAPER.index("[axis.controller]"), PAPER.index("# Eq (5)")
     text = PAPER[:start] + controller + "\n" + PAPER[end:]
     text = text[: text.index("[axis.reference]")] + HOLD + text[text.index("# [[schedule]]") :]
-    text = text.replace("rate_hz = 10000\n", f"rate_hz = 10000\n{_standing_by(standby)}", 1)
+    text = text.replace("rate_hz = 10000\n", f"rate_hz = 10000\n{_standby_line(standby)}", 1)
     text = text.replace('specification = "paper-spec.toml"', "")
     return text if model else MODEL.sub("", text)
 
 
-def _standing_by(standby: Sequence[str]) -> str:
+def _standby_line(standby: Sequence[str]) -> str:
+    """Return the line of a configuration that names the loaded laws."""
     names = ", ".join(f'"{name}"' for name in standby)
     return f"laws = [{names}]\n"
 
@@ -109,11 +111,11 @@ class Changes:
         self.refused = 0
 
     def kinds(self) -> Sequence[Callable[[], object]]:
-        """Return the kinds of changes, from which the next is drawn."""
+        """Return the functions that each make one kind of change; the next change is drawn from them."""
         raise NotImplementedError
 
     def one(self) -> None:
-        """Make the next change."""
+        """Make the next random change."""
         kind = self._chance.choice(self.kinds())
         try:
             kind()
@@ -123,10 +125,10 @@ class Changes:
 
 
 class LawChanges(Changes):
-    """Numbers of the law that runs, modes, and another law: the first of `sections` as often as all others together.
+    """Changes of the running law's numbers, of the mode, and of the law.
 
-    Every number is drawn anew, up to a quarter from what its section says. `of` counts the changes of each law: under
-    which it ran, or which began or ended with it.
+    The first law of `sections` is loaded as often as all other laws together. Each change draws every number again, up
+    to a quarter from its section's value. `of` counts for each law the changes during, from and to it.
     """
 
     def __init__(self, live: LiveLaw, desk: Desk, chance: Random, sections: dict[str, dict[str, Any]]) -> None:
@@ -136,32 +138,37 @@ class LawChanges(Changes):
         self.of: Counter[str] = Counter()
 
     def kinds(self) -> Sequence[Callable[[], object]]:
-        """Numbers twice as often as the others; of one law alone there is no other."""
+        """Return the change of numbers twice; a single law has a third one in place of the change of law."""
         return (self._numbers, self._numbers, self._mode, self._law if len(self._sections) > 1 else self._numbers)
 
     def one(self) -> None:
         """Make the next change and count it for its laws."""
-        before, taken = self._running, self.done.total()
+        before, done_before = self._running, self.done.total()
         super().one()
-        self.of.update({before, self._running} if self.done.total() > taken else ())
+        self.of.update({before, self._running} if self.done.total() > done_before else ())
 
     def _numbers(self) -> None:
+        """Load the running law with other numbers."""
         self._load(self._running)
 
     def _law(self) -> None:
-        others = [name for name in self._sections if name != self._running]
-        self._load(self._chance.choice((others[0], self._chance.choice(others))))
+        """Load another law than the running one."""
+        names = [name for name in self._sections if name != self._running]
+        self._load(self._chance.choice((names[0], self._chance.choice(names))))
 
     def _mode(self) -> None:
+        """Set a mode that is drawn at random."""
         mode = self._chance.choice((Mode.CLOSED_LOOP, *Mode))
         self._desk.submit(Kind.SET_MODE, values=[float(mode)])
 
     def _load(self, name: str) -> None:
-        section = {key: self._drawn(key, value) for key, value in self._sections[name].items()}
+        """Load a law with random numbers."""
+        section = {key: self._draw_value(key, value) for key, value in self._sections[name].items()}
         self._live.load_controller("x", section)
         self._running = name
 
-    def _drawn(self, key: str, value: Any) -> Any:
+    def _draw_value(self, key: str, value: Any) -> Any:
+        """Return the value of a key times a random factor; other types than numbers stay the same."""
         factor = self._chance.uniform(0.8, 1.25)
         if key == "repeat_s":
             return round(value * factor, 4)  # a whole number of ticks
@@ -173,7 +180,7 @@ class LawChanges(Changes):
 
 
 class SteppedDesk(Desk):
-    """Desk that executes a tick of the loop for each answer."""
+    """Desk that runs a tick of the loop before it reads each answer."""
 
     def __init__(self, loop: RealLoop) -> None:
         super().__init__(loop.block)
@@ -187,7 +194,7 @@ class SteppedDesk(Desk):
 def change_at_random(
     folder: Path, sections: dict[str, str], files: dict[Path, Options], *, seed: int, count: int, model: bool
 ) -> LawChanges:
-    """Record changes among the laws of `sections`, `count` of them of the first, in each of `files`."""
+    """Record random changes of laws, at least `count` of the first of `sections`, in each of `files`; return them."""
     first = next(iter(sections))
     standby = [f"{name}.py" if "file =" in section else name for name, section in sections.items()]
     loop, chance = RealLoop(configuration(sections[first], standby, model=model), folder), Random(seed)
@@ -211,10 +218,10 @@ def change_at_random(
 
 
 class Steps(NamedTuple):
-    """Distances of the demand from the drive in force, before limits, in modes that drive.
+    """Largest distances (V) of the demand, before limits, from the drive of the previous tick.
 
-    The largest in the tick of a change in closed loop; the largest of any tick, from one change to the next too; ticks
-    in which something was limited.
+    `at_change_v` is the largest in the ticks of changes in closed loop, `largest_v` the largest in all ticks of modes
+    that drive. `limited` is the number of ticks with an active limit.
     """
 
     at_change_v: float
@@ -229,6 +236,7 @@ def steps_of(recording: rtloop.Recording) -> Steps:
 
 
 def _steps_of_axis(recording: rtloop.Recording, axis: str) -> Steps:
+    """Return the largest steps of one axis."""
     demand_v, drive_v, mode, flags = recording.read(f"{axis}_demand_v", f"{axis}_drive_v", "mode", "flags")
     step_v = np.abs(demand_v - np.concatenate([[0.0], drive_v[:-1]]))
     settled, changed = np.arange(step_v.size) > SETTLED, np.zeros(step_v.size, bool)

@@ -1,4 +1,4 @@
-"""Laws that go wrong while they run, as a laboratory would write them; each becomes a file beside a configuration."""
+"""Texts of user laws that fail while they run, or are refused before; tests write them beside a configuration."""
 
 from __future__ import annotations
 
@@ -21,20 +21,20 @@ UPDATE = (
     "    def update(c, s, told):\n{}        s.seen += 1.0\n"
     "        s.integral_um += c.ki * told.error_um + told.applied_um - told.command_um\n"
 )
-LATER = "        if s.seen == 200.0:\n            {}\n"
-"""Condition that is True at tick 200."""
+AT_TICK_200 = "        if s.seen == 200.0:\n            {}\n"
+"""A statement that runs at tick 200."""
 
 
 def text(output: str = "", update: str = "") -> str:
-    """A law's file; `output` and `update` are what is done at tick 200."""
-    bodies = (LATER.format(body) if body else "" for body in (output, update))
+    """Return the text of a law whose functions run the statements `output` and `update` at tick 200."""
+    bodies = (AT_TICK_200.format(body) if body else "" for body in (output, update))
     return HEAD + "".join(part.format(body) for part, body in zip((OUTPUT, UPDATE), bodies, strict=True))
 
 
 ENDLESS_UM = 30.0
 FOR_EVER = "        if told.reference_um > {}:\n            while True:\n                s.seen += 1.0\n"
 ENDLESS = HEAD + OUTPUT.format(FOR_EVER.format(ENDLESS_UM)) + UPDATE.format("")
-"""Its output never comes to an end once a reference lies above ENDLESS_UM."""
+"""Text of a law whose output never returns once the reference is above ENDLESS_UM."""
 FAILING = {
     "divides by zero": (text("return 1.0 / (s.seen - 200.0)"), 200, "raised an exception in output of the controller"),
     "divides a whole number by zero": (
@@ -63,7 +63,7 @@ FAILING = {
     ),
     "raises": (text("raise ValueError('too late')"), 200, "raised an exception in output of the controller"),
 }
-"""Text, the tick of the trip, what is said of it."""
+"""Text of the law, tick of the trip, part of the trip's reason."""
 CLASS = "class Mine(Controller):\n"
 USLEEP = "from numba import types\nusleep = types.ExternalFunction('usleep', types.int32(types.uint32))\n"
 BY_ADDRESS = "import ctypes\nusleep = ctypes.CDLL(None).usleep\nusleep.argtypes = [ctypes.c_uint]\n"
@@ -88,4 +88,4 @@ REFUSED = {
     "defines no law": ("x = 1\n", "defines no law"),
     "raises when it is read": ("1 / 0\n", "ZeroDivisionError"),
 }
-"""Text, and what `check` says."""
+"""Text of the law, part of the message that refuses it."""

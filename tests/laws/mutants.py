@@ -1,4 +1,4 @@
-"""Laws that each break one promise, and the test of the conformance suite that says so."""
+"""Laws that each break one promise of the contract, and the test of the conformance suite that must fail."""
 
 # ruff: noqa: RUF012
 from __future__ import annotations
@@ -15,7 +15,7 @@ MEMORY = [0.0]
 GLOBAL = np.zeros(1)
 
 
-class Good(Controller):
+class CorrectIntegrator(Controller):
     """Integrator that passes the suite; each mutant differs from it in one respect."""
 
     coefficients = {"ki": float}
@@ -37,40 +37,40 @@ class Good(Controller):
         s.integral_um = told.command_um
 
 
-class InfiniteCoefficient(Good):
+class InfiniteCoefficient(CorrectIntegrator):
     def build(self) -> dict[str, Any]:
         return {"ki": math.inf}
 
 
-class AnotherBuildEachTime(Good):
+class AnotherBuildEachTime(CorrectIntegrator):
     def build(self) -> dict[str, Any]:
         MEMORY[0] += 1.0
         return {"ki": 0.01 * MEMORY[0]}
 
 
-class UnboundedIndex(Good):
+class UnboundedIndex(CorrectIntegrator):
     coefficients = {"ki": float, "which": int}
 
     def build(self) -> dict[str, Any]:
         return {"ki": 0.01, "which": 0}
 
 
-class UnboundedIndexOfState(Good):
+class UnboundedIndexOfState(CorrectIntegrator):
     state = {"integral_um": float, "at": int}
 
 
-class RulesForNothing(Good):
+class RulesForNothing(CorrectIntegrator):
     allowed_coefficients = {"ki": Allowed(0, 1)}
 
 
-class WritesCoefficients(Good):
+class WritesCoefficients(CorrectIntegrator):
     @staticmethod
     def update(c: Any, s: Any, told: Any) -> None:
         s.integral_um += c.ki * told.error_um + told.applied_um - told.command_um
         c.ki = c.ki * 0.999
 
 
-class RemembersElsewhere(Good):
+class RemembersElsewhere(CorrectIntegrator):
     @staticmethod
     def output(c: Any, s: Any, told: Any) -> float:
         GLOBAL[0] += told.error_um
@@ -79,60 +79,60 @@ class RemembersElsewhere(Good):
     enter = None
 
 
-class CountsElsewhere(Good):
+class CountsElsewhere(CorrectIntegrator):
     @staticmethod
     def output(c: Any, s: Any, told: Any) -> float:
         GLOBAL[0] += 1.0
         return s.integral_um + 1e-9 * GLOBAL[0]
 
 
-class GrowsWithoutBound(Good):
+class GrowsWithoutBound(CorrectIntegrator):
     @staticmethod
     def update(c: Any, s: Any, told: Any) -> None:
         s.integral_um = 1.1 * s.integral_um + told.error_um
 
 
-class InfiniteFromACommandBelowZero(Good):
-    """Goes wrong where the command in force, from which a law may continue, is negative."""
+class InfiniteFromACommandBelowZero(CorrectIntegrator):
+    """Returns infinity where the command in force, from which a law may continue, is negative."""
 
     @staticmethod
     def output(c: Any, s: Any, told: Any) -> float:
         return math.inf if told.command_um < 0.0 else s.integral_um
 
 
-class NoAntiWindup(Good):
+class NoAntiWindup(CorrectIntegrator):
     @staticmethod
     def update(c: Any, s: Any, told: Any) -> None:
         s.integral_um += 1e8 * told.error_um
 
 
-class WindsUp(Good):
+class WindsUp(CorrectIntegrator):
     @staticmethod
     def update(c: Any, s: Any, told: Any) -> None:
         s.integral_um += c.ki * told.error_um
 
 
-class WindsUpALittle(Good):
-    """A tenth of what was not applied is made up for in a tick: 23 ms for a loop that takes 30 ms."""
+class WindsUpALittle(CorrectIntegrator):
+    """Moves its state in a tick by only 0.4 % of the difference between applied command and command."""
 
     @staticmethod
     def update(c: Any, s: Any, told: Any) -> None:
         s.integral_um += c.ki * told.error_um + 0.004 * (told.applied_um - told.command_um)
 
 
-class EntersAtZero(Good):
+class EntersAtZero(CorrectIntegrator):
     @staticmethod
     def enter(c: Any, s: Any, told: Any) -> None:
         s.integral_um = 0.0
 
 
-class EntersWithTheErrorForgotten(Good):
+class EntersWithTheErrorForgotten(CorrectIntegrator):
     @staticmethod
     def output(c: Any, s: Any, told: Any) -> float:
         return 0.5 * told.error_um + s.integral_um
 
 
-class KeepsNan(Good):
+class KeepsNan(CorrectIntegrator):
     @staticmethod
     def enter(c: Any, s: Any, told: Any) -> None:
         s.integral_um = told.command_um
@@ -140,7 +140,7 @@ class KeepsNan(Good):
             s.integral_um = (told.command_um - told.command_um) / (told.error_um - told.error_um + 1e-320 * 1e-320)
 
 
-class Sine(Good):
+class Sine(CorrectIntegrator):
     @staticmethod
     def output(c: Any, s: Any, told: Any) -> float:
         return s.integral_um + math.sin(told.reference_um)
@@ -148,7 +148,7 @@ class Sine(Good):
     enter = None
 
 
-class Power(Good):
+class Power(CorrectIntegrator):
     @staticmethod
     def output(c: Any, s: Any, told: Any) -> float:
         return s.integral_um + abs(told.error_um) ** 0.3
@@ -156,22 +156,22 @@ class Power(Good):
     enter = None
 
 
-class TakesMemory(Good):
+class TakesMemory(CorrectIntegrator):
     @staticmethod
     def output(c: Any, s: Any, told: Any) -> float:
-        taken = np.zeros(3)
-        taken[0] = s.integral_um
-        return taken.sum()
+        buffer = np.zeros(3)
+        buffer[0] = s.integral_um
+        return buffer.sum()
 
 
-class Prints(Good):
+class Prints(CorrectIntegrator):
     @staticmethod
     def update(c: Any, s: Any, told: Any) -> None:
         print(told.error_um)
         s.integral_um += c.ki * told.error_um + told.applied_um - told.command_um
 
 
-class RaisesWhatItMade(Good):
+class RaisesWhatItMade(CorrectIntegrator):
     @staticmethod
     def update(c: Any, s: Any, told: Any) -> None:
         if told.error_um > 1e300:

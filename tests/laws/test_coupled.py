@@ -1,4 +1,4 @@
-"""Controllers of several axes: the shipped one against scipy and the rig, a laboratory's own, what is refused."""
+"""Controllers of several axes: the shipped one against scipy and the rig, user laws, and refused configurations."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ CONTROLLER = EXAMPLE[EXAMPLE.index("[axis.controller]\n") : EXAMPLE.index("[axis
 LOOP = CONTROLLER[CONTROLLER.index("[[axis.controller.loops]]\n") :].split("[[axis.controller.loops]]\n")[1]
 DECOUPLING = "decoupling = [[0.98232, -0.14735], [0.11788, 0.98232]]"
 PID = '[axis.controller]\nkind = "pid"\nki_per_s = 1.0\n'
-ALONE = "[axis.controller]\n" + LOOP
+ONE_AXIS_CONTROLLER = "[axis.controller]\n" + LOOP
 PAIR_OF_LAGS = """[axis.controller]
 kind = "coupled"
 axes = ["x", "y"]
@@ -51,11 +51,11 @@ d = [[0.0, 0.0], [0.0, 0.0]]
 """
 THRESHOLDS, WEIGHTS = "thresholds_v = [0.0, 1.46, 4.01]", "weights_um_per_v = [3.0, 0.6, 0.9]"
 INVERTIBLE = f'[driver.plant.hysteresis]\ntruth = "custom"\n{THRESHOLDS}\n{WEIGHTS}\n[driver.coupling]'
-"""Hysteresis without a dead band, which the inverse compensates completely: the rest is linear."""
+"""Hysteresis without a dead band, which the inverse compensates completely, so that the loop is linear."""
 NOMINAL = '[driver.plant.hysteresis]\ntruth = "nominal"\n[driver.coupling]'
 
 
-def referenced(text: str, x: str, y: str) -> str:
+def set_references(text: str, x: str, y: str) -> str:
     """Return a configuration with other references of the two axes."""
     head, first, _ = text.split("[axis.reference]\n")
     return f"{head}[axis.reference]\n{x}\n[[axis]]{first.split('[[axis]]')[1]}[axis.reference]\n{y}\n"
@@ -63,23 +63,24 @@ def referenced(text: str, x: str, y: str) -> str:
 
 def two_single_loops(text: str) -> str:
     """Return the configuration of two separate loops, whose models have no coupling."""
-    alone = (
-        text.replace(CONTROLLER, ALONE)
+    single = (
+        text.replace(CONTROLLER, ONE_AXIS_CONTROLLER)
         .replace("coupling = { y = 0.15 }\n", "")
         .replace("coupling = { x = -0.12 }\n", "")
     )
-    head, second = alone.split('name = "y"\n')
-    return head + 'name = "y"\n' + second.replace("[axis.model]", ALONE + "[axis.model]")
+    head, second = single.split('name = "y"\n')
+    return head + 'name = "y"\n' + second.replace("[axis.model]", ONE_AXIS_CONTROLLER + "[axis.model]")
 
 
-def invertible(text: str) -> str:
-    """The rig with that hysteresis, and the feedforward with the same."""
+def make_invertible(text: str) -> str:
+    """Return a configuration whose rig has the hysteresis INVERTIBLE and whose feedforward has the same numbers."""
     text = re.sub(r"thresholds_v = \[[^\]]*\]", THRESHOLDS, text)
     text = re.sub(r"weights_um_per_v = \[[^\]]*\]", WEIGHTS, text)
     return text.replace("[driver.coupling]", INVERTIBLE)
 
 
 def run(text: str, ticks: int, folder: Path = Path()) -> tuple[LoopBench, np.ndarray]:
+    """Run a configuration; return its bench and its records (ticks, columns)."""
     bench = LoopBench(prepare_text(text, folder).plan)
     rows = bench.run(ticks)
     assert bench.outcome is Outcome.DONE
@@ -87,19 +88,19 @@ def run(text: str, ticks: int, folder: Path = Path()) -> tuple[LoopBench, np.nda
 
 
 def test_it_computes_what_its_matrices_say():
-    """Against scipy's simulation of C(z), where all that is commanded is applied; and so does its linear part."""
+    """Its unlimited commands and its linear part agree with scipy's simulation of C(z)."""
     for law in (example(EXAMPLES["coupled"]), state_space()):
         bench, linear = Bench(law), law.linear()
         random, axes = np.random.default_rng(1), law.count
         errors_um = random.normal(size=(300, axes))
-        told, found = bench._control[0], []
+        control, commands_um = bench._control[0], []
         for error_um in errors_um:
-            told.error_um = error_um
-            found.append(bench._commands(told))
-            told.applied_um = told.command_um
-            bench._call("update", told)
+            control.error_um = error_um
+            commands_um.append(bench._commands(control))
+            control.applied_um = control.command_um
+            bench._call("update", control)
         _, expected, _ = signal.dlsim((*linear.system, PERIOD_S), errors_um)
-        np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-9)
+        np.testing.assert_allclose(commands_um, expected, rtol=1e-9, atol=1e-9)
         z = np.exp(2j * np.pi * np.geomspace(1.0, 4900.0, 50) * PERIOD_S)
         np.testing.assert_allclose(
             linearise_at_rest(law).system.response(z), linear.system.response(z), rtol=1e-5, atol=1e-9
@@ -107,57 +108,57 @@ def test_it_computes_what_its_matrices_say():
 
 
 def test_without_decoupling_it_is_its_loops_one_beside_the_other():
-    alone = prepare_text(two_single_loops(EXAMPLE)).checks[0].discrete
+    single_loop = prepare_text(two_single_loops(EXAMPLE)).checks[0].discrete
     law = prepare_text(EXAMPLE.replace("decoupling =", "# decoupling =")).checks[0].law
     z = np.exp(2j * np.pi * np.geomspace(1.0, 4900.0, 50) * PERIOD_S)
-    found = law.linear().system.response(z)
+    response = law.linear().system.response(z)
     for i in range(2):
-        np.testing.assert_allclose(found[:, i, i], alone.system.response(z), rtol=1e-12)
-    assert np.all(found[:, 0, 1] == 0)
-    assert np.all(found[:, 1, 0] == 0)
+        np.testing.assert_allclose(response[:, i, i], single_loop.system.response(z), rtol=1e-12)
+    assert np.all(response[:, 0, 1] == 0)
+    assert np.all(response[:, 1, 0] == 0)
 
 
 def test_a_limited_command_does_not_wind_it_up():
-    """States that follow at once explain the applied command: it equals C x + D e."""
+    """The states follow a limited command at once: C x + D e equals the applied command."""
     for law in (example(EXAMPLES["coupled"]), state_space()):
         bench, (a, b, c, d) = Bench(law), law.linear().system
         bench.coefficients["share"] = 1.0
-        random, told, axes = np.random.default_rng(2), bench._control[0], law.count
+        random, control, axes = np.random.default_rng(2), bench._control[0], law.count
         for _ in range(50):
-            told.error_um = random.normal(size=axes)
-            bench._commands(told)
+            control.error_um = random.normal(size=axes)
+            bench._commands(control)
             applied_um = random.normal(size=axes)
-            told.applied_um = applied_um
+            control.applied_um = applied_um
             x = bench.state["x"][0, : a.shape[0]] + bench.coefficients["tracking"][0, : a.shape[0], :axes] @ (
-                applied_um - told.command_um
+                applied_um - control.command_um
             )
-            np.testing.assert_allclose(c @ x + d @ told.error_um, applied_um, atol=1e-7)
-            bench._call("update", told)
-            np.testing.assert_allclose(bench.state["x"][0, : a.shape[0]], a @ x + b @ told.error_um, atol=1e-9)
+            np.testing.assert_allclose(c @ x + d @ control.error_um, applied_um, atol=1e-7)
+            bench._call("update", control)
+            np.testing.assert_allclose(bench.state["x"][0, : a.shape[0]], a @ x + b @ control.error_um, atol=1e-9)
 
 
 def test_what_it_remembers_does_not_matter_to_an_entry():
-    """Entered on a state of zeros, and entered in the middle of a run: the same commands from there on."""
+    """An entry from a state of zeros and an entry in the middle of a run give the same state and commands."""
     for law in (example(EXAMPLES["coupled"]), state_space()):
         bench, axes = Bench(law, compiled=False), law.count
-        asked_um = np.array([[3.0, -1.0, 2.0], [0.5, 4.0, -2.0], [7.0, 8.0, -9.0]])[:, :axes]
-        first = bench.enter(*asked_um)
+        entry_um = np.array([[3.0, -1.0, 2.0], [0.5, 4.0, -2.0], [7.0, 8.0, -9.0]])[:, :axes]
+        first = bench.enter(*entry_um)
         state = bench.state["x"].copy()
         list(bench.run(20))
-        told = bench._control[0]
-        told.position_um, told.error_um, told.command_um = asked_um
-        told.applied_um = told.command_um
-        bench._call("enter", told)
+        control = bench._control[0]
+        control.position_um, control.error_um, control.command_um = entry_um
+        control.applied_um = control.command_um
+        bench._call("enter", control)
         assert np.array_equal(bench.state["x"], state)
-        assert bench._commands(told) == first
+        assert bench._commands(control) == first
 
 
 def test_entered_beside_feeds_it_rests_with_its_own_part_of_the_commands():
-    """Two lags without integrator, let in at commands of 10 and −6 µm of which 4 and 3 µm are fed: nothing moves."""
+    """Two lags without integrator, entered at commands of 10 and −6 µm with feeds of 4 and 3 µm, keep the commands."""
     lags = f"{PAIR_OF_LAGS}allow_unstable = true\n\n"
     text = EXAMPLE.replace(CONTROLLER, lags).replace("rate_hz = 10000", 'rate_hz = 10000\nmode = "feedforward"')
     text = text.replace("[axis.feedforward]", "[axis.limits]\nbump_s = 1e9\n\n[axis.feedforward]")
-    bench, before = run(referenced(text, 'kind = "hold"\nvalue = 10.0', 'kind = "hold"\nvalue = -6.0'), 300)
+    bench, before = run(set_references(text, 'kind = "hold"\nvalue = 10.0', 'kind = "hold"\nvalue = -6.0'), 300)
     bench.assembly.generators["feed_um"] = 4.0, 3.0
     bench.send(Kind.SET_MODE, Mode.CLOSED_LOOP)
     after = bench.run(300)
@@ -168,22 +169,22 @@ def test_entered_beside_feeds_it_rests_with_its_own_part_of_the_commands():
 
 
 def test_cross_talk_is_what_the_decoupling_takes_away():
-    """A step of 20 µm in x: what y moves, with the decoupling and with two single loops, on the plant of the model.
+    """A step of 20 µm in x moves y far less with the decoupling than with two single loops, on the plant of the model.
 
-    What is left is what the first threshold keeps of y's drive, 0.095 V · 2.55 µm/V, which no inverse undoes.
+    The rest is the dead band of the first threshold, 0.095 V · 2.55 µm/V, which this inverse leaves in y.
     """
-    text = referenced(EXAMPLE.replace("[driver.coupling]", NOMINAL), 'kind = "hold"\nvalue = 20.0', 'kind = "hold"')
-    moved = {}
-    for name, one in (("decoupled", text), ("single", two_single_loops(text))):
-        bench, rows = run(one, 2000)
+    text = set_references(EXAMPLE.replace("[driver.coupling]", NOMINAL), 'kind = "hold"\nvalue = 20.0', 'kind = "hold"')
+    cross_talk = {}
+    for name, configuration in (("decoupled", text), ("single", two_single_loops(text))):
+        bench, rows = run(configuration, 2000)
         assert abs(bench.column(rows, "x_true_position_um")[-1] - 20.0) < 0.1
-        moved[name] = np.max(np.abs(bench.column(rows, "y_true_position_um"))) / 20.0
-    assert moved["decoupled"] < 1.1 * 0.095 * 2.55 / 20.0, moved
-    assert moved["single"] > 5 * moved["decoupled"], moved
+        cross_talk[name] = np.max(np.abs(bench.column(rows, "y_true_position_um"))) / 20.0
+    assert cross_talk["decoupled"] < 1.1 * 0.095 * 2.55 / 20.0, cross_talk
+    assert cross_talk["single"] > 5 * cross_talk["decoupled"], cross_talk
 
 
 def test_the_models_of_a_shared_controller_have_the_delays_of_their_loops() -> None:
-    """The model of y states its delay; the one of x does not, and has the driver's."""
+    """The model of y states its delay; the model of x states none and gets the driver's."""
     before, _, model_of_y = EXAMPLE.rpartition("[axis.model]")
     text = f"{before}[axis.model]\ndelay_ticks = 2{model_of_y}".replace("seed = 1", "seed = 1\nlatency_ticks = 1")
     for check in prepare_text(text).checks:
@@ -192,22 +193,22 @@ def test_the_models_of_a_shared_controller_have_the_delays_of_their_loops() -> N
 
 
 def test_the_loop_is_as_it_was_predicted(tmp_path):
-    """S measured on the rig by sines in one reference and then in the other, beside the one that `check` computes."""
-    found = prepare_text(EXAMPLE).checks[0].together
-    assert found is not None
-    predicted = found.margins
+    """The sensitivity that `check` computes agrees with the rig's, measured by sines in one reference at a time."""
+    joint = prepare_text(EXAMPLE).checks[0].together
+    assert joint is not None
+    predicted = joint.margins
     hz = np.array([20.0, 95.0, 200.0, 400.0, 560.0, 575.0, 580.0, 600.0, 1000.0])
-    times_s, rest = np.arange(8000) * PERIOD_S, 2000
+    times_s, settling_ticks = np.arange(8000) * PERIOD_S, 2000
     sines = np.cos(2 * np.pi * np.outer(hz, times_s) + np.pi * np.arange(hz.size)[:, None] ** 2 / hz.size)
     np.save(tmp_path / "sines.npy", 0.3 * sines.sum(axis=0))
-    asked, sensitivity = 'kind = "table"\nfile = "sines.npy"', np.zeros((hz.size, 2, 2), complex)
-    turns = np.exp(-2j * np.pi * np.outer(hz, times_s))[:, rest:]
-    for j, references in enumerate(((asked, 'kind = "hold"'), ('kind = "hold"', asked))):
-        bench, rows = run(referenced(invertible(EXAMPLE), *references), times_s.size, tmp_path)
-        reference = turns @ bench.column(rows, f"{'xy'[j]}_reference_um")[rest:]
+    table, sensitivity = 'kind = "table"\nfile = "sines.npy"', np.zeros((hz.size, 2, 2), complex)
+    turns = np.exp(-2j * np.pi * np.outer(hz, times_s))[:, settling_ticks:]
+    for j, references in enumerate(((table, 'kind = "hold"'), ('kind = "hold"', table))):
+        bench, rows = run(set_references(make_invertible(EXAMPLE), *references), times_s.size, tmp_path)
+        reference = turns @ bench.column(rows, f"{'xy'[j]}_reference_um")[settling_ticks:]
         for i, axis in enumerate("xy"):
-            sensitivity[:, i, j] = turns @ bench.column(rows, f"{axis}_error_um")[rest:] / reference
-    expected = CoupledLoop(found.linear, found.plant).sensitivity(hz)
+            sensitivity[:, i, j] = turns @ bench.column(rows, f"{axis}_error_um")[settling_ticks:] / reference
+    expected = CoupledLoop(joint.linear, joint.plant).sensitivity(hz)
     np.testing.assert_allclose(sensitivity, expected, atol=0.01)
     assert predicted.max_sensitivity == pytest.approx(np.linalg.norm(sensitivity, 2, axis=(1, 2)).max(), rel=0.01)
     disk = 1 / np.linalg.norm(sensitivity - np.eye(2) / 2, 2, axis=(1, 2)).max()
@@ -216,15 +217,15 @@ def test_the_loop_is_as_it_was_predicted(tmp_path):
 
 @pytest.mark.usefixtures("few_simulated_steps")
 def test_it_is_verified_as_it_runs():
-    """What `design verify` promises of a step is what the rig does; there is no C(s), and nothing is said of one."""
-    answer = CliRunner().invoke(main, ["design", "verify", str(EXAMPLES["coupled"]), "--json"])
-    assert answer.exit_code == 0
-    found = json.loads(answer.stdout)
-    assert [axis["name"] for axis in found["axes"]] == ["x", "y"]
-    assert found["axes"][0]["together"] == prepare_text(EXAMPLE).checks[0].together.margins.as_dict()
-    rows = {row["name"]: row for row in found["axes"][0]["rows"]}
+    """A step of the rig has the figures of `design verify`, which reports none for C(s), as the law has no C(s)."""
+    result = CliRunner().invoke(main, ["design", "verify", str(EXAMPLES["coupled"]), "--json"])
+    assert result.exit_code == 0
+    report = json.loads(result.stdout)
+    assert [axis["name"] for axis in report["axes"]] == ["x", "y"]
+    assert report["axes"][0]["together"] == prepare_text(EXAMPLE).checks[0].together.margins.as_dict()
+    rows = {row["name"]: row for row in report["axes"][0]["rows"]}
     assert all(row["continuous"] is None for row in rows.values())
-    bench, ticks = run(referenced(invertible(EXAMPLE), 'kind = "hold"\nvalue = 10.0', 'kind = "hold"'), 600)
+    bench, ticks = run(set_references(make_invertible(EXAMPLE), 'kind = "hold"\nvalue = 10.0', 'kind = "hold"'), 600)
     position_um = bench.column(ticks, "x_true_position_um")
     assert rows["peak_command"]["running"] == pytest.approx(bench.column(ticks, "x_command_um").max() / 10.0, rel=0.01)
     outside = np.flatnonzero(np.abs(position_um / position_um[-1] - 1) > 0.05)
@@ -233,10 +234,10 @@ def test_it_is_verified_as_it_runs():
 
 @pytest.mark.usefixtures("few_simulated_steps")
 def test_a_law_of_one_axis_is_verified_too():
-    answer = CliRunner().invoke(main, ["design", "verify", str(EXAMPLES["pid"])])
-    assert answer.exit_code == 0
-    assert "as it runs C(z)" in answer.stdout
-    assert "continuous" not in answer.stdout
+    result = CliRunner().invoke(main, ["design", "verify", str(EXAMPLES["pid"])])
+    assert result.exit_code == 0
+    assert "as it runs C(z)" in result.stdout
+    assert "continuous" not in result.stdout
 
 
 MINE = PAIR.replace("class Pair", "class Mine")
@@ -244,24 +245,24 @@ MY_TABLE = '[axis.controller]\nfile = "mine.py"\naxes = ["x", "y"]\n\n'
 
 
 def test_a_laboratory_writes_its_own(tmp_path):
-    """It is found to be linear, judged, run, and comes to its references."""
+    """The check of a user law has its linear part and finds it stable; in a run it reaches its references."""
     (tmp_path / "mine.py").write_text(MINE)
-    text = referenced(
+    text = set_references(
         EXAMPLE.replace(CONTROLLER, MY_TABLE), 'kind = "hold"\nvalue = 5.0', 'kind = "hold"\nvalue = -3.0'
     )
-    ready = prepare_text(text, tmp_path)
-    assert ready.checks[1].running.stable
-    c = ready.checks[0].together.linear.system.response(np.exp(2j * np.pi * 10.0 * PERIOD_S))[0]
+    prepared = prepare_text(text, tmp_path)
+    assert prepared.checks[1].running.stable
+    c = prepared.checks[0].together.linear.system.response(np.exp(2j * np.pi * 10.0 * PERIOD_S))[0]
     integral = 100.0 * PERIOD_S / (np.exp(2j * np.pi * 10.0 * PERIOD_S) - 1)
     np.testing.assert_allclose(c, integral * np.array([[1.0, -0.1], [-0.1, 1.0]]), rtol=1e-9)
-    bench = LoopBench(ready.plan)
+    bench = LoopBench(prepared.plan)
     rows = bench.run(4000)
     assert abs(bench.column(rows, "x_position_um")[-500:].mean() - 5.0) < 0.05
     assert abs(bench.column(rows, "y_position_um")[-500:].mean() + 3.0) < 0.05
 
 
 class RunningDesk:
-    """Desk whose loop executes each submitted command at once."""
+    """Desk that runs the loop for 500 ticks at each submitted command."""
 
     def __init__(self, loop: RealLoop, session: Session) -> None:
         self.loop, self.session = loop, session
@@ -273,17 +274,18 @@ class RunningDesk:
         return tick
 
     def run(self, ticks: int) -> None:
+        """Run `ticks` ticks and record them."""
         self.loop.run(ticks)
         self.session.drain()
         self.session.write_due()
 
 
 def test_it_is_tuned_and_swapped_while_it_runs(tmp_path, monkeypatch):
-    """Changes name any of its axes and cause no jump; a replay is identical."""
+    """A change may name either axis and causes no jump; a replay is identical."""
     monkeypatch.setattr(live, "prepare_limited", lambda configuration: prepare(configuration, paced=False))
     (tmp_path / "mine.py").write_text(MINE)
     text = EXAMPLE.replace("rate_hz = 10000", 'rate_hz = 10000\nlaws = ["mine.py"]')
-    loop = RealLoop(referenced(text, 'kind = "hold"\nvalue = 8.0', 'kind = "hold"\nvalue = -6.0'), tmp_path)
+    loop = RealLoop(set_references(text, 'kind = "hold"\nvalue = 8.0', 'kind = "hold"\nvalue = -6.0'), tmp_path)
     session = Session(loop.block, tmp_path / "live.mcap", loop.header, Options(min_free_bytes=0))
     desk = RunningDesk(loop, session)
     desk.run(3000)
@@ -310,9 +312,9 @@ def test_it_is_tuned_and_swapped_while_it_runs(tmp_path, monkeypatch):
     recording = rtloop.load(tmp_path / "live.mcap")
     assert [event["axis"] for event in recording.events if event["kind"] == "load_law"] == ["x", "y", *["x"] * 5]
     assert not [event for event in recording.events if event["kind"] in ("tripped", "refused")]
-    for axis, aimed_um in (("x", 8.0), ("y", -6.0)):
+    for axis, reference_um in (("x", 8.0), ("y", -6.0)):
         assert np.max(np.abs(np.diff(recording[f"{axis}_drive_v"][2000:]))) < 0.05
-        assert abs(recording[f"{axis}_position_um"][-400:].mean() - aimed_um) < 0.1
+        assert abs(recording[f"{axis}_position_um"][-400:].mean() - reference_um) < 0.1
     report = replay(recording, trust=TrustedLaws(recorded=True))
     assert report.identical
     assert report.ticks == 3000 + 7 * 500
@@ -345,7 +347,7 @@ def test_a_command_of_one_axis_that_is_no_number_lets_the_other_axis_ramp_in_the
     output = "            told.command_um[i] = s.integral_um[i] - c.shared * s.integral_um[1 - i]\n"
     mistake = "            if i == 1 and s.integral_um[0] > 3.0:\n                told.command_um[i] = 1e300 * 1e300\n"
     (tmp_path / "mine.py").write_text(MINE.replace(output, output + mistake))
-    text = referenced(
+    text = set_references(
         EXAMPLE.replace(CONTROLLER, MY_TABLE), 'kind = "hold"\nvalue = 9.0', 'kind = "hold"\nvalue = -3.0'
     )
     plan = prepare_text(text, tmp_path).plan

@@ -1,4 +1,4 @@
-"""The way of docs/laws.md, gone as it is written, in an empty folder outside of the project."""
+"""The commands and files of docs/laws.md work as written, in an empty folder outside of the project."""
 
 from __future__ import annotations
 
@@ -21,34 +21,36 @@ PAGE = (ROOT / "docs" / "laws.md").read_text()
 TUTORIAL = (ROOT / "docs" / "tutorial" / "your-own-law.md").read_text()
 COMMANDS = re.findall(r"^    \$ (rtloop .*)$", PAGE, re.MULTILINE)
 FILE = re.compile(r"^    # (\w+\.py)\n((?:    .*\n|\n)+)", re.MULTILINE)
-MOST_LINES = 25
+MAX_LINES = 25
 PATIENCE_S = 120.0
 PATIENT_SERVICE = f"\n[service]\nstall_ms = {1000.0 * PATIENCE_S}\n"
-"""A host that stalls must not end the run."""
+"""Section with a long stall limit: a host that stalls must not end the run."""
 
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
+    """Return an empty folder outside of the project."""
     return tmp_path
 
 
 def environment(folder: Path) -> dict[str, str]:
+    """Return the environment of a command: it imports rtloop and the folder, and has its sockets in `run`."""
     (folder / "run").mkdir(exist_ok=True)
     return os.environ | {"PYTHONPATH": f"{ROOT}{os.pathsep}{folder}", "RUNTIME_DIRECTORY": str(folder / "run")}
 
 
-def ran(folder: Path, command: str) -> str:
+def run_command(folder: Path, command: str) -> str:
     """Run a command of the page, which must succeed, and return its output."""
     words = [sys.executable, "-m", *command.split()]
-    done = subprocess.run(words, cwd=folder, env=environment(folder), capture_output=True, text=True, timeout=240)
-    assert done.returncode == 0, (command, done.stdout, done.stderr)
-    return done.stdout
+    result = subprocess.run(words, cwd=folder, env=environment(folder), capture_output=True, text=True, timeout=240)
+    assert result.returncode == 0, (command, result.stdout, result.stderr)
+    return result.stdout
 
 
 def test_a_new_law_runs_replays_and_is_tuned_and_swapped_live(folder: Path):
     offline, live = [line for line in COMMANDS if " ctl " not in line and "serve" not in line], COMMANDS[-3:]
     assert [line.split()[1] for line in offline] == ["laws", "law", "check", "run", "replay"]
-    output = [ran(folder, command) for command in offline]
+    output = [run_command(folder, command) for command in offline]
     assert "integral_resonant" in output[0]
     assert "law 'damping', linear near its rest state, of order 1" in output[2]
     assert "identical" in output[4]
@@ -63,39 +65,40 @@ def test_a_new_law_runs_replays_and_is_tuned_and_swapped_live(folder: Path):
         while state(folder) != "running":
             assert time.monotonic() < deadline_s
             time.sleep(0.1)
-        ticks = [json.loads(ran(folder, command))["tick"] for command in live[1:]]
+        ticks = [json.loads(run_command(folder, command))["tick"] for command in live[1:]]
     finally:
         service.terminate()
         assert service.wait(60.0) == 0
     assert ticks == sorted(ticks)
     newest = max((folder / "recordings").glob("*.mcap"), key=lambda path: path.stat().st_mtime)
-    report = json.loads(ran(folder, f"rtloop replay {newest} --law damping.py --json"))
+    report = json.loads(run_command(folder, f"rtloop replay {newest} --law damping.py --json"))
     assert report["identical"]
     assert report["ticks"] > ticks[-1]
 
 
 def state(folder: Path) -> str | None:
+    """Return the state of the service, or None if it does not answer."""
     with suppress(RtloopError):
         return Client(folder / "run" / "damping.sock").get("/status")["state"]
     return None
 
 
 def test_the_pages_law_is_the_new_one_and_fits_on_a_screen(folder: Path):
-    ran(folder, "rtloop law new damping")
+    run_command(folder, "rtloop law new damping")
     files = {name: "\n".join(line[4:] for line in text.splitlines()).strip() for name, text in FILE.findall(PAGE)}
-    files.pop("test_notch.py")  # of tutorial 3
+    files.pop("test_notch.py")  # belongs to tutorial 3
     for name, text in files.items():
         written = (folder / name).read_text()
         assert written.strip().endswith(text), name
     lines = [line for line in files["damping.py"].splitlines() if line.strip()]
-    assert len(lines) <= MOST_LINES
+    assert len(lines) <= MAX_LINES
     report = pytest_report(folder, "test_damping.py")
     assert re.search(r"\d+ passed", report), report
     assert "failed" not in report
 
 
 def test_the_documented_test_of_the_notch_passes_and_finds_a_wrong_notch(folder: Path, monkeypatch: pytest.MonkeyPatch):
-    """The wrong notch has half the depth, which stability and all other promises survive."""
+    """The wrong notch has half the depth; it is stable and keeps all other promises."""
     match = re.search(r'```python title="notch.py"\n(.*?)```', TUTORIAL, re.DOTALL)
     (page_test,) = [text for name, text in FILE.findall(PAGE) if name == "test_notch.py"]
     assert match is not None
@@ -113,8 +116,8 @@ def test_the_documented_test_of_the_notch_passes_and_finds_a_wrong_notch(folder:
 
 def pytest_report(folder: Path, *arguments: str) -> str:
     """Run pytest in a folder and return its report."""
-    done = subprocess.run(
+    result = subprocess.run(
         [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "--basetemp", folder / "basetemp", *arguments],
         cwd=folder, env=environment(folder), capture_output=True, text=True, check=False,
     )  # fmt: skip
-    return done.stdout
+    return result.stdout

@@ -1,4 +1,4 @@
-"""Inputs and outputs beside sensors and drives: a law that reads and sets them, loopback, the held reference."""
+"""Inputs and outputs beside sensors and drives: a law that reads and sets them, loopback, held references."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ min_v = 0.0
 
 
 def configuration(*changes: tuple[str, str]) -> str:
-    """The paper's stage, its controller in favour of the law above, with two channels looped back."""
+    """Return the paper's loop with the law MINE and two channels looped back, after replacements of texts."""
     start, end = PAPER.index("[axis.controller]"), PAPER.index("# Eq (5)")
     text = PAPER[:start] + '[axis.controller]\nfile = "mine.py"\n' + PAPER[end:]
     text = text.replace('kind = "sim"\n', LOOPBACK, 1).replace("\n[[axis]]", CHANNELS, 1)
@@ -85,15 +85,16 @@ def configuration(*changes: tuple[str, str]) -> str:
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
+    """Return a folder with the law MINE in `mine.py`."""
     (tmp_path / "mine.py").write_text(MINE)
     return tmp_path
 
 
 def test_a_law_reads_and_sets_them(folder):
-    """A pulse at each line that the position passes, which comes back a tick later and is counted, to the limit."""
+    """The law sets a pulse at each line that the position passes, reads it a tick later, and counts up to the limit."""
     prepared = prepare_text(configuration(), folder)
     plan = prepared.plan
-    assert prepared.checks[0].running.stable  # what it counts and marks, no command sees: it is no part of the loop
+    assert prepared.checks[0].running.stable  # pulses and count do not change the command, so the loop stays linear
     assert plan.extras.outputs == (ExtraOutput("count", 0, -10.0, 0.75, 0.0), ExtraOutput("pulse", 0, 0.0, 10.0, 0.0))
     bench = LoopBench(plan)
     rows = bench.run(3000)
@@ -113,8 +114,8 @@ def test_a_law_reads_and_sets_them(folder):
 def test_where_the_loop_is_not_closed_they_are_safe(folder):
     text = configuration(("max_v = 0.75", "min_v = -1.0"))
     bench = LoopBench(plan_of(text, folder))
-    closed = bench.run(500)
-    assert bench.column(closed, "count_v")[-1] > 0
+    closed_rows = bench.run(500)
+    assert bench.column(closed_rows, "count_v")[-1] > 0
     for mode in (Mode.FEEDFORWARD, Mode.OFF):
         bench.send(Kind.SET_MODE, mode)
         rows = bench.run(200)
@@ -151,7 +152,7 @@ def test_a_replay_comes_to_the_same(folder):
 
 
 def test_references_stand_still_while_they_are_held(folder):
-    """The gate is the loop's own output, looped back: high while the law that drives it says so."""
+    """The gate is the law's output `pulse`, looped back."""
     text = configuration(
         ("rate_hz = 10000\n", 'rate_hz = 10000\nhold_input = "back"\nhold_min_v = 2.5\n'),
     )
@@ -165,8 +166,8 @@ def test_references_stand_still_while_they_are_held(folder):
     steps = np.diff(reference_um)
     assert np.all(steps[held[1:]] == 0.0)
     assert np.all(steps[~held[1:]] != 0.0)
-    played = np.arange(4000) - np.cumsum(held)
-    phase = np.modf(played * 1e-4 * 5.0 + 0.25)[0]
+    elapsed_ticks = np.arange(4000) - np.cumsum(held)
+    phase = np.modf(elapsed_ticks * 1e-4 * 5.0 + 0.25)[0]
     np.testing.assert_allclose(reference_um, 10.0 * np.where(phase < 0.5, 4 * phase - 1, 3 - 4 * phase), atol=1e-9)
 
 

@@ -1,4 +1,4 @@
-"""A mistake in a law is a trip that names law, axis and tick, or is refused before anything runs."""
+"""A mistake in a law is a trip that names law, axis and tick, or is refused before the loop runs."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def test_it_trips_and_the_outputs_come_down(name, tmp_path):
 
 @pytest.mark.parametrize("name", ["writes beyond its array", "writes before its array"])
 def test_no_memory_but_its_own_is_written(name, tmp_path):
-    """Bytes behind and before the law's records stay as they are, and so do its coefficients."""
+    """Bytes behind the law's state and all coefficients do not change."""
     bench = LoopBench(user_law_plan(tmp_path, FAILING[name][0]))
     law = bench.law.layout.laws[-1]
     room = bench.law.layout.slot_bytes("controller")[1]
@@ -61,15 +61,15 @@ def test_no_memory_but_its_own_is_written(name, tmp_path):
     spare_bytes[:] = CANARY
     before = bench.law.coefficients.tobytes(), bench.law.axes["feedforward"].tobytes()
     bench.run(199)
-    own = bench.law.axes["feedforward"].tobytes()
+    feedforward_state = bench.law.axes["feedforward"].tobytes()
     bench.run(50)
     assert np.all(spare_bytes == CANARY)
     assert bench.law.coefficients.tobytes() == before[0]
-    assert own != before[1]  # the loop ran
+    assert feedforward_state != before[1]  # the loop ran
 
 
 def test_after_a_reset_it_may_be_entered_again(tmp_path):
-    """The state begins at zeros: what went wrong before is forgotten."""
+    """The state begins at zeros, without the values from before the trip."""
     bench = LoopBench(user_law_plan(tmp_path, FAILING["grows without bound"][0]))
     bench.run(400)
     bench.send(Kind.RESET_TRIP)
@@ -87,12 +87,12 @@ def test_it_is_refused_before_anything_runs(name, tmp_path):
 
 
 def test_one_that_never_ends_is_killed_and_its_outputs_parked(tmp_path):
-    """The recording before the failure is complete. On a board that outlives the run: `make faults`."""
+    """The recording before the failure is complete. `make faults` has the same on a board that outlives the run."""
     (tmp_path / "mine.py").write_text(ENDLESS)
     steps = f'[axis.reference]\nkind = "steps"\nlevels = [5.0, {ENDLESS_UM + 5.0}]\ndwell_s = 0.2\n'
     config, law = tmp_path / "lab.toml", '[axis.controller]\nfile = "mine.py"\n'
-    whatever_the_host_does = ("late_ticks = 10", "late_ticks = 0")
-    text = configuration(law, [], model=False).replace(*whatever_the_host_does)
+    tolerate_late_ticks = ("late_ticks = 10", "late_ticks = 0")
+    text = configuration(law, [], model=False).replace(*tolerate_late_ticks)
     config.write_text(text.replace(HOLD_5_UM, steps))
     code, summary, sentence = run(config, "--duration", "3", "--out", tmp_path)
     assert code == 1
@@ -103,7 +103,7 @@ def test_one_that_never_ends_is_killed_and_its_outputs_parked(tmp_path):
 
 
 def test_a_law_without_enter_is_entered_without_a_bump(tmp_path):
-    """From raw at 3 V into closed loop, the drive makes no larger step than either mode does."""
+    """The drive makes no larger step from raw at 3 V into closed loop than either mode does."""
     law = law_text().replace("    def enter(c, s, told):\n        s.integral_um = told.command_um\n", "")
     assert "enter" not in law
     bench = LoopBench(user_law_plan(tmp_path, law))

@@ -15,13 +15,13 @@ from rtloop.cli import main
 from rtloop.configuration.file import parse
 from rtloop.configuration.prepare import prepare
 from rtloop.errors import ConfigError
-from rtloop.laws.limited import trial as first
+from rtloop.laws.limited import trial
 from rtloop.laws.limited.process import MAX_OUTPUT_BYTES, PROCESS, LimitedProcess
 from rtloop.laws.registry import law_from_text
 from rtloop.service.service import Service
 from tests.faults.evidence import wait_for
 from tests.laws.failing import text as law_text
-from tests.laws.test_replay import CONFIGURATION, recorded
+from tests.laws.test_replay import CONFIGURATION, record_law
 from tests.paper_configuration import PAPER, TEXT
 
 LIMIT_S = 0.5
@@ -56,7 +56,7 @@ IN_BUILD = {
 
 @pytest.fixture(autouse=True)
 def limit() -> Iterator[None]:
-    """Restore the limit after each test."""
+    """Restore the time limit of user laws after each test."""
     limit_s = PROCESS.limit_s
     yield
     PROCESS.limit_s = limit_s
@@ -64,7 +64,7 @@ def limit() -> Iterator[None]:
 
 @pytest.fixture
 def write_law(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[str], Path]:
-    """A configuration with a law of this text."""
+    """Return a function that writes a law's text and its configuration, and returns the path of the configuration."""
     monkeypatch.chdir(tmp_path)
 
     def write(text: str) -> Path:
@@ -75,21 +75,21 @@ def write_law(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[str]
     return write
 
 
-def is_refused(sentence: str, *arguments: object, file: object = "mine.py") -> None:
-    """The command ends with 78, and with one sentence that names the law and what it did."""
-    ran = CliRunner().invoke(main, [str(argument) for argument in arguments])
-    assert (ran.exit_code, f"law 'mine' ({file}): {sentence}" in ran.stderr) == (78, True), ran.output
-    assert isinstance(ran.exception, SystemExit)
-    assert "Traceback" not in ran.output
+def assert_refused(sentence: str, *arguments: object, file: object = "mine.py") -> None:
+    """Assert that a command ends with 78, and with one sentence that names the law and its fault."""
+    result = CliRunner().invoke(main, [str(argument) for argument in arguments])
+    assert (result.exit_code, f"law 'mine' ({file}): {sentence}" in result.stderr) == (78, True), result.output
+    assert isinstance(result.exception, SystemExit)
+    assert "Traceback" not in result.output
 
 
 @pytest.mark.parametrize("name", AT_IMPORT)
 def test_a_file_that_does_as_it_is_read(name: str):
-    """Here without a command; tests with commands follow."""
+    """The test calls the function that commands use; tests with commands follow."""
     text, sentence = AT_IMPORT[name]
     PROCESS.limit_s = LIMIT_S if "longer" in sentence else 10.0
     with pytest.raises(ConfigError) as refusal:
-        first.try_limited("lab.toml", law_from_text, text + law_text(), "mine.py", "mine")
+        trial.try_limited("lab.toml", law_from_text, text + law_text(), "mine.py", "mine")
     assert refusal.value.faults == [f"law 'mine' (mine.py): {sentence}"]
     assert refusal.value.exit_code == 78
 
@@ -98,66 +98,66 @@ def test_a_file_that_does_as_it_is_read(name: str):
 def test_a_law_that_does_as_it_is_built(write_law: Callable[[str], Path], name: str):
     line, sentence = IN_BUILD[name]
     PROCESS.limit_s = LIMIT_S if "longer" in sentence else 10.0
-    is_refused(sentence, "design", "verify", write_law(law_text().replace(BUILD, f"{BUILD}        {line}\n")))
+    assert_refused(sentence, "design", "verify", write_law(law_text().replace(BUILD, f"{BUILD}        {line}\n")))
 
 
 def test_every_command_that_reads_a_law_is_protected(write_law: Callable[[str], Path]):
     config = write_law("raise SystemExit\n" + law_text())
     for command in (("run", config), ("design", "verify", config), ("doctor", config), ("park", config)):
-        is_refused("raised SystemExit", *command)
+        assert_refused("raised SystemExit", *command)
     with pytest.raises(ConfigError, match=r"law 'mine' \(mine.py\): raised SystemExit"):
         Service(config)
 
 
 def test_a_law_that_is_built_for_a_run_is_protected(write_law: Callable[[str], Path]):
     config = write_law(law_text().replace(BUILD, f"{BUILD}        raise SystemExit\n"))
-    is_refused("raised SystemExit", "run", config)
+    assert_refused("raised SystemExit", "run", config)
 
 
 def test_a_replay_reads_a_law_as_carefully(write_law: Callable[[str], Path], tmp_path: Path):
-    """The file that is named, and the recorded text that is trusted: it ended well when it was recorded."""
+    """Both the trusted recorded text and the named file fail now, but ran without fault when they were recorded."""
     trigger = tmp_path / "trigger"
     text = f"import pathlib\nif pathlib.Path({str(trigger)!r}).exists():\n    raise SystemExit\n" + law_text()
-    run = recorded(tmp_path, text)
+    run = record_law(tmp_path, text)
     trigger.touch()
-    is_refused("raised SystemExit", "replay", run, "--trust-recorded-law", file=run)
-    Path("mine.py").write_text(text + "# as it is now\n")
-    is_refused("raised SystemExit", "replay", run, "--law", "mine.py")
+    assert_refused("raised SystemExit", "replay", run, "--trust-recorded-law", file=run)
+    Path("mine.py").write_text(text + "# edited\n")
+    assert_refused("raised SystemExit", "replay", run, "--law", "mine.py")
 
 
 def test_what_a_refused_law_started_is_ended(write_law: Callable[[str], Path]):
-    is_refused("left a process running", "check", write_law(PROCESS_LEFT + law_text()))
+    assert_refused("left a process running", "check", write_law(PROCESS_LEFT + law_text()))
     status = Path("/proc", Path("pid").read_text(), "status")
     wait_for(lambda: not status.exists() or "State:\tZ" in status.read_text(), "the end of the process", 10.0)
 
 
 def test_what_build_prints_is_shown_and_no_part_of_an_answer(write_law: Callable[[str], Path]):
     config = write_law("print('text was read')\n" + law_text().replace(BUILD, f"{BUILD}        print('built')\n"))
-    ran = CliRunner().invoke(main, ["check", str(config), "--json"])
-    assert (ran.exit_code, "built" in ran.stderr, ran.stdout[:1]) == (0, True, "{"), ran.output
-    assert "text was read" not in ran.stdout
+    result = CliRunner().invoke(main, ["check", str(config), "--json"])
+    assert (result.exit_code, "built" in result.stderr, result.stdout[:1]) == (0, True, "{"), result.output
+    assert "text was read" not in result.stdout
 
 
 def test_a_shipped_law_needs_no_process(monkeypatch: pytest.MonkeyPatch):
     process = LimitedProcess()
-    monkeypatch.setattr(first, "PROCESS", process)
+    monkeypatch.setattr(trial, "PROCESS", process)
     prepare(parse(TEXT, "paper", PAPER.parent, "paper.toml"))
     assert process.pid is None
 
 
 def test_an_end_while_another_thread_ends_the_process_leaves_no_traceback(monkeypatch):
-    """As at the exit of a service whose thread still prepares the process."""
+    """The case occurs at the exit of a service whose thread still prepares the process."""
     process = LimitedProcess(limit_s=60.0)
     process.prepare_ahead(math.sqrt)
     child: Any = process._process
     wait = child.wait
 
-    def wait_while_the_other_ends_it():
+    def wait_while_another_thread_ends_it():
         monkeypatch.setattr(child, "wait", wait)
         process.end()
         return wait()
 
-    monkeypatch.setattr(child, "wait", wait_while_the_other_ends_it)
+    monkeypatch.setattr(child, "wait", wait_while_another_thread_ends_it)
     process.end()
     assert process.pid is None
     assert child.returncode == -signal.SIGKILL

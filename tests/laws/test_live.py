@@ -1,4 +1,4 @@
-"""Laws, their numbers and modes changed while the loop runs: the drive goes on without a jump, and a replay agrees."""
+"""Laws, their numbers and modes changed while the loop runs: the drive does not jump, and a replay is identical."""
 
 from __future__ import annotations
 
@@ -21,13 +21,14 @@ CHANGES, SEED = 80, 5
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a folder with a user law in `mine.py`."""
     folder = tmp_path_factory.mktemp("live")
     (folder / "mine.py").write_text(law_text())
     return folder
 
 
-def changed(folder: Path, sections: dict[str, str], path: Path) -> rtloop.Recording:
-    """A recorded run under changes among these laws."""
+def record_changes(folder: Path, sections: dict[str, str], path: Path) -> rtloop.Recording:
+    """Return the recording of a run with random changes among these laws; a trip or a refusal fails the test."""
     files = {path: Options(min_free_bytes=0)}
     changes = change_at_random(folder, sections, files, seed=SEED, count=CHANGES, model=False)
     recording = rtloop.load(path)
@@ -38,13 +39,13 @@ def changed(folder: Path, sections: dict[str, str], path: Path) -> rtloop.Record
 
 
 def test_any_law_follows_any_other(folder: Path, tmp_path: Path):
-    """The demand goes on from the drive in force, and moves from tick to tick as it does under C(z) alone."""
-    alone = steps_of(changed(folder, {"transfer": CONTROLLERS["transfer"]}, tmp_path / "alone.mcap"))
-    recording = changed(folder, CONTROLLERS | MINE, tmp_path / "together.mcap")
-    together = steps_of(recording)
-    assert together.at_change_v <= AT_CHANGE_V
-    assert together.largest_v <= MORE * alone.largest_v
-    assert together.limited == 0
+    """The demand continues from the drive in force, and its steps are not much larger than with C(z) alone."""
+    one_law = steps_of(record_changes(folder, {"transfer": CONTROLLERS["transfer"]}, tmp_path / "alone.mcap"))
+    recording = record_changes(folder, CONTROLLERS | MINE, tmp_path / "together.mcap")
+    all_laws = steps_of(recording)
+    assert all_laws.at_change_v <= AT_CHANGE_V
+    assert all_laws.largest_v <= MORE * one_law.largest_v
+    assert all_laws.limited == 0
     report = replay(recording, trust=TrustedLaws(recorded=True))
     assert report.identical
     assert report.ticks == len(recording) > 100 * CHANGES
@@ -53,12 +54,12 @@ def test_any_law_follows_any_other(folder: Path, tmp_path: Path):
 
 def test_two_laws_of_one_name_keep_apart(folder: Path):
     """The digest of the text is part of a law's identity."""
-    text, of_mine = (folder / "mine.py").read_text(), configuration(MINE["mine"], ["mine.py"], model=False)
-    one, other = (prepare(parse(of_mine, "x", folder, "x"), paced=False).plan for _ in "ab")
-    assert one.laws == other.laws
+    text, loop_text = (folder / "mine.py").read_text(), configuration(MINE["mine"], ["mine.py"], model=False)
+    first, second = (prepare(parse(loop_text, "x", folder, "x"), paced=False).plan for _ in "ab")
+    assert first.laws == second.laws
     (folder / "mine.py").write_text(text + "# edited\n")
     try:
-        edited = prepare(parse(of_mine, "x", folder, "x"), paced=False).plan
+        edited = prepare(parse(loop_text, "x", folder, "x"), paced=False).plan
     finally:
         (folder / "mine.py").write_text(text)
-    assert edited.laws != one.laws
+    assert edited.laws != first.laws

@@ -1,4 +1,4 @@
-"""Marks: outputs that follow reference or position without a law of one's own; references that a gate starts."""
+"""Marks: outputs that follow reference or position without a user law; references that a gate starts."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ STAIRCASE = 'kind = "steps"\nlevels = [0.0, 4.0, 12.0, 8.0]\ndwell_s = 0.05\n'
 
 
 def configuration(reference: str, *changes: tuple[str, str]) -> str:
-    """The paper's loop without noise, with three marks and an input, each looped back."""
+    """Return the paper's loop with three marks and an input, each looped back, after replacements of texts."""
     text = PAPER[: PAPER.index("[axis.reference]")].replace('specification = "paper-spec.toml"', "")
     text = text.replace('kind = "sim"\n', 'kind = "sim"\nloopback = 3\n', 1).replace("\n[[axis]]", CHANNELS, 1)
     text = (
@@ -66,7 +66,7 @@ def test_marks_follow_reference_and_position(tmp_path: Path):
     np.testing.assert_array_equal(bench.column(rows, "far_v"), np.where(far, 3.0, 0.0))
     assert 0.1 < far.mean() < 0.3
     edges = np.flatnonzero(np.diff(bench.column(rows, "line_v")) > 0)
-    np.testing.assert_allclose(np.diff(edges)[1:] * 1e-4, 0.2, atol=1e-9)  # it begins in the middle of a line
+    np.testing.assert_allclose(np.diff(edges)[1:] * 1e-4, 0.2, atol=1e-9)  # it begins in the middle of a rising line
 
 
 def test_a_step_is_marked_in_its_tick(tmp_path: Path):
@@ -97,7 +97,7 @@ def test_a_replay_from_any_snapshot_has_the_same_marks(tmp_path: Path):
         (2, 0.0),
         (3, 6.0),
     ]
-    for output in header["extras"]["outputs"]:  # as recordings of earlier versions have them
+    for output in header["extras"]["outputs"]:  # as in recordings of earlier versions
         del output["mark"], output["level_um"]
     assert [output.mark for output in header_extras(header).outputs] == [0, 0, 0]
 

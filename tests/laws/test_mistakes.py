@@ -42,6 +42,7 @@ CLASS, COEFFICIENTS, BUILD, GIVES, OUTPUT, RETURN, UPDATE, ADDS = (
     for text in ("class Mine(", "    coefficients", "def build", 'return {"kp"', "def output", "return c.kp",
                  "def update", "        s.integral_um +=")
 )  # fmt: skip
+"""Numbers of lines in the text LAW."""
 TYPOS = {
     "a signal": ("c.kp * told.error_um +", "c.kp * told.eror_um +", RETURN, "unknown signal; did you mean told.error_"),
     "a command that output still computes": (
@@ -186,9 +187,9 @@ def test_a_coupled_output_may_use_the_commands_that_it_sets(name: str, message: 
         told.command_um[0] = told.error_um[0]
         told.command_um[1] = told.error_um[1] - c.share * told.{name}[0]
 """
-    found = list(find_mistakes(text, {"Pair": Pair}))
-    assert [mistake.line for mistake in found] == ([4] if message else [])
-    assert all(mistake.message.startswith(message) for mistake in found)
+    mistakes = list(find_mistakes(text, {"Pair": Pair}))
+    assert [mistake.line for mistake in mistakes] == ([4] if message else [])
+    assert all(mistake.message.startswith(message) for mistake in mistakes)
 
 
 def test_a_law_without_typos_is_taken(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""Options of the shipped laws: bounds, what may stand beside what, and their way to another process."""
+"""Options of the shipped laws: bounds, keys that exclude each other, and their transfer to another process."""
 
 from __future__ import annotations
 
@@ -57,15 +57,15 @@ def test_the_longest_period_has_one_place_a_tick(repeat: int, fits: bool) -> Non
         with pytest.raises(ValueError, match="repeat_s"):
             law.build()
         return
-    built = law.build()
-    assert (built["places"], built["ahead"]) == (repeat, repeat - 1)
-    assert all(limits.low <= built[name] <= limits.high for name, limits in law.allowed_coefficients.items())
+    coefficients = law.build()
+    assert (coefficients["places"], coefficients["ahead"]) == (repeat, repeat - 1)
+    assert all(limits.low <= coefficients[name] <= limits.high for name, limits in law.allowed_coefficients.items())
 
 
-@pytest.mark.parametrize("beside", [{"a": [[1.0]]}, {"b": [[1.0, 1.0]]}, {"c": [[1.0], [1.0]]}, {"prewarp_hz": 10.0}])
-def test_loops_and_matrices_do_not_stand_side_by_side(beside: dict) -> None:
+@pytest.mark.parametrize("excluded", [{"a": [[1.0]]}, {"b": [[1.0, 1.0]]}, {"c": [[1.0], [1.0]]}, {"prewarp_hz": 10.0}])
+def test_loops_and_matrices_do_not_stand_side_by_side(excluded: dict) -> None:
     with pytest.raises(ValidationError, match="not allowed together with loops"):
-        CoupledOptions.model_validate({"axes": ["x", "y"], "loops": [LOOP, LOOP], **beside})
+        CoupledOptions.model_validate({"axes": ["x", "y"], "loops": [LOOP, LOOP], **excluded})
 
 
 @pytest.mark.parametrize(("order", "fits"), [(48, True), (49, False)])
@@ -89,7 +89,7 @@ def test_a_controller_of_several_axes_has_up_to_48_states(order: int, fits: bool
 
 
 def test_the_edge_of_the_limited_range_is_the_limit_times_the_plants_gain() -> None:
-    """At rest there: a command at the limit holds the plant, and one of half the limit lets it go half way."""
+    """A command at the limit holds the plant at the edge, and half the limit lets it return half way to 0."""
     gains = np.array([2.0, 0.5])
     loop = LimitedLoop(lambda position, reference, limit: np.full(2, min(limit, 10.0)), gains, 10.0)
     assert loop.edge_um.tolist() == [20.0, 5.0]
@@ -100,7 +100,7 @@ def test_the_edge_of_the_limited_range_is_the_limit_times_the_plants_gain() -> N
 
 @pytest.mark.parametrize("drive_v", [0.05, -0.02, 0.0])
 def test_an_entry_within_the_dead_band_finds_where_in_it_the_drive_is(drive_v: float) -> None:
-    """The band is ±0.095 V about the play's output: half way in it is a direction of ½."""
+    """The band is ±0.095 V about the play's output: a drive half way in the band is a direction of ½."""
     bench = Bench(PrandtlIshlinskii(PrandtlIshlinskiiOptions.model_validate(EXACT), PERIOD_S, None), compiled=False)
     bench._call("enter", drive_v)
     assert bench.state["dead_band_direction"][0] == pytest.approx(drive_v / 0.095)
@@ -113,13 +113,13 @@ def test_a_misspelt_key_of_a_law_is_taken_for_the_one_that_is_missing() -> None:
     text = EXAMPLES["repetitive"].read_text().replace("ki_per_s =", "ki_per_second =")
     with pytest.raises(ConfigError) as error:
         parse(text, "test", EXAMPLES["repetitive"].parent, "test")
-    said = str(error.value)
-    assert "axis.x.controller.ki_per_s: missing; this key is required" in said
-    assert "axis.x.controller.ki_per_second: unknown key; did you mean ki_per_s?" in said
+    message = str(error.value)
+    assert "axis.x.controller.ki_per_s: missing; this key is required" in message
+    assert "axis.x.controller.ki_per_second: unknown key; did you mean ki_per_s?" in message
 
 
 def test_code_of_a_shared_controller_is_cached_for_each_number_of_axes(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Two and three axes have records of other sizes: the one's code would write over the other's memory."""
+    """Records of two and of three axes differ in size: code for three axes would write beyond the memory of two."""
     names: list[str] = []
     monkeypatch.setattr(binding, "cached_address", lambda function, name, signature: names.append(name) or 1)
     for axes in (1, 2, 3):

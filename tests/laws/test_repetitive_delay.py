@@ -1,4 +1,4 @@
-"""The repetitive controller is judged with its loop's delay: scipy and python-control simulate whether errors grow."""
+"""The check of the repetitive controller has the loop's delay: a simulation with scipy shows whether errors grow."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from tests.laws.test_shipped import EXAMPLES
 from tests.paper_dynamics import paper_dynamics
 
 PERIOD_S, REPEAT, LEAD, WIDTH, KI_PER_S, GAIN = 1e-4, 1000, 4, 30, 150.0, 0.9
-"""The options of the example."""
+"""The options of the shipped example."""
 PERIODS = 40
 
 

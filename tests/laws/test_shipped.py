@@ -23,12 +23,12 @@ EXAMPLES = {path.stem.replace("-", "_"): path for path in sorted((DEPLOY / "laws
 
 
 def example(path: Path):
-    """The controller of a configuration."""
+    """Return the controller of a configuration's first axis."""
     return make_controller(load(path).axes[0], PERIOD_S)
 
 
 def state_space() -> Coupled:
-    """A controller of three axes, from matrices."""
+    """Return a controller of three axes, from random matrices."""
     random = np.random.default_rng(4)
     a = np.diag([0.0, -3.0, -40.0, -700.0, -5.0]) + np.triu(random.normal(size=(5, 5)), 1)
     matrices = {"a": a, "b": 10 * random.normal(size=(5, 3)), "c": random.normal(size=(3, 5)), "d": np.eye(3) * 0.1}
@@ -86,6 +86,7 @@ class TestPrandtlIshlinskiiWithADeadBand(LawConformance):
 
 
 def resonance(omega: float, damping: float, s: np.ndarray) -> np.ndarray:
+    """Return the response of a resonance with static gain 1."""
     return omega**2 / (s**2 + 2 * damping * omega * s + omega**2)
 
 
@@ -102,7 +103,7 @@ def reference_responses(hz: np.ndarray) -> dict[str, np.ndarray]:
 
 @pytest.mark.parametrize("kind", ["pid", "integral_resonant", "positive_position"])
 def test_its_linear_part_is_that_of_its_equation(kind):
-    """Far below the rate; half a tick of hold, or a tick, between the two."""
+    """The two agree far below the rate, within the phase of 1.5 ticks of delay."""
     hz = np.geomspace(0.1, 100.0, 50)
     from rtloop.laws.linearise import linear_part
 
@@ -126,21 +127,21 @@ def test_the_repetitive_controller_follows_its_formula(lead_ticks, smooth_ticks)
 
     The command is the sum of ki T ê.
 
-    Each tenth command is limited by 0.1 µm: the integral goes on from the limited command, and the memory takes a 0.
+    Each tenth command is limited by 0.1 µm: the integral continues from the limited command, and the memory stores 0.
     """
     repeat, gain, ki_per_s = 20, 0.8, 150.0
     options = RepetitiveOptions(
         ki_per_s=ki_per_s, repeat_s=repeat * PERIOD_S, gain=gain, lead_ticks=lead_ticks, smooth_ticks=smooth_ticks
     )
     bench = Bench(Repetitive(options, PERIOD_S, None), compiled=False)
-    told, commands_um = bench._control[0], []
+    control, commands_um = bench._control[0], []
     errors_um = np.random.default_rng(3).normal(size=5 * repeat)
     limited_um = np.where(np.arange(errors_um.size) % 10 == 9, 0.1, 0.0)
     for error_um, less_um in zip(errors_um, limited_um, strict=True):
-        told.error_um = error_um
-        commands_um.append(bench._commands(told))
-        told.command_um, told.applied_um = commands_um[-1], commands_um[-1] - less_um
-        bench._call("update", told)
+        control.error_um = error_um
+        commands_um.append(bench._commands(control))
+        control.command_um, control.applied_um = commands_um[-1], commands_um[-1] - less_um
+        bench._call("update", control)
     width = smooth_ticks + 1
     triangle = {j: (width - abs(j)) / width**2 for j in range(-smooth_ticks, width)}
     memory_um, expected_um = {}, [0.0]

@@ -21,8 +21,8 @@ MEMORY = Path("/dev/shm")
 TIMEOUT_S, ANSWER_S = 240, 100
 
 
-def processes_with(text: str) -> list[str]:
-    """Command lines, of other processes, that contain a text."""
+def find_command_lines(text: str) -> list[str]:
+    """Return the command lines of running processes that contain a text."""
     lines = []
     for path in Path("/proc").glob("[0-9]*/cmdline"):
         with contextlib.suppress(OSError):
@@ -49,7 +49,7 @@ def test_ctrl_c_ends_all_processes_and_leaves_no_file(tmp_path: Path) -> None:
     before = set(MEMORY.glob(f"{PREFIX}*")) if MEMORY.is_dir() else set()
     with subprocess.Popen(command, stderr=subprocess.PIPE, text=True, env=environment, cwd=tmp_path) as demo:
         assert demo.stderr is not None
-        watchdog = threading.Timer(TIMEOUT_S, demo.kill)  # one that never answers fails instead of waiting for ever
+        watchdog = threading.Timer(TIMEOUT_S, demo.kill)  # a demo that never answers fails the test
         watchdog.start()
         try:
             lines = []
@@ -61,17 +61,17 @@ def test_ctrl_c_ends_all_processes_and_leaves_no_file(tmp_path: Path) -> None:
             assert address, "".join(lines)
             with urllib.request.urlopen(address[0], timeout=ANSWER_S) as response:
                 assert response.status == 200
-            boards = processes_with(f"{folder}/{PREFIX}")
+            boards = find_command_lines(f"{folder}/{PREFIX}")
             assert any("hil serve" in line for line in boards)
             demo.send_signal(signal.SIGINT)
-            rest = demo.stderr.read()
-            assert demo.wait() == 0, "".join(lines) + rest
-            assert "board at" in rest
-            assert "ended after" in rest
+            remaining_output = demo.stderr.read()
+            assert demo.wait() == 0, "".join(lines) + remaining_output
+            assert "board at" in remaining_output
+            assert "ended after" in remaining_output
         finally:
             watchdog.cancel()
             demo.terminate()  # after a failure: it removes its files
-    assert processes_with(f"{folder}/{PREFIX}") == processes_with(str(runtime)) == []
-    left = [path for path in tmp_path.rglob("*") if path not in (runtime, folder)]
-    assert left == []
+    assert find_command_lines(f"{folder}/{PREFIX}") == find_command_lines(str(runtime)) == []
+    leftover_files = [path for path in tmp_path.rglob("*") if path not in (runtime, folder)]
+    assert leftover_files == []
     assert not (set(MEMORY.glob(f"{PREFIX}*")) if MEMORY.is_dir() else set()) - before

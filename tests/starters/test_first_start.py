@@ -1,4 +1,4 @@
-"""The first start on a machine says that it compiles; a later one does not."""
+"""The first start on a machine prints that it compiles; a later start does not."""
 
 from __future__ import annotations
 
@@ -12,7 +12,8 @@ from rtloop.cli.run import TerminalObserver
 from rtloop.foundation.native import cache
 
 
-def watched(capsys: pytest.CaptureFixture[str]) -> str:
+def watch_start(capsys: pytest.CaptureFixture[str]) -> str:
+    """Return the text that the terminal shows at the start of a run."""
     prepared: Any = SimpleNamespace(plan=None)
     with TerminalObserver().watch(prepared):
         pass
@@ -23,6 +24,6 @@ def test_a_run_with_an_empty_cache_says_that_it_compiles(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(cache, "CACHE_FOLDER", tmp_path)
-    assert watched(capsys).startswith("compiling the loop for this machine, once: ")
+    assert watch_start(capsys).startswith("compiling the loop for this machine, once: ")
     (tmp_path / "rtloop.engine.loop.run_ticks.o").touch()
-    assert watched(capsys) == ""
+    assert watch_start(capsys) == ""

@@ -1,4 +1,4 @@
-"""`rtloop init`: the files of each kind run as they are, none is overwritten, a mistake is one sentence."""
+"""`rtloop init`: the files of each kind run unchanged, none is overwritten, a mistake is one sentence."""
 
 from __future__ import annotations
 
@@ -21,6 +21,7 @@ KINDS = ("paper", "stage", "law", "driver")
 
 
 def init(*arguments: object) -> Result:
+    """Run `rtloop init` with `arguments` in this process and return the result."""
     return CliRunner().invoke(main, ["init", *map(str, arguments)])
 
 
@@ -124,11 +125,11 @@ def test_a_law_takes_a_stage_of_ones_own(tmp_path: Path) -> None:
     result = init(tmp_path, "--kind", "law", "--name", "damping", "--config", tmp_path / "stage.toml")
     assert result.exit_code == 0, result.output
     text = (tmp_path / "damping.toml").read_text()
-    stage, made = tomllib.loads(stage_text), tomllib.loads(text)
+    stage, law_example = tomllib.loads(stage_text), tomllib.loads(text)
     ki_per_s = stage["axis"][0]["controller"]["ki_per_s"]
-    assert made["axis"][0].pop("controller") == {"file": "damping.py", "ki_per_s": ki_per_s}
+    assert law_example["axis"][0].pop("controller") == {"file": "damping.py", "ki_per_s": ki_per_s}
     del stage["axis"][0]["controller"]
-    assert made == stage
+    assert law_example == stage
     assert text.startswith("#:schema ./rtloop.schema.json\n")
     assert text.count("#:schema") == 1
     assert "integrator" not in text.lower()
@@ -156,7 +157,7 @@ def test_the_test_runs_with_the_python_of_rtloop(kind: str, tmp_path: Path) -> N
 
 
 def test_the_package_installs_the_modules_that_it_lists(tmp_path: Path) -> None:
-    """The line of the template's comment brings a card's library into the installed package."""
+    """The line in the template's comment adds a card's library to the installed package."""
     init(tmp_path, "--kind", "driver", "--name", "lab_card")
     (tmp_path / "my_library.py").write_text("")
     assert built_modules(tmp_path) == ["lab_card.py"]
@@ -172,7 +173,7 @@ def test_the_driver_keeps_the_contract(tmp_path: Path) -> None:
     options = ("-q", "-p", "no:cacheprovider", "-W", "error", "--rootdir", tmp_path, f"--basetemp={tmp_path}/basetemp")
     command = [sys.executable, "-m", "pytest", *options]
     environment = os.environ | {"PYTHONPATH": str(ROOT)}
-    done = subprocess.run(
+    result = subprocess.run(
         [*command, "test_lab_card.py"], cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=120
     )
-    assert done.stdout.strip().splitlines()[-1].startswith("13 passed"), done.stdout
+    assert result.stdout.strip().splitlines()[-1].startswith("13 passed"), result.stdout

@@ -1,4 +1,4 @@
-"""Man pages and completion scripts: a page a command, without a warning of groff; bash completes commands."""
+"""Man pages and completion scripts: a page for each command, no warning of groff, and completion in bash."""
 
 from __future__ import annotations
 
@@ -19,6 +19,7 @@ ROOT = Path(__file__).resolve().parents[2]
 
 @pytest.fixture(scope="module")
 def share(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a folder with the man pages and completion scripts; skip the tests without bash."""
     if shutil.which("bash") is None:
         pytest.skip("no bash")
     folder = tmp_path_factory.mktemp("share")
@@ -27,6 +28,7 @@ def share(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def page(share: Path, name: str) -> str:
+    """Return the text of a man page."""
     return (share / "man/man1" / f"{name}.1").read_text()
 
 
@@ -48,10 +50,10 @@ def test_groff_has_nothing_to_warn_of(share: Path) -> None:
     if shutil.which("groff") is None:
         pytest.skip("no groff")
     pages = sorted((share / "man/man1").iterdir())
-    done = subprocess.run(
+    result = subprocess.run(
         ["groff", "-man", "-Kutf8", "-Tutf8", "-ww", "-z", *pages], capture_output=True, text=True, check=True
     )
-    assert done.stderr == ""
+    assert result.stderr == ""
 
 
 def test_bash_completes_commands(share: Path, tmp_path: Path) -> None:
@@ -63,5 +65,5 @@ def test_bash_completes_commands(share: Path, tmp_path: Path) -> None:
         f"_rtloop_completion {program}; echo ${{COMPREPLY[@]}}"
     )
     environment = os.environ | {"PYTHONPATH": str(ROOT)}
-    done = subprocess.run(["bash", "-c", script], capture_output=True, text=True, env=environment, check=True)
-    assert done.stdout.split() == ["recover", "replay"]
+    result = subprocess.run(["bash", "-c", script], capture_output=True, text=True, env=environment, check=True)
+    assert result.stdout.split() == ["recover", "replay"]

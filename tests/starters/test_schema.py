@@ -1,4 +1,4 @@
-"""`rtloop schema`: a validator of another project accepts every configuration that ships and refuses mistakes."""
+"""`rtloop schema`: the validator jsonschema accepts every shipped configuration and refuses mistakes."""
 
 from __future__ import annotations
 
@@ -23,7 +23,8 @@ CONFIGURATIONS = {str(path): raw for path, raw in RAW.items() if "loop" in raw}
 
 @pytest.fixture(scope="module")
 def validator() -> Any:
-    # a second and a half of import, which every process of `make test` that collects this file would take
+    """Return a validator for the printed schema; skip the tests without jsonschema."""
+    # An import at the top would take 1.5 s in every process of `make test` that collects this file.
     jsonschema = pytest.importorskip("jsonschema", reason="jsonschema is not installed")
     result = CliRunner().invoke(main, ["schema"])
     assert result.exit_code == 0
@@ -38,8 +39,8 @@ def test_every_configuration_is_accepted(validator: Any, name: str) -> None:
     assert [error.message for error in validator.iter_errors(CONFIGURATIONS[name])] == []
 
 
-def changes() -> dict[str, Callable[[Any], Any]]:
-    """Mistakes, each made in deploy/paper.toml, by the place that has to refuse them."""
+def make_mistakes() -> dict[str, Callable[[Any], Any]]:
+    """Return functions that each make a mistake in the values of deploy/paper.toml, by the name of the mistake."""
     return {
         "unknown key of the loop": lambda raw: raw["loop"].update(rate=1.0),
         "text for a number": lambda raw: raw["loop"].update(rate_hz="10000"),
@@ -57,10 +58,10 @@ def changes() -> dict[str, Callable[[Any], Any]]:
     }
 
 
-@pytest.mark.parametrize("mistake", changes())
+@pytest.mark.parametrize("mistake", make_mistakes())
 def test_a_mistake_is_refused(validator: Any, mistake: str) -> None:
     raw = copy.deepcopy(CONFIGURATIONS["paper.toml"])
-    changes()[mistake](raw)
+    make_mistakes()[mistake](raw)
     assert not validator.is_valid(raw)
 
 

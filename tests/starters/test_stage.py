@@ -1,4 +1,4 @@
-"""The stage of `rtloop init`: stable by poles that numpy computes, figures that are checked, a design that works."""
+"""The stage of `rtloop init`: stable by poles from numpy, its figures are checked, and its specification can be met."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ ONE_SIDED: list[dict[str, float]] = [
     {"drive_min_v": 0.0, "hysteresis_percent": 30.0, "sensor_share": 0.06},
     {"drive_min_v": -6.0, "drive_v": 7.5, "hysteresis_percent": 0.0, "sensor_share": 1.0},
 ]
-"""Stages that move farther to one side; the sensor's scale as a share of the travel: 0.1 shows it up to 10 V."""
+"""Stages that move farther to one side; `sensor_share` is the sensor's µm/V over the travel in µm."""
 
 
 def largest_pole(stage: dict, gain_factor: float = 1.0) -> float:
-    """Largest magnitude of the closed loop's poles: held plant, `delay_ticks`, integral behind the output."""
+    """Return the largest magnitude of the closed loop's poles, with held plant, `delay_ticks` and integrator."""
     axis, rate_hz = stage["axis"][0], stage["loop"]["rate_hz"]
     (_, damping_term, stiffness) = axis["model"]["denominator"][0]
     assert axis["model"]["gain"] == stiffness
@@ -39,13 +39,15 @@ def largest_pole(stage: dict, gain_factor: float = 1.0) -> float:
     return float(np.max(np.abs(np.roots(np.polyadd(open_loop, gain * numerator.ravel())))))
 
 
-def one_sided(resonance_hz: float, damping: float, range_um: float, sides: dict[str, float]) -> StageFigures:
+def one_sided_figures(resonance_hz: float, damping: float, range_um: float, sides: dict[str, float]) -> StageFigures:
+    """Return the figures of a stage with an entry of ONE_SIDED."""
     values = {name: value for name, value in sides.items() if name != "sensor_share"}
     um_per_v = sides["sensor_share"] * range_um
     return StageFigures(resonance_hz, damping, range_um, sensor_um_per_v=um_per_v, **values)
 
 
 def stage_values(figures: StageFigures) -> dict:
+    """Return the values of a stage's stage.toml."""
     return tomllib.loads(stage_files(figures)["stage.toml"])
 
 
@@ -57,7 +59,7 @@ def test_the_loop_is_stable_with_twice_its_gain(rate_samples: float | None) -> N
         assert largest_pole(stage, 1.0) < 1, (resonance_hz, damping)
         assert largest_pole(stage, 2.0) < 1, (resonance_hz, damping)
         for sides in ONE_SIDED:
-            stage = stage_values(one_sided(resonance_hz, damping, range_um, sides))
+            stage = stage_values(one_sided_figures(resonance_hz, damping, range_um, sides))
             assert largest_pole(stage, 2.0) < 1, (resonance_hz, damping, sides)
 
 
@@ -82,7 +84,7 @@ def test_check_finds_nothing_to_warn_of(figures: tuple[float, float, float], tmp
 def test_a_stage_that_moves_farther_to_one_side_is_as_safe(
     figures: tuple[float, float, float], sides: dict[str, float], tmp_path: Path
 ) -> None:
-    texts = stage_files(one_sided(*figures, sides))
+    texts = stage_files(one_sided_figures(*figures, sides))
     for name in ("stage.toml", "stage-sine.toml", "stage-step.toml"):
         prepared = prepare(parse(texts[name], "stage", tmp_path, name))
         assert [*prepared.warnings, *cautions(prepared)] == [], name
@@ -152,7 +154,7 @@ def test_the_specification_has_a_controller_that_meets_it(resonance_hz: float, d
 
 
 def test_a_stage_of_one_sign_is_specified_within_the_range_above_its_remanence() -> None:
-    """By the plays of its own configuration, stepped up to the largest drive and back to 0."""
+    """The test steps the plays of the stage's configuration up to the largest drive and back to 0."""
     figures = StageFigures(800.0, 0.015, 90.0, 7.5, drive_min_v=0.0, hysteresis_percent=15.0, sensor_um_per_v=10.0)
     stage, specification = (tomllib.loads(stage_files(figures)[name]) for name in ("stage.toml", "stage-spec.toml"))
     plays = stage["axis"][0]["feedforward"]

@@ -1,4 +1,4 @@
-"""One run for all tests of a file, and the command line in the test's own process."""
+"""Fixtures: a run that all tests of a file share, and the command line in the test's process."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ DURATION_S = 0.7
 
 @pytest.fixture(scope="module")
 def paper_run(tmp_path_factory: pytest.TempPathFactory) -> RunResult:
-    """The paper's loop for DURATION_S in virtual time."""
+    """Return a run of the paper's loop for DURATION_S in virtual time."""
     return rtloop.run(PAPER, duration_s=DURATION_S, unpaced=True, folder=tmp_path_factory.mktemp("run"))
 
 
 @pytest.fixture(scope="session")
 def command() -> Callable[..., Result]:
-    """Run a command of the command line; an exit code other than `code` is an error."""
+    """Return a function that runs a command; an exit code other than `code` fails the test."""
 
     def call(*arguments: object, code: int = 0) -> Result:
         result = CliRunner().invoke(main, [str(argument) for argument in arguments])

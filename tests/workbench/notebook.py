@@ -12,7 +12,7 @@ Names = dict[str, Any]
 
 
 def execute_notebook(name: str, folder: Path) -> Names:
-    """Execute all cells of docs/notebooks/`name` in their order, and return the names that they leave.
+    """Execute all cells of docs/notebooks/`name` in their order, and return the names that they define.
 
     The working directory becomes a new folder below `folder`, at the notebook's place beside `deploy`. Raises
     AssertionError for a notebook with stored outputs or with two cells of one id.

@@ -13,7 +13,7 @@ EXAMPLES = re.findall(r"^```python\n(.*?)^```$", (ROOT / "docs/python.md").read_
 
 
 def test_the_examples_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
-    """Without the example that identifies and designs: tests/workbench/test_notebook.py runs it."""
+    """The example that identifies and designs is left to tests/workbench/test_notebook.py."""
     (tmp_path / "deploy").symlink_to(ROOT / "deploy")
     monkeypatch.chdir(tmp_path)
     names: dict[str, Any] = {}

@@ -1,4 +1,4 @@
-"""The examples in the docstrings of public names print what they say, on one recording of the paper's loop."""
+"""The examples in the docstrings of public names print the stated output, on a recording of the paper's loop."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ FLAGS = doctest.NORMALIZE_WHITESPACE | doctest.REPORT_NDIFF
 
 @pytest.fixture
 def folder(tmp_path: Path, paper_run: RunResult, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """The working directory: a folder with `run.mcap` and the configurations."""
+    """Return the working directory: a folder with `run.mcap` and the configurations."""
     assert paper_run.recording is not None
     (tmp_path / "run.mcap").symlink_to(paper_run.recording.paths[0])
     (tmp_path / "deploy").symlink_to(DEPLOY)
@@ -40,8 +40,8 @@ def folder(tmp_path: Path, paper_run: RunResult, monkeypatch: pytest.MonkeyPatch
     return tmp_path
 
 
-def failed_examples(owner: Any) -> tuple[int, str]:
-    """Run the examples in the docstring of a name itself. Returns their number, and the report of those that fail."""
+def run_examples(owner: Any) -> tuple[int, str]:
+    """Run the examples in the docstring of an object; return their number and the report of failures."""
     report: list[str] = []
     runner = doctest.DocTestRunner(optionflags=FLAGS)
     test = doctest.DocTestParser().get_doctest(owner.__doc__, {"rtloop": rtloop}, owner.__qualname__, None, None)
@@ -54,7 +54,7 @@ def failed_examples(owner: Any) -> tuple[int, str]:
 def test_the_example_of_a_public_name_prints_what_it_says(name: str):
     if name == "Recording.to_pandas":
         pytest.importorskip("pandas", reason="pandas is not installed (extra `data`)")
-    count, report = failed_examples(OWNERS[name])
+    count, report = run_examples(OWNERS[name])
     assert count >= 1
     assert report == ""
 
@@ -70,12 +70,12 @@ def test_every_module_with_an_example_is_listed():
 
 def test_an_example_that_prints_something_else_is_found():
     def example() -> None:
-        """Return nothing.
+        """State a wrong output for an example.
 
         >>> 1 + 1
         3
         """
 
-    count, report = failed_examples(example)
+    count, report = run_examples(example)
     assert count == 1
     assert "- 3" in report

@@ -1,4 +1,4 @@
-"""docs/notebooks/look.ipynb: every cell runs, and its slices, settling times and figures are those of the file."""
+"""docs/notebooks/look.ipynb: every cell runs, and its slices, settling times and figures agree with the file."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ HEIGHT_UM = 20.0
 
 @pytest.fixture(scope="module")
 def names(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Names]:
-    """The names that the notebook's cells leave."""
+    """Yield the names that the notebook's cells define."""
     pytest.importorskip("pandas", reason="pandas is not installed (extra `data`)")
     pytest.importorskip("matplotlib", reason="matplotlib is not installed (extra `plot`)").use("agg")
     before = Path.cwd()
@@ -31,13 +31,13 @@ def names(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Names]:
 def test_a_slice_has_the_ticks_of_its_time(names: Names):
     ticks = np.arange(0.2 * RATE_HZ, 0.22 * RATE_HZ + 1)
     for name, step in names["steps"].items():
-        whole = names["runs"][name]["x_position_um"]
+        column_um = names["runs"][name]["x_position_um"]
         assert np.array_equal(step["tick"], ticks)
-        assert np.array_equal(step["x_position_um"], whole[ticks.astype(int)])
+        assert np.array_equal(step["x_position_um"], column_um[ticks.astype(int)])
 
 
 def test_the_settling_time_is_that_of_the_last_sample_outside(names: Names):
-    """Of the positions in the file's rows, counted one by one; and near the median over the run's steps."""
+    """The settling time agrees with a loop over the positions, and is near the median over the run's steps."""
     for name, run in names["runs"].items():
         position_um, settled = run["x_position_um"], 0
         for tick in range(2000, 2201):

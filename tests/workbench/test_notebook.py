@@ -28,7 +28,7 @@ RESONANCE_HZ, DAMPING = 595.5, 0.0073
 
 @pytest.fixture(scope="module")
 def names(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Names]:
-    """The names that the notebook's cells leave."""
+    """Yield the names that the notebook's cells define."""
     before = Path.cwd()
     try:
         yield execute_notebook("design.ipynb", tmp_path_factory.mktemp("notebook"))
@@ -37,6 +37,7 @@ def names(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Names]:
 
 
 def lines(text: str) -> list[str]:
+    """Return the lines of a text without white space at their ends."""
     return [line.rstrip() for line in text.rstrip().splitlines()]
 
 
@@ -78,7 +79,7 @@ def test_the_designed_controller_closes_a_stable_loop_by_python_control(names: N
 
 
 def test_the_check_has_the_margins_of_the_loop_by_python_control(names: Names):
-    """C(s) on the plant, without sampling."""
+    """The check's margins equal the margins of C(s) on the plant, without sampling."""
     design = names["design"]
     plant = design.specification.design.required_plant.transfer()
     loop = control.zpk(plant.zeros, plant.poles, plant.gain) * names["system"]
@@ -114,11 +115,12 @@ def test_the_example_of_the_page_uses_these_results(names: Names, tmp_path: Path
     """The example of docs/python.md that identifies and designs, with the notebook's results in place of new ones."""
     monkeypatch.chdir(tmp_path)
 
-    def identified(recordings: str, kind: str, **options: Any) -> Any:
+    def return_notebook_result(recordings: str, kind: str, **options: Any) -> Any:
+        """Check the options against the function's parameters; return the notebook's result."""
         inspect.signature(fit_hysteresis if kind == "hysteresis" else fit_dynamics).bind([recordings], **options)
         return names[kind]
 
-    results = {"identify": identified, "design": lambda _: names["design"], "check": rtloop.check}
+    results = {"identify": return_notebook_result, "design": lambda _: names["design"], "check": rtloop.check}
     [example] = [text for text in EXAMPLES if "rtloop.identify(" in text]
     exec(compile(example, "docs/python.md", "exec"), {"rtloop": SimpleNamespace(**results)})
     assert {file.name for file in tmp_path.iterdir()} == {"hysteresis.toml", "model.toml", "designed.toml"}
@@ -126,8 +128,8 @@ def test_the_example_of_the_page_uses_these_results(names: Names, tmp_path: Path
 
 def test_results_and_pictures_show_in_a_notebook(names: Names):
     for name in ("sine", "hysteresis", "dynamics", "design", "check"):
-        shown = names[name]._repr_html_()
-        assert shown.startswith("<pre")
-        assert "[red]" not in shown
+        html = names[name]._repr_html_()
+        assert html.startswith("<pre")
+        assert "[red]" not in html
         assert repr(names[name]).startswith(f"<{type(names[name]).__name__}: ")
     assert names["check"].plot()._repr_png_().startswith(b"\x89PNG")

@@ -34,6 +34,7 @@ TICKS = round(10_000 * DURATION_S)
 
 
 def lines(text: str) -> list[str]:
+    """Return the lines of a text without white space at their ends."""
     return [line.rstrip() for line in text.rstrip().splitlines()]
 
 
@@ -47,7 +48,7 @@ def test_a_run_returns_its_figures(paper_run: RunResult):
 
 
 def test_the_steps_of_a_run_have_the_figures_of_their_definition(paper_run: RunResult):
-    """Each step of the reference, judged by a loop over its ticks."""
+    """The test evaluates each step of the reference by a loop over its ticks."""
     reference_um, position_um = (paper_run.recording[f"x_{name}_um"] for name in ("reference", "position"))
     starts = [k for k in range(1, TICKS) if reference_um[k] != reference_um[k - 1]]
     overshoots, settlings, errors = [], [], []
@@ -75,25 +76,25 @@ def test_a_run_prints_and_returns_what_the_commands_do(paper_run: RunResult, com
     summary_text = lines(command("info", file).stdout)
     text = lines(str(paper_run))
     assert text[: len(summary_text)] == summary_text
-    (asked,) = (line for line in text if "paper-spec.toml asks" in line)
-    assert re.split(r"\s{2,}", asked.strip()) == ["paper-spec.toml asks", "≤ 0, MISSED", "≤ 3, MISSED", "≤ 0.1, MISSED"]
+    (row,) = (line for line in text if "paper-spec.toml asks" in line)
+    assert re.split(r"\s{2,}", row.strip()) == ["paper-spec.toml asks", "≤ 0, MISSED", "≤ 3, MISSED", "≤ 0.1, MISSED"]
     assert any(line.startswith("MISSED: the worst recorded step") for line in text)
 
 
 @pytest.mark.parametrize(
-    ("worst", "cells"),
+    ("worst_figures", "cells"),
     [
         ((1.0, 6.0, 0.2), ["≤ 1", "≤ 6", "≤ 0.2"]),
         ((1.0, 6.1, 0.265), ["≤ 1", "≤ 6, MISSED", "≤ 0.2, MISSED"]),
         ((math.nan, math.inf, 0.1), ["≤ 1, MISSED", "≤ 6, MISSED", "≤ 0.2"]),
     ],
 )
-def test_limits_that_the_worst_step_does_not_meet_are_marked(worst, cells, tmp_path: Path):
+def test_limits_that_the_worst_step_does_not_meet_are_marked(worst_figures, cells, tmp_path: Path):
     limits = "[specification]\novershoot_percent = 1.0\nsettling_ms = 6.0\nstatic_error_percent = 0.2\n"
     (tmp_path / "spec.toml").write_text(limits, encoding="utf-8")
     configuration = replace(load_configuration(PAPER), folder=tmp_path)
     axis = configuration.axes[0].model_copy(update={"specification": "spec.toml"})
-    pairs = [value for value in worst for _ in range(2)]
+    pairs = [value for value in worst_figures for _ in range(2)]
     (row,) = specification_rows(configuration, axis, StepMetrics(4, 0, *pairs))
     assert (row.label, row.cells) == ("spec.toml asks", cells)
 
@@ -146,12 +147,12 @@ def test_another_law_is_compared_on_the_recorded_inputs(paper_run: RunResult, co
     assert (result.ticks, result.trip) == (TICKS, None)
     assert {signal["max"] for signal in result.signals.values()} == {0.0}
     assert result.as_dict() == json.loads(command("replay", file, "--config", PAPER, "--json").stdout)
-    again = rtloop.replay(file, resimulate=True)
-    position_um = paper_run.recording["x_position_um"] - paper_run.recording["x_reference_um"]
-    recorded = again.axes["x"]["recorded"]
-    assert recorded["rms_error_um"] == pytest.approx(math.sqrt(np.mean(position_um**2)), rel=1e-9)
-    assert again.axes["x"]["resimulated"] == recorded
-    assert "resimulated" in str(again)
+    resimulation = rtloop.replay(file, resimulate=True)
+    error_um = paper_run.recording["x_position_um"] - paper_run.recording["x_reference_um"]
+    recorded = resimulation.axes["x"]["recorded"]
+    assert recorded["rms_error_um"] == pytest.approx(math.sqrt(np.mean(error_um**2)), rel=1e-9)
+    assert resimulation.axes["x"]["resimulated"] == recorded
+    assert "resimulated" in str(resimulation)
 
 
 def test_a_check_judges_each_axis_as_the_command_does(command):
@@ -205,7 +206,7 @@ def test_a_part_of_a_recording_is_refused_where_the_whole_is_needed(paper_run: R
 
 
 def test_a_tripped_run_is_a_result_and_no_exception(tmp_path: Path):
-    """Of a loop that was recorded in this process."""
+    """The result is of a loop that was recorded in this process."""
     text = changed(("position_um = 60.0", "position_um = 5.0"))
     path, *_ = record(tmp_path / "run.mcap", text, 3_000)
     supervised = SupervisedRun([path], "done", {"complete": True}, [], None, 0)
@@ -219,21 +220,21 @@ def test_a_tripped_run_is_a_result_and_no_exception(tmp_path: Path):
 
 
 def test_a_run_in_another_thread_touches_no_signal(tmp_path: Path):
-    """As in a server, or in a notebook's background task: the event loop runs on, and the handlers stay."""
+    """A server or a notebook may run a loop in a thread: its event loop continues, and its handlers stay."""
     handlers = {name: signal.getsignal(name) for name in (signal.SIGINT, signal.SIGTERM)}
-    seen: list[dict] = []
+    observed: list[dict] = []
 
-    async def turn() -> RunResult:
+    async def run_in_thread() -> RunResult:
         task = asyncio.create_task(asyncio.to_thread(rtloop.run, PAPER, duration_s=0.1, unpaced=True, folder=tmp_path))
         while not task.done():
-            seen.append({name: signal.getsignal(name) for name in handlers})
+            observed.append({name: signal.getsignal(name) for name in handlers})
             await asyncio.sleep(0.005)
         return task.result()
 
-    result = asyncio.run(turn())
+    result = asyncio.run(run_in_thread())
     assert (result.outcome, result.ticks) == ("done", 1000)
-    assert len(seen) > 5
-    interrupts = {entry[signal.SIGTERM] for entry in seen}
+    assert len(observed) > 5
+    interrupts = {entry[signal.SIGTERM] for entry in observed}
     assert interrupts == {handlers[signal.SIGTERM]}
     errors: list[RtloopError] = []
 
@@ -250,11 +251,11 @@ def test_a_run_in_another_thread_touches_no_signal(tmp_path: Path):
 
 
 def test_ctrl_c_in_the_main_thread_returns_a_stopped_run(tmp_path: Path):
-    """The signal comes once the loop has its first ticks; the handlers are the former ones afterwards."""
+    """The signal comes once the loop has its first ticks; the earlier handler is restored afterwards."""
     before = signal.getsignal(signal.SIGINT)
 
     def interrupt() -> None:
-        while not any(file.stat().st_size > 100_000 for file in tmp_path.glob("*.part")):  # more than its head
+        while not any(file.stat().st_size > 100_000 for file in tmp_path.glob("*.part")):  # larger than the header
             threading.Event().wait(0.01)
         signal.pthread_kill(threading.main_thread().ident, signal.SIGINT)
 
