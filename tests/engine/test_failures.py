@@ -128,7 +128,7 @@ def test_a_write_that_fails_is_ramped_down_by_further_writes(for_good: bool):
     assert str(loop.driver.error) == "no such device"
 
 
-@pytest.mark.parametrize("refused", [1, 2, 20, 200])
+@pytest.mark.parametrize("refused_count", [1, 2, 20, 200])
 def test_a_card_that_refuses_for_a_while_is_not_stepped(refused_count: int):
     """The ramp continues from the last accepted value: each accepted value is one step further."""
     loop = RefusingLoop(lambda number: 26 <= number < 26 + refused_count)

@@ -115,7 +115,7 @@ def test_a_law_that_is_built_for_a_run_is_protected(write_law: Callable[[str], P
 
 
 def test_a_replay_reads_a_law_as_carefully(write_law: Callable[[str], Path], tmp_path: Path):
-    """Both the trusted recorded text and the named file fail now, but ran without fault when they were recorded."""
+    """The trusted recorded text and the named file exit now; the same text ran without fault when it was recorded."""
     trigger = tmp_path / "trigger"
     text = f"import pathlib\nif pathlib.Path({str(trigger)!r}).exists():\n    raise SystemExit\n" + law_text()
     run = record_law(tmp_path, text)
