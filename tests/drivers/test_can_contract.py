@@ -30,7 +30,8 @@ from tests.faults.evidence import wait_for
 
 ONE_AXIS = {"x": Wiring("adc0", "dac0")}
 RATE_HZ = 500.0
-WATCHDOG_MS = 300.0
+WATCHDOG_MS = 1000.0
+"""Longer than the host stalls a test: a node whose controller pauses for longer parks its output."""
 WITNESS = struct.Struct("<qdq")
 PROGRAM = """
 import mmap, sys
