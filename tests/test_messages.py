@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from rtloop.configuration.toml_lines import key_lines, numbered
-from tests.asked import run
+from tests.command_line import run
 from tests.recording.hand_made_loop import make_rows, write_recording
 from tests.recording.real_loop import TWO_AXES, record
 

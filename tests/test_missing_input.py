@@ -12,7 +12,7 @@ import click
 import pytest
 
 from rtloop.cli import main
-from tests.asked import run
+from tests.command_line import run
 from tests.users import ROOT_ONLY, VICTIM, as_user
 
 DEPLOY = Path(__file__).resolve().parents[1] / "deploy"

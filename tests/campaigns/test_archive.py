@@ -24,7 +24,6 @@ from rtloop.campaigns.workers import WorkerDied
 from rtloop.errors import UnavailableError
 from rtloop.recording.errors import RecordingError
 from rtloop.version import __version__
-from tests.asked import run
 from tests.campaigns.bad_recordings import (
     BAD,
     DRIVE_TICK,
@@ -38,6 +37,7 @@ from tests.campaigns.bad_recordings import (
     require_exact,
 )
 from tests.campaigns.campaign_files import rtloop
+from tests.command_line import run
 from tests.recording import rewriting
 from tests.recording.forging import pack_file, record_bases
 from tests.recording.real_loop import record, scheduled

@@ -26,8 +26,8 @@ from rtloop.campaigns.sensitivity import SensitivityIndex
 from rtloop.campaigns.store import crashed_case, open_store
 from rtloop.campaigns.summary import summarise_campaign
 from rtloop.campaigns.unit import Unit
-from tests.asked import run
 from tests.campaigns.campaign_files import ROOT, STEPS, write_campaign
+from tests.command_line import run
 
 SCAN = """
 [[experiment]]

@@ -15,8 +15,8 @@ import pytest
 from rtloop import campaign as rtloop_campaign
 from rtloop.campaigns.campaign_file import load_campaign
 from rtloop.campaigns.unit import OtherVersion, WorkerFacts, run_unit
-from tests.asked import run
 from tests.campaigns.campaign_files import result_files, rtloop, write_campaign
+from tests.command_line import run
 from tests.users import ROOT_ONLY
 
 KILLING_RIG = 7

@@ -14,7 +14,7 @@ from rtloop.design.identification.axis_recording import trip_remedy
 from rtloop.design.identification.dynamics.prediction_error import Excitation
 from rtloop.design.identification.frequency_response import recording_response
 from rtloop.errors import ConfigError, RtloopError
-from tests.asked import answer, run
+from tests.command_line import answer, run
 
 RATE_HZ, RESONANCE_HZ, DAMPING, GAIN_UM_PER_V = 20_000, 620.0, 0.03, 3.5
 SPEC = """

@@ -13,7 +13,7 @@ WIRING = {"x": Wiring("ai0", "ao0")}
 
 
 @contextmanager
-def opened(driver: Driver) -> Iterator[DriverCalls]:
+def open_driver(driver: Driver) -> Iterator[DriverCalls]:
     """Open a driver, yield its calls, and close it."""
     yield DriverCalls(driver.open(), driver.facts)
     driver.close()

@@ -18,7 +18,7 @@ from rtloop.drivers.can.frames import DBC
 from rtloop.drivers.can.node import serve
 from rtloop.drivers.can.options import CanOptions
 from rtloop.errors import ConfigError
-from tests.asked import answer, run
+from tests.command_line import answer, run
 from tests.drivers.can_bench import configuration, free_port
 from tests.drivers.processes import completed, rtloop
 

@@ -23,7 +23,7 @@ from rtloop.drivers.can.driver import CanDriver
 from rtloop.drivers.can.node import serve
 from rtloop.drivers.contract import DriverCalls, DriverContract
 from rtloop.drivers.errors import DriverError
-from tests.drivers.bench_driver import opened
+from tests.drivers.bench_driver import open_driver
 from tests.drivers.can_bench import free_port, options_on
 from tests.drivers.processes import ENVIRONMENT
 from tests.faults.evidence import wait_for
@@ -37,7 +37,7 @@ PROGRAM = """
 import mmap, sys
 from rtloop.drivers.can.bus import open_bus
 from rtloop.drivers.can.node import RigNode
-from tests.drivers.bench_driver import opened
+from tests.drivers.bench_driver import open_driver
 from tests.drivers.can_bench import options_on
 from tests.drivers.test_can_contract import WATCHDOG_MS, WITNESS
 
@@ -107,7 +107,7 @@ class TestNode(DriverContract):
 
 
 def test_a_silent_controller_gets_the_outputs_parked(node):
-    with opened(node.driver()) as calls:
+    with open_driver(node.driver()) as calls:
         before = node.record[2]
         assert calls.write([4.0]) == 0
         wait_for(lambda: node.record[1] == pytest.approx(4.0, abs=2e-4), "the drive")
@@ -115,7 +115,7 @@ def test_a_silent_controller_gets_the_outputs_parked(node):
 
 
 def test_a_stopped_node_shows_in_status_and_age(node):
-    with opened(node.driver(hold_ticks=3)) as calls:
+    with open_driver(node.driver(hold_ticks=3)) as calls:
         assert calls.read()[0] == 0
         node.process.send_signal(signal.SIGSTOP)
         readings = [calls.read() for _ in range(5) if calls.write([0.0]) == 0]
@@ -134,7 +134,7 @@ def test_a_second_controller_is_refused(node):
         while not ending.wait(0.005):
             calls.write([0.5])
 
-    with opened(node.driver()) as calls, ThreadPoolExecutor() as executor:
+    with open_driver(node.driver()) as calls, ThreadPoolExecutor() as executor:
         executor.submit(drive, calls)
         try:
             with pytest.raises(DriverError, match=message):

@@ -14,7 +14,7 @@ from rtloop.drivers.base import Driver, Wiring
 from rtloop.drivers.comedi import ComediDriver, ComediOptions
 from rtloop.drivers.contract import DriverCalls, DriverContract
 from rtloop.drivers.errors import DriverError
-from tests.drivers.bench_driver import opened
+from tests.drivers.bench_driver import open_driver
 from tests.drivers.comedi_board import hardware, new_board, output_v, stub_library
 from tests.drivers.processes import completed
 
@@ -78,7 +78,7 @@ class TestUnipolarOutput(TestOneAxis):
 
 @pytest.mark.parametrize("volts", [-10.0, -3.7, 0.0, 1e-4, 2.5, 10.0])
 def test_codes_are_the_nearest_and_come_back(device, volts):
-    with opened(comedi(device, {"x": Wiring("ai2", "ao2")})) as calls:
+    with open_driver(comedi(device, {"x": Wiring("ai2", "ao2")})) as calls:
         assert calls.write([volts]) == 0
         assert output_v(device, 2) == pytest.approx(volts, abs=LSB_V / 2 * 1.0001)
         status, (read_v, age_us) = calls.read()
@@ -93,14 +93,14 @@ def test_codes_are_the_nearest_and_come_back(device, volts):
 def test_an_output_stays_where_it_is_known_to_be(tmp_path, mute, share, expected_v):
     device = new_board(tmp_path / "comedi0", mute, share)
     driver = comedi(device)
-    with opened(driver):
+    with open_driver(driver):
         assert driver.outputs_v() == pytest.approx([expected_v], abs=LSB_V)
         assert output_v(device, 0) == pytest.approx(expected_v, abs=LSB_V)
 
 
 def test_channels_are_not_mixed_up(device):
     driver = comedi(device, CROSSED, more_inputs=["ai7"])
-    with opened(driver) as calls:
+    with open_driver(driver) as calls:
         assert [channel.name for channel in driver.facts.inputs] == ["ai1", "ai3", "ai7"]
         calls.write([3.0, -4.0])  # ao3, ao1
         assert calls.read()[1] == pytest.approx([-4.0, 3.0, 0.0, 0.0], abs=LSB_V)
@@ -117,7 +117,7 @@ def test_an_uncompiled_driver_parks_its_output(device):
 
 
 def test_nan_moves_no_output(device):
-    with opened(comedi(device, CROSSED)) as calls:
+    with open_driver(comedi(device, CROSSED)) as calls:
         calls.write([1.0, 2.0])
         before = hardware(device)["code"].tolist()
         assert calls.write([5.0, math.nan]) < 0
@@ -154,7 +154,7 @@ FAULTS = {
 def test_a_missing_part_of_a_board_is_named_and_the_board_released(device, options, wiring, message):
     with pytest.raises(DriverError, match=message):
         comedi(device, wiring, **options).open()
-    with opened(comedi(device)):
+    with open_driver(comedi(device)):
         pass
 
 

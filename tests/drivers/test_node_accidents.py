@@ -19,7 +19,7 @@ import pytest
 import rtloop
 from rtloop.drivers.errors import DriverError
 from rtloop.drivers.node.driver import NodeDriver
-from tests.drivers.bench_driver import opened
+from tests.drivers.bench_driver import open_driver
 from tests.drivers.node_bench import NodeProcess
 from tests.drivers.processes import ENVIRONMENT
 from tests.drivers.processes import rtloop as start_rtloop
@@ -65,7 +65,7 @@ def test_a_master_that_dies_before_its_first_write_leaves_safe_outputs_and_a_fre
     run_dying_master(node, [], 200.0)
     wait_for(lambda: abs(node.settled_output_v()) < 1e-5, "a safe output")
     assert node.parkings == parkings + 1
-    with opened(node.driver(**PATIENT)) as calls:
+    with open_driver(node.driver(**PATIENT)) as calls:
         assert calls.read()[0] == 0
         assert abs(node.settled_output_v()) < 1e-5
 
@@ -99,7 +99,7 @@ def test_of_eight_masters_at_once_one_drives_undisturbed_and_the_others_are_told
 
 def test_a_master_that_drives_is_never_evicted(node):
     driver = node.driver(**PATIENT)
-    with opened(driver) as calls:
+    with open_driver(driver) as calls:
         calls.read()
         calls.write([2.0])
         for _ in range(2):
@@ -132,7 +132,7 @@ def local_port(driver: NodeDriver) -> int:
 
 def test_a_flood_of_garbage_to_both_ports_moves_nothing_and_ends_nothing(node):
     driver = node.driver(rate_hz=2000.0, **PATIENT)
-    with opened(driver) as calls:
+    with open_driver(driver) as calls:
         calls.read()
         is_ended = threading.Event()
         thread = threading.Thread(target=flood, args=([local_port(driver), node.options["port"]], is_ended))

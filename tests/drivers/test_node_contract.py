@@ -15,7 +15,7 @@ from rtloop.drivers.contract import DriverCalls, DriverContract
 from rtloop.drivers.errors import DriverError
 from rtloop.drivers.node.driver import SerialDriver, UdpDriver
 from rtloop.drivers.node.options import UdpOptions
-from tests.drivers.bench_driver import opened
+from tests.drivers.bench_driver import open_driver
 from tests.drivers.node_bench import NodeProcess, make_options
 from tests.faults.evidence import wait_for
 
@@ -51,7 +51,7 @@ class TestSameTick(TestNextTick):
 
 
 def test_a_silent_controller_gets_the_outputs_parked_and_cannot_go_on(node):
-    with opened(node.driver(**PATIENT | {"watchdog_ms": 200.0})) as calls:
+    with open_driver(node.driver(**PATIENT | {"watchdog_ms": 200.0})) as calls:
         before = node.parkings
         assert calls.read()[0] >= 0
         assert calls.write([4.0]) == 0
@@ -65,7 +65,7 @@ def test_a_silent_controller_gets_the_outputs_parked_and_cannot_go_on(node):
 
 def test_the_reason_of_a_failure_is_told(node):
     driver = node.driver(**PATIENT | {"watchdog_ms": 100.0})
-    with opened(driver) as calls:
+    with open_driver(driver) as calls:
         calls.read()
         assert driver.error is None
         calls.write([1.0])
@@ -76,7 +76,7 @@ def test_the_reason_of_a_failure_is_told(node):
 
 
 def test_a_stopped_node_shows_in_status_and_age(node):
-    with opened(node.driver(**PATIENT | {"hold_ticks": 3})) as calls:
+    with open_driver(node.driver(**PATIENT | {"hold_ticks": 3})) as calls:
         assert calls.read()[0] == 0
         node.process.send_signal(signal.SIGSTOP)
         readings = [calls.read() for _ in range(5) if calls.write([0.0]) == 0]
@@ -90,7 +90,7 @@ def test_a_stopped_node_shows_in_status_and_age(node):
 
 def test_a_node_that_stops_before_the_first_tick_is_named_and_the_age_is_that_of_its_last_answer(node):
     driver, start_s = node.driver(**PATIENT), time.monotonic()
-    with opened(driver) as calls:
+    with open_driver(driver) as calls:
         node.process.send_signal(signal.SIGSTOP)
         status, values = calls.read()
         node.process.send_signal(signal.SIGCONT)
@@ -101,7 +101,7 @@ def test_a_node_that_stops_before_the_first_tick_is_named_and_the_age_is_that_of
 
 def test_missing_answers_end_the_exchange_at_the_error_limit(node):
     driver = node.driver(**PATIENT | {"error_limit": 10})
-    with opened(driver) as calls:
+    with open_driver(driver) as calls:
         assert calls.read()[0] == 0
         node.process.send_signal(signal.SIGSTOP)
         statuses = [calls.read()[0] for _ in range(6) if calls.write([0.0]) == 0]

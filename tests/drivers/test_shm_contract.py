@@ -16,7 +16,7 @@ from rtloop.drivers.contract import DriverContract
 from rtloop.drivers.errors import DriverError
 from rtloop.drivers.shm import ShmDriver, ShmOptions
 from rtloop.hil.board import LSB_V
-from tests.drivers.bench_driver import opened
+from tests.drivers.bench_driver import open_driver
 from tests.drivers.processes import ENVIRONMENT, board_memory
 
 ONE_AXIS = {"x": Wiring("adc0", "dac0")}
@@ -42,7 +42,7 @@ def start_board(path: Path) -> subprocess.Popen[bytes]:
     deadline_s = time.monotonic() + TIMEOUT_S
     while time.monotonic() < deadline_s:
         try:
-            with opened(shm(path)):
+            with open_driver(shm(path)):
                 return board
         except DriverError:
             time.sleep(0.02)
@@ -74,7 +74,7 @@ class TestBoard(DriverContract):
 
 def test_a_paused_board_shows_in_the_sample_age(tmp_path):
     board = start_board(tmp_path / "board")
-    with opened(shm(tmp_path / "board")) as calls:
+    with open_driver(shm(tmp_path / "board")) as calls:
         board.send_signal(signal.SIGSTOP)
         ages_us = []
         for _ in range(2):

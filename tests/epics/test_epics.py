@@ -18,7 +18,7 @@ caproto = pytest.importorskip("caproto", reason="caproto is missing: pip install
 
 from rtloop.client import Client  # noqa: E402
 from rtloop.errors import RtloopError  # noqa: E402
-from tests.asked import run  # noqa: E402
+from tests.command_line import run  # noqa: E402
 from tests.epics.bench import HOST, TIMEOUT_S, UM_PER_V, Adapter, make_bench  # noqa: E402
 from tests.faults.bench import Bench  # noqa: E402
 from tests.faults.configuration import ROOT  # noqa: E402

@@ -14,7 +14,7 @@ import pytest
 from rtloop.epics.requests import MAX_PENDING, Requests
 from rtloop.epics.variables import LOOP_VARIABLES, axis_variables, unit_in_mode
 from rtloop.errors import LoopFault
-from tests.asked import run
+from tests.command_line import run
 
 TABLE = {variable.suffix: variable for variable in (*LOOP_VARIABLES, *axis_variables("x"))}
 STATUS: dict[str, Any] = {"state": "stopped", "armed": False, "faults": []}

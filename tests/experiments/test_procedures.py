@@ -37,7 +37,7 @@ from rtloop.experiments.timeline import Segment
 from rtloop.experiments.verdict import Row
 from rtloop.foundation.options import Options
 from rtloop.recording.load import load as load_recording
-from tests.asked import answer
+from tests.command_line import answer
 from tests.experiments.test_linear_model import JUMPING_LAW
 from tests.recording.real_loop import record
 

@@ -183,7 +183,7 @@ class Bench(Evidence):
     def await_drive(self) -> None:
         """Wait until the loop runs with more than 1 V at the output, and for 1,000 further ticks."""
         self.await_state("running")
-        wait_for(lambda: abs(self.seen().last_v) > 1.0, "a drive")
+        wait_for(lambda: abs(self.output_record().last_v) > 1.0, "a drive")
         ticks = self.ticks
 
         def executed() -> bool:

@@ -98,7 +98,7 @@ class Evidence:
         """Smallest step of the output in V."""
         return plain_card.RESOLUTION_V if self.card else LSB_V
 
-    def seen(self) -> OutputRecord:
+    def output_record(self) -> OutputRecord:
         """Return the record of the output, read from the board or the card."""
         if self.card:
             record, unseen = np.memmap(self.folder / "card", plain_card.MEMORY, "r", shape=(1,))[0], 0
@@ -108,7 +108,7 @@ class Evidence:
         names = ("last_v", "lowest_v", "highest_v", "largest_step_v", "largest_window_v")
         return OutputRecord(*(float(record[name]) for name in names), int(record["moved_ns"]), unseen)
 
-    def ask_for(self, fault: int) -> None:
+    def cause_fault(self, fault: int) -> None:
         """Make the board or the card fail: `fault` is a constant of `hil.board` or of `plain_card`."""
         if self.card:
             np.memmap(self.folder / "card", plain_card.MEMORY, "r+", shape=(1,))["fault"] = fault
@@ -138,7 +138,7 @@ class Evidence:
 
         def is_safe() -> bool:
             waited_ns.update(self._waited(by_request))  # a loop that was killed waits too, until it is gone
-            return self.seen().last_v == 0.0
+            return self.output_record().last_v == 0.0
 
         wait_for(is_safe, "a safe output", poll_s=SAFE_POLL_S)
         took_ms = self._safe_ms(waited_ns)
@@ -149,7 +149,7 @@ class Evidence:
 
     def _safe_ms(self, thread_ns: dict[int, int]) -> float:
         """Return the ms from the fault to the last movement of the output; store the host's share in `stalled_ms`."""
-        moved_ns = self.seen().moved_ns
+        moved_ns = self.output_record().moved_ns
         assert self._host is not None
         waited_ns = sum(ns - self._waited_ns.get(thread, 0) for thread, ns in thread_ns.items())
         waited_ms = (self._strike_waited_ns + waited_ns) / NS_PER_MS
@@ -158,4 +158,4 @@ class Evidence:
 
     def store_record(self) -> None:
         """Append the present record of the output to `records`: a board that is started again begins a new one."""
-        self.records.append(self.seen())
+        self.records.append(self.output_record())

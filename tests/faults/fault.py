@@ -107,8 +107,8 @@ def _judge(row: Row, bench: Bench) -> None:
     row.step_v = max(record.largest_step_v for record in bench.records)
     row.window_v = max(record.largest_window_v for record in bench.records)
     row.problems += [problem for record in bench.records for problem in record.problems(row.bounds)]
-    if bench.seen().last_v != 0.0:
-        row.problems.append(f"the output is at {bench.seen().last_v:.3f} V in the end")
+    if bench.output_record().last_v != 0.0:
+        row.problems.append(f"the output is at {bench.output_record().last_v:.3f} V in the end")
     row.account = account(bench.folder / "recordings", bench.blocks)
     row.problems += row.account.problems
     if row.account.lost and not outcome.lost_allowed:

@@ -38,30 +38,30 @@ def board_paused(bench: Bench) -> Outcome:
     bench.await_state("tripped", "stale")
     wait_for(lambda: bench.memory.dac_codes[0] == 0, "a code of 0 V")
     process.send_signal(signal.SIGCONT)
-    wait_for(lambda: bench.seen().last_v == 0.0, "a safe output")
+    wait_for(lambda: bench.output_record().last_v == 0.0, "a safe output")
     bench.recover()
     return Outcome(note="code at 0 V while the board was stopped")
 
 
 def input_frozen(bench: Bench) -> Outcome:
     """Freeze the board's input: the loop trips and ramps to 0 V."""
-    bench.strike(lambda: bench.ask_for(board.FROZEN_INPUT))
+    bench.strike(lambda: bench.cause_fault(board.FROZEN_INPUT))
     took_ms = bench.await_safe(FROZEN_MS)
     trips = bench.await_state("tripped")["trip"]
     assert {"frozen", "stale"} & set(trips), trips
-    bench.ask_for(board.NO_FAULT)
+    bench.cause_fault(board.NO_FAULT)
     bench.recover()
     return Outcome(took_ms, note=trips[0])
 
 
 def output_stuck(bench: Bench) -> Outcome:
     """Make the output ignore its codes: the loop trips and writes 0 V, which the output takes once it is free."""
-    bench.strike(lambda: bench.ask_for(board.STUCK_OUTPUT))
+    bench.strike(lambda: bench.cause_fault(board.STUCK_OUTPUT))
     bench.await_state("tripped", "tracking")
     wait_for(lambda: abs(int(bench.memory.dac_codes[0])) * LSB_V == 0.0, "a code of 0 V")
     bench.store_record()
-    bench.ask_for(board.NO_FAULT)
-    wait_for(lambda: bench.seen().last_v == 0.0, "a safe output")
+    bench.cause_fault(board.NO_FAULT)
+    wait_for(lambda: bench.output_record().last_v == 0.0, "a safe output")
     bench.recover()
     return Outcome(note="code at 0 V")
 
@@ -70,13 +70,13 @@ def card_fault(fault: int, safe_ms: float, *causes: str, new_loop: bool):
     """Return a fault of the card that must trip the loop; with `new_loop` the loop's process must be replaced too."""
 
     def inject(bench: Bench) -> Outcome:
-        bench.strike(lambda: bench.ask_for(fault))
+        bench.strike(lambda: bench.cause_fault(fault))
         took_ms = bench.await_safe(safe_ms)
         if new_loop:
-            bench.ask_for(plain_card.NONE)
+            bench.cause_fault(plain_card.NONE)
             bench.await_restart()
         bench.await_state("tripped", *causes)
-        bench.ask_for(plain_card.NONE)
+        bench.cause_fault(plain_card.NONE)
         bench.recover()
         return Outcome(took_ms)
 
@@ -86,7 +86,7 @@ def card_fault(fault: int, safe_ms: float, *causes: str, new_loop: bool):
 def blocks_once(bench: Bench) -> Outcome:
     """Make one read of the card take 50 ms: the loop runs on and counts the missed periods."""
     ticks = bench.ticks
-    bench.strike(lambda: bench.ask_for(plain_card.BLOCK_50_MS))
+    bench.strike(lambda: bench.cause_fault(plain_card.BLOCK_50_MS))
     wait_for(lambda: bench.ticks > ticks + 2000, "another second")
     report = bench.status()
     assert report["state"] == "running", report
@@ -97,7 +97,7 @@ def blocks_once(bench: Bench) -> Outcome:
 def unstable(bench: Bench) -> Outcome:
     """Run on a rig whose resonance lies 5 % above the model's: the unstable loop trips before 45 µm."""
     report = bench.await_state("tripped", "oscillation")
-    wait_for(lambda: bench.seen().last_v == 0.0, "a safe output")
+    wait_for(lambda: bench.output_record().last_v == 0.0, "a safe output")
     largest_um = float(bench.memory.evidence[0]["largest_position_um"])
     assert largest_um < 45.0, largest_um
     return Outcome(note=f"|x| ≤ {largest_um:.1f} µm; {', '.join(report['trip'])}")

@@ -44,10 +44,10 @@ def parked_three_times(bench: Bench) -> Outcome:
     bench.service.wait()
     assert bench.rtloop("park", bench.config).wait(TIMEOUT_S) == 0
     took_ms = bench.await_safe()  # no bound: an interpreter must start
-    moved_ns = bench.seen().moved_ns
+    moved_ns = bench.output_record().moved_ns
     for _ in range(2):
         assert bench.rtloop("park", bench.config).wait(TIMEOUT_S) == 0
-    assert bench.seen().moved_ns == moved_ns, "the output moved again"
+    assert bench.output_record().moved_ns == moved_ns, "the output moved again"
     bench.config.write_text(text)
     bench.start_service()
     bench.await_drive()
@@ -63,12 +63,12 @@ def forged_block(bench: Bench) -> Outcome:
     assert bench.service is not None
     bench.service.wait()
     (path,) = (bench.folder / "run").glob("*.block")
-    before_v = bench.seen().last_v
+    before_v = bench.output_record().last_v
     with path.open("r+b") as file:
         SharedBlock(file.fileno())["last_drive_v"][0] = FORGED_V
     os.chown(path, STRANGER, STRANGER)
     assert bench.rtloop("park", bench.config).wait(TIMEOUT_S) != 0, "the block of another user was believed"
-    assert bench.seen().last_v == before_v, "an output moved"
+    assert bench.output_record().last_v == before_v, "an output moved"
     path.unlink()
     assert bench.rtloop("park", bench.config).wait(TIMEOUT_S) == 0
     took_ms = bench.await_safe()  # no bound: an interpreter must start
@@ -83,9 +83,9 @@ def parked_without_restart(bench: Bench) -> Outcome:
     took_ms = bench.await_safe(KILLED_SAFE_MS)
     assert bench.service is not None
     bench.service.wait(TIMEOUT_S)
-    moved_ns = bench.seen().moved_ns
+    moved_ns = bench.output_record().moved_ns
     assert bench.rtloop("park", bench.config).wait(TIMEOUT_S) == 0
-    assert bench.seen().moved_ns == moved_ns, "the output moved again"
+    assert bench.output_record().moved_ns == moved_ns, "the output moved again"
     return Outcome(took_ms, exit_code=1)
 
 
@@ -160,13 +160,13 @@ def parking_killed(bench: Bench) -> Outcome:
     for _ in range(DEATHS):
         drive_v = chance.uniform(-9.0, 9.0)
         os.waitpid(fork(lambda drive_v=drive_v: drive_and_die(plan.driver(), drive_v, slew_v_per_s)), 0)
-        wait_for(lambda drive_v=drive_v: abs(bench.seen().last_v - drive_v) < LSB_V, "a drive")
+        wait_for(lambda drive_v=drive_v: abs(bench.output_record().last_v - drive_v) < LSB_V, "a drive")
         pid = fork(lambda: park(plan.driver(), slew_v_per_s, last_drive_v))
         time.sleep(chance.uniform(0.0, 2.0 * abs(drive_v) / slew_v_per_s))
         os.kill(pid, signal.SIGKILL)
         os.waitpid(pid, 0)
         halfway += 0.0 < abs(park(plan.driver(), slew_v_per_s, last_drive_v)[0]) < abs(drive_v) - LSB_V
-        wait_for(lambda: bench.seen().last_v == 0.0, "a safe output")
+        wait_for(lambda: bench.output_record().last_v == 0.0, "a safe output")
     assert halfway > DEATHS // 10, f"{halfway} of {DEATHS} died halfway"
     bench.start_service()
     bench.await_drive()

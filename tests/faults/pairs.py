@@ -67,7 +67,7 @@ def change_filter(count: int) -> Callable[[Bench], None]:
 
 def board_fault(fault: int) -> Callable[[Bench], None]:
     """Return a function that sets a fault of the board."""
-    return lambda bench: bench.ask_for(fault)
+    return lambda bench: bench.cause_fault(fault)
 
 
 DISTURBANCES = (
@@ -108,11 +108,11 @@ def sequence(bench: Bench, chance: random.Random) -> tuple[str, float]:
         bench.service.terminate()
         wait_for(lambda: bench.service is None or bench.service.poll() is not None, "the service's end")
     assert bench.rtloop("park", bench.config).wait(TIMEOUT_S) == 0, bench.log()[-600:]
-    took_ms = bench.await_safe(SAFE_MS) if bench.seen().moved_ns > bench.struck_ns else 0.0
-    moved_ns = bench.seen().moved_ns
+    took_ms = bench.await_safe(SAFE_MS) if bench.output_record().moved_ns > bench.struck_ns else 0.0
+    moved_ns = bench.output_record().moved_ns
     assert bench.rtloop("park", bench.config).wait(TIMEOUT_S) == 0
-    assert bench.seen().moved_ns == moved_ns, "the output moved again"
-    assert bench.seen().last_v == 0.0, f"the output is at {bench.seen().last_v} V"
+    assert bench.output_record().moved_ns == moved_ns, "the output moved again"
+    assert bench.output_record().last_v == 0.0, f"the output is at {bench.output_record().last_v} V"
     return f"{first.name}, after {1000 * delay_s:.0f} ms {second.name}", took_ms
 
 
@@ -131,14 +131,14 @@ def main() -> int:
             bench.await_drive()
             try:
                 description, took_ms = sequence(bench, chance)
-                problems = bench.seen().problems(bench.bounds)
+                problems = bench.output_record().problems(bench.bounds)
                 assert not problems, "; ".join(problems)
                 verdict = f"safe after {took_ms:.0f} ms"
             except AssertionError as error:
                 description, verdict, failed = "?", f"FAILS: {error}", failed + 1
                 for name in ("largest_step_v", "largest_window_v"):
                     bench.memory.evidence[name] = 0.0
-            largest_v = max(largest_v, bench.seen().largest_window_v)
+            largest_v = max(largest_v, bench.output_record().largest_window_v)
             print(f"{number + 1:4} {description}: {verdict}", flush=True)
         steps = f"at most {largest_v:.3f} V within 1 ms of {bench.bounds.window_v:.3f}"
         print(f"seed {arguments.seed}: {arguments.sequences} sequences, {failed} failed; {steps}")

@@ -25,7 +25,7 @@ def signal_loop(number: signal.Signals, safe_ms: float):
         took_ms = bench.await_safe(safe_ms)
         bench.await_restart()
         assert bench.await_state("tripped")["faults"]
-        assert bench.seen().last_v == 0.0
+        assert bench.output_record().last_v == 0.0
         bench.recover()
         return Outcome(took_ms)
 
@@ -39,7 +39,7 @@ def service_killed(bench: Bench) -> Outcome:
     assert bench.service is not None
     bench.service.wait()
     assert bench.rtloop("park", bench.config).wait(TIMEOUT_S) == 0
-    assert bench.seen().last_v == 0.0
+    assert bench.output_record().last_v == 0.0
     bench.start_service()
     bench.await_drive()
     return Outcome(took_ms)

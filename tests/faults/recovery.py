@@ -53,15 +53,15 @@ def await_recovered(bench: Bench, count: int = 1) -> None:
         bench.follow()
     report = bench.await_state("running")
     assert (report["mode"], report["trip"], report["faults"]) == ("closed_loop", [], []), report
-    wait_for(lambda: abs(bench.seen().last_v) > 1.0, "a drive")
+    wait_for(lambda: abs(bench.output_record().last_v) > 1.0, "a drive")
 
 
 def stays_safe(bench: Bench, seconds: float = STANDS_STILL_S) -> None:
     """Wait for 0 V, then require that output and service stay at 0 V and tripped for `seconds`."""
-    wait_for(lambda: bench.seen().last_v == 0.0, "a safe output")
-    moved_ns, returns = bench.seen().moved_ns, bench.log().count(": recovered")
+    wait_for(lambda: bench.output_record().last_v == 0.0, "a safe output")
+    moved_ns, returns = bench.output_record().moved_ns, bench.log().count(": recovered")
     time.sleep(seconds)
-    assert bench.seen().moved_ns == moved_ns, f"the output moved; {bench.log()[-600:]}"
+    assert bench.output_record().moved_ns == moved_ns, f"the output moved; {bench.log()[-600:]}"
     report = wait_for(bench.status, "an answer")
     assert report["state"] == "tripped", report
     assert (report["recovery"] or {"state": "latched"})["state"] == "latched", report["recovery"]
@@ -70,7 +70,7 @@ def stays_safe(bench: Bench, seconds: float = STANDS_STILL_S) -> None:
 
 def await_return(bench: Bench) -> None:
     """Wait until a recovery drives the output back."""
-    driving = lambda: abs(bench.seen().last_v) > 0.5 and bench.status()["recovery"]["state"] == "returning"
+    driving = lambda: abs(bench.output_record().last_v) > 0.5 and bench.status()["recovery"]["state"] == "returning"
     wait_for(driving, "a return", poll_s=0.002)
 
 
@@ -88,7 +88,7 @@ def board_sleeps(bench: Bench) -> None:
 
 def card_fails(fault: int) -> Strike:
     """Return a function that sets a fault of the card."""
-    return lambda bench: bench.strike(lambda: bench.ask_for(fault))
+    return lambda bench: bench.strike(lambda: bench.cause_fault(fault))
 
 
 def loop_sleeps(bench: Bench) -> None:
@@ -108,7 +108,7 @@ def service_sleeps(bench: Bench) -> None:
     """Stop the service until the loop has parked, then let the service run again."""
     service = bench.pid("service")
     bench.strike(lambda: os.kill(service, signal.SIGSTOP))
-    wait_for(lambda: bench.seen().last_v == 0.0, "a safe output")
+    wait_for(lambda: bench.output_record().last_v == 0.0, "a safe output")
     os.kill(service, signal.SIGCONT)
 
 
@@ -127,9 +127,9 @@ def board_fault(fault: int) -> Strike:
     """Return a function that sets a fault of the board until the loop trips."""
 
     def strike(bench: Bench) -> None:
-        bench.strike(lambda: bench.ask_for(fault))
+        bench.strike(lambda: bench.cause_fault(fault))
         bench.await_state("tripped")
-        bench.ask_for(board.NO_FAULT)
+        bench.cause_fault(board.NO_FAULT)
 
     return strike
 
@@ -154,9 +154,9 @@ def law_hangs(bench: Bench) -> None:
 
 def enable_opens(bench: Bench) -> None:
     """Open the enable input until the loop trips."""
-    bench.strike(lambda: bench.ask_for(plain_card.ENABLE_OPEN))
+    bench.strike(lambda: bench.cause_fault(plain_card.ENABLE_OPEN))
     bench.await_state("tripped", "enable")
-    bench.ask_for(plain_card.NONE)
+    bench.cause_fault(plain_card.NONE)
 
 
 def expect_recovery(strike: Strike, *steps: str, new_loop: bool = False):
@@ -196,9 +196,9 @@ def latches_after_two(bench: Bench) -> Outcome:
         bench.await_drive()
     board_sleeps(bench)
     wait_for(lambda: bench.status().get("recovery", {}).get("state") == "latched", "a latched recovery")
-    moved_ns = wait_for(lambda: bench.seen().last_v == 0.0 and bench.seen().moved_ns, "a safe output")
+    moved_ns = wait_for(lambda: bench.output_record().last_v == 0.0 and bench.output_record().moved_ns, "a safe output")
     time.sleep(STANDS_STILL_S)
-    assert bench.seen().moved_ns == moved_ns, "the output moved"
+    assert bench.output_record().moved_ns == moved_ns, "the output moved"
     report = bench.status()["recovery"]
     assert report["left"] == 0, report
     assert "max_per_hour" in report["reason"], report
@@ -222,10 +222,10 @@ def client_takes_over(command: str, in_state: str):
             process.send_signal(signal.SIGCONT)
             await_return(bench)
             bench.client.post(command)
-        wait_for(lambda: bench.seen().last_v == 0.0, "a safe output")
-        moved_ns = bench.seen().moved_ns
+        wait_for(lambda: bench.output_record().last_v == 0.0, "a safe output")
+        moved_ns = bench.output_record().moved_ns
         time.sleep(STANDS_STILL_S)
-        assert bench.seen().moved_ns == moved_ns, f"the output moved; {bench.log()[-800:]}"
+        assert bench.output_record().moved_ns == moved_ns, f"the output moved; {bench.log()[-800:]}"
         assert ": recovered" not in bench.log()
         assert ": ended" in bench.log()
         return Outcome()
@@ -249,9 +249,9 @@ def trips_in_the_middle(bench: Bench) -> Outcome:
 def service_ends(bench: Bench) -> Outcome:
     """Send SIGTERM while the service confirms the readings: the output does not move, the exit code is 0."""
     board_sleeps(bench)
-    moved_ns = wait_for(lambda: bench.seen().last_v == 0.0 and bench.seen().moved_ns, "a safe output")
+    moved_ns = wait_for(lambda: bench.output_record().last_v == 0.0 and bench.output_record().moved_ns, "a safe output")
     assert bench.stop() == 0
-    assert bench.seen().moved_ns == moved_ns, "the output moved"
+    assert bench.output_record().moved_ns == moved_ns, "the output moved"
     return Outcome()
 
 
@@ -271,14 +271,14 @@ def another_configuration(bench: Bench) -> Outcome:
 
 def card_flaps(bench: Bench) -> Outcome:
     """Make the card's read fail in each new loop: after three recoveries the trip stays latched."""
-    bench.ask_for(plain_card.RAISE_IN_READ)
+    bench.cause_fault(plain_card.RAISE_IN_READ)
     for count in range(1, 5):
         wait_for(
             lambda count=count: bench.status().get("restarts", 0) >= count and bench.status().get("ticks"), "a loop"
         )
         bench.follow()
-        bench.ask_for(plain_card.RAISE_IN_READ)
-    bench.ask_for(plain_card.NONE)
+        bench.cause_fault(plain_card.RAISE_IN_READ)
+    bench.cause_fault(plain_card.NONE)
     wait_for(lambda: bench.status().get("ticks"), "a loop")
     if not bench._follows_the_present_loop():
         bench.follow()

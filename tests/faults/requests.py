@@ -15,7 +15,7 @@ from rtloop.errors import RtloopError
 from tests.faults.bench import Bench
 from tests.faults.evidence import TIMEOUT_S, wait_for
 from tests.faults.fault import Fault, Outcome
-from tests.service.hostile import EXPENSIVE, hostile
+from tests.service.hostile import EXPENSIVE, hostile_requests
 from tests.service.http import exchange
 
 RELOADS, CLIENTS, REQUESTS = 100, 8, 60
@@ -106,7 +106,7 @@ def hostile_clients(bench: Bench) -> Outcome:
             with contextlib.suppress(OSError):
                 client.connect(str(bench.client.path))
         expensive = [(path, json.dumps(body).encode()) for path, body in EXPENSIVE.items()]
-        requests = [*expensive, *hostile(SEED, BODIES)]
+        requests = [*expensive, *hostile_requests(SEED, BODIES)]
 
         def send_requests(number: int) -> None:
             for path, body in requests[number::CLIENTS]:
@@ -121,7 +121,8 @@ def hostile_clients(bench: Bench) -> Outcome:
         bench.strike(lambda: bench.client.post("/stop"))
         answered_ms = 1e3 * (time.monotonic() - began_s)
         bench.await_safe(STOPPED_MS, by_request=True)
-        took_ms = max((bench.seen().moved_ns - bench.struck_ns) / 1e6, 0.0)  # a hostile body may have stopped it before
+        moved_ns = bench.output_record().moved_ns
+        took_ms = max((moved_ns - bench.struck_ns) / 1e6, 0.0)  # A hostile body may have stopped the loop before.
         for thread in threads:
             thread.join()
     return Outcome(took_ms, note=f"/stop answered after {answered_ms:.0f} ms")

@@ -15,7 +15,7 @@ from rtloop.interchange.reading import read_in_process
 from rtloop.interchange.sampling import grows_evenly
 from rtloop.recording.errors import RecordingError
 from rtloop.recording.load import load
-from tests.asked import answer, run
+from tests.command_line import answer, run
 from tests.interchange.controldesk import read_v5, write_controldesk
 
 DOCUMENT = Path(__file__).parents[2] / "docs/data.md"

@@ -11,7 +11,7 @@ import pytest
 import rtloop
 from rtloop.interchange.formats.table import UnreadableData
 from rtloop.interchange.reading import read_in_process
-from tests.asked import run
+from tests.command_line import run
 
 BATCHES, SAMPLES = 3, 8
 LSB_V = 20.48 / 65536

@@ -11,7 +11,7 @@ import pytest
 from rtloop.laws import CoupledController
 from rtloop.laws.mistakes import find_mistakes
 from rtloop.laws.registry import find_law
-from tests.asked import run
+from tests.command_line import run
 from tests.drivers.installing import write_distribution
 from tests.laws.changing import configuration
 

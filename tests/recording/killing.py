@@ -12,7 +12,7 @@ from rtloop.engine.memory import SharedBlock, Word
 from rtloop.recording.file.recover import recover
 from rtloop.recording.load import load
 from rtloop.recording.replay.replay import replay
-from tests.service.test_run import PAPER, TIMEOUT_S, children, start
+from tests.service.test_run import PAPER, TIMEOUT_S, process_ids, start
 
 
 class KilledRun(NamedTuple):
@@ -26,7 +26,7 @@ class KilledRun(NamedTuple):
 def kill_a_run(folder: Path, after_s: float, *options: str) -> KilledRun:
     """Run the paper's loop, and kill supervisor, recorder and loop `after_s` after the file was opened."""
     process = start("run", PAPER, "--out", folder, *options)
-    pids = children(process)
+    pids = process_ids(process)
     deadline = time.monotonic() + TIMEOUT_S
     while not (parts := list(folder.glob("*.mcap.part"))):
         assert process.poll() is None, process.communicate()

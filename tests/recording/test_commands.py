@@ -18,7 +18,7 @@ from rtloop.cli import main
 from rtloop.recording.load import load
 from rtloop.recording.replay.verdict import ReplayReport
 from rtloop.workbench.replay_text import print_replay
-from tests.asked import answer, run
+from tests.command_line import answer, run
 from tests.recording.conftest import EVENTFUL_TICKS
 from tests.recording.hand_made_loop import make_rows, write_recording
 from tests.recording.real_loop import PAPER, changed, record

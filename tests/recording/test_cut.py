@@ -24,8 +24,8 @@ from rtloop.recording.errors import RecordingError
 from rtloop.recording.file.reader import Reader
 from rtloop.recording.load import load
 from rtloop.recording.replay.replay import replay
-from tests.asked import answer
-from tests.asked import run as command
+from tests.command_line import answer
+from tests.command_line import run as command
 from tests.recording.hand_made_loop import make_rows, write_recording
 from tests.recording.real_loop import ROOT, RecordedRun, scheduled
 from tests.recording.tamper import flip_byte

@@ -10,7 +10,7 @@ import pytest
 
 from rtloop.recording.load import load
 from rtloop.recording.replay.replay import replay
-from tests.asked import answer, run
+from tests.command_line import answer, run
 from tests.recording.real_loop import PAPER, schedule
 
 TRIP_TICK, SECOND = 80_000, 10_000

@@ -17,7 +17,7 @@ from rtloop.recording.load import load
 from rtloop.recording.replay.replay import replay
 from tests.recording.hand_made_loop import COLUMNS
 from tests.recording.killing import kill_a_run, open_shared_block, recovered_ticks
-from tests.service.test_run import PAPER, children, finish, run, start, wait_for_ticks
+from tests.service.test_run import PAPER, finish, process_ids, run, start, wait_for_ticks
 
 
 @pytest.mark.parametrize("after_s", [0.05, 0.5])
@@ -45,7 +45,7 @@ def test_the_next_run_recovers_the_file_of_a_killed_one(tmp_path: Path):
 def test_a_loop_in_virtual_time_waits_for_its_recorder_at_half_the_ring(tmp_path: Path):
     """The supervisor is stopped as well, so that it does not replace the recorder."""
     process = start("run", PAPER, "--unpaced", "--duration", "600", "--out", tmp_path, "--json")
-    recorder = children(process)["capture.recorder"]
+    recorder = process_ids(process)["capture.recorder"]
     wait_for_ticks(tmp_path)
     block = open_shared_block(recorder)
     for pid in (process.pid, recorder):

@@ -20,7 +20,7 @@ from rtloop.recording.file.mcap.chunkfile import ChunkFile
 from rtloop.recording.file.reader import Reader
 from rtloop.recording.load import load
 from rtloop.supervision.quota import Quota
-from tests.asked import run
+from tests.command_line import run
 from tests.recording.hand_made_loop import make_rows, write_recording
 from tests.recording.real_loop import RecordedRun
 

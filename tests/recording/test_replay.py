@@ -15,7 +15,7 @@ from rtloop.signals import Flag
 from tests.recording.conftest import EVENTFUL_TICKS
 from tests.recording.hand_made_loop import RecorderProcess
 from tests.recording.real_loop import TWO_AXES, RealLoop, record, scheduled
-from tests.service.test_run import eight_axes
+from tests.service.test_run import eight_axis_text
 
 ROTATED_TICKS = 45_000
 
@@ -43,7 +43,7 @@ def test_saturation_trips_and_changes_of_mode_replay(eventful: Path):
     assert {event["kind"] for event in recording.events} >= {"set_mode", "tripped", "reset_trip", "set_reference"}
 
 
-@pytest.mark.parametrize(("text", "axes"), [(TWO_AXES, 2), (eight_axes(), 8)], ids=["two axes", "eight axes"])
+@pytest.mark.parametrize(("text", "axes"), [(TWO_AXES, 2), (eight_axis_text(), 8)], ids=["two axes", "eight axes"])
 def test_several_axes_replay(text: str, axes: int, tmp_path: Path):
     path = record(tmp_path / "run.mcap", text, 12_000)[0]
     report = replay_without_difference(path)

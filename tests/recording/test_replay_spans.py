@@ -14,7 +14,7 @@ from rtloop.recording.load import load
 from rtloop.recording.replay import spans
 from rtloop.recording.replay.laws import NO_TRUST, recorded_laws
 from rtloop.recording.replay.replay import replay
-from tests.asked import answer
+from tests.command_line import answer
 from tests.laws.test_shipped import DEPLOY
 from tests.recording.forging import TICKS, Base, pack_changed_snapshot, pack_file, take_apart
 from tests.recording.real_loop import record, scheduled

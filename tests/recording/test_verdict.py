@@ -16,7 +16,7 @@ from rtloop.recording.file.topics import format
 from rtloop.recording.load import load
 from rtloop.recording.replay.replay import ReplayReport, replay
 from rtloop.recording.views.summary import summarise
-from tests.asked import answer, run
+from tests.command_line import answer, run
 from tests.recording.forging import CHUNK_TICKS, TICKS, Base, Chunk, first_chunk, pack_changed_snapshot, pack_file
 
 

@@ -22,7 +22,7 @@ class FakeBoard:
         os.close(fd)
         facts = self._memory.facts
         facts["version"], facts["channels"], facts["rate_hz"] = board.VERSION, channels, 8000.0
-        write_first(self._memory, [round(volts / LSB_V)] * channels)
+        set_first_outputs(self._memory, [round(volts / LSB_V)] * channels)
         facts["magic"] = board.MAGIC
 
     @property
@@ -38,7 +38,7 @@ class FakeBoard:
         return np.array([self.start_v, *self._memory.fifo.codes[1:count, 0] * LSB_V])
 
 
-def write_first(memory: BoardMemory, codes: list[int]) -> None:
+def set_first_outputs(memory: BoardMemory, codes: list[int]) -> None:
     """Set the outputs of a fresh board memory to the DAC codes `codes`, as its first write."""
     memory.fifo.codes[0, : len(codes)] = codes
     memory.words[board.WRITTEN] = 1

@@ -47,7 +47,7 @@ EXPENSIVE = {"/controller": {"axis": "x", "controller": {"form": "state_space", 
 """Path and body of a request within the size limit whose controller of order 600 would take minutes to build."""
 
 
-def hostile(seed: int, count: int) -> Iterator[tuple[str, bytes]]:
+def hostile_requests(seed: int, count: int) -> Iterator[tuple[str, bytes]]:
     """Yield path and JSON body of `count` hostile requests; equal seeds give equal requests."""
     generator = random.Random(seed)
     for _ in range(count):
@@ -56,7 +56,7 @@ def hostile(seed: int, count: int) -> Iterator[tuple[str, bytes]]:
         yield path, json.dumps(_replace(body, place, generator.choice(HOSTILE))).encode()
 
 
-def every(values: tuple[Any, ...]) -> Iterator[tuple[str, bytes]]:
+def requests_with_each_value(values: tuple[Any, ...]) -> Iterator[tuple[str, bytes]]:
     """Yield path and JSON body of each valid request with each of `values` at each key path of the body."""
     for path, body in BODIES:
         for place in _places(body):

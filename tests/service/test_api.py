@@ -52,7 +52,7 @@ def test_states_and_refusals(bench: Bench):
     tick = bench.client.post("/stop")["tick"]
     assert await_event(bench, "set_mode", tick)["what"]["mode"] == "off"
     bench.await_state("stopped")
-    wait_for(lambda: bench.seen().last_v == 0.0, "a safe output")
+    wait_for(lambda: bench.output_record().last_v == 0.0, "a safe output")
 
 
 def test_a_trip_latches_until_the_reset(running: Bench):

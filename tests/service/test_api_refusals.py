@@ -14,7 +14,7 @@ import pytest
 from rtloop.engine.memory import Word
 from rtloop.service.api.connections import BACKLOG, MAX_CONNECTIONS
 from tests.faults.bench import Bench
-from tests.service.hostile import EXPENSIVE, HUGE, hostile
+from tests.service.hostile import EXPENSIVE, HUGE, hostile_requests
 from tests.service.http import GOOD_CONTROLLER, answer, exchange
 
 
@@ -115,7 +115,7 @@ def test_numbers_that_nothing_can_be_made_of(bench: Bench, path: str, body: dict
 
 def test_hostile_requests_are_refused_and_change_nothing(bench: Bench):
     refused = 0
-    for path, body in hostile(seed=1, count=120):
+    for path, body in hostile_requests(seed=1, count=120):
         commands = bench.blocks[-1].load(Word.COMMANDS_HEAD)
         code, response = exchange(bench.client.path, "POST", path, body)
         assert code in (200, 413, 422), (path, body[:300], response)

@@ -536,9 +536,9 @@ def test_a_service_that_died_is_parked_while_its_file_is_being_edited(tmp_path):
         for role in ("rt", "service"):
             os.kill(bench.pid(role), signal.SIGKILL)
         bench.service.wait()
-        assert bench.seen().last_v != 0.0
+        assert bench.output_record().last_v != 0.0
         assert bench.rtloop("park", bench.config).wait(120.0) == 0
-        assert bench.seen().last_v == 0.0
+        assert bench.output_record().last_v == 0.0
         assert "parking uses the board of the last run" in bench.log()
 
 

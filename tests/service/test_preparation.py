@@ -69,7 +69,7 @@ def test_while_the_actuator_is_depolarised_setpoints_move_nothing_and_no_start_u
     """A setpoint of 4 µm would be 4 V in mode raw; the depolarising sine has 2 V."""
     sine = "[service]\ndepolarise = { amplitude_v = 2.0, cycles = 1000 }\n[recording]"
     with Bench(tmp_path, ("[recording]", sine)) as bench:
-        wait_for(lambda: bench.seen().largest_v > 0.5, "the sine")
+        wait_for(lambda: bench.output_record().largest_v > 0.5, "the sine")
         for resource, body in (("/setpoint", {"value": 4.0}), ("/waveform", {"samples": [4.0, 4.0]})):
             with pytest.raises(RtloopError, match="the actuator is being depolarised; send the request again"):
                 bench.client.post(resource, {"axis": "x"} | body)
@@ -80,8 +80,8 @@ def test_while_the_actuator_is_depolarised_setpoints_move_nothing_and_no_start_u
         wait_for(lambda: message in bench.log(), "the end of the preparation")
         ticks = bench.ticks
         wait_for(lambda: bench.ticks > ticks + 1000, "ticks")
-        assert (bench.status()["mode"], bench.seen().last_v) == ("off", 0.0)
-        assert bench.seen().largest_v < 2.1
+        assert (bench.status()["mode"], bench.output_record().last_v) == ("off", 0.0)
+        assert bench.output_record().largest_v < 2.1
         bench.client.post("/start")
         bench.await_drive()
         assert bench.stop() == 0, bench.log()
@@ -95,7 +95,7 @@ def test_a_service_in_mode_raw_plays_its_reference_after_the_tare(tmp_path):
         ("[recording]", "[service]\ntare_s = 0.1\n[recording]"),
     )
     with Bench(tmp_path, *changes) as bench:
-        wait_for(lambda: bench.seen().highest_v > 4.9, "the sine's top")
+        wait_for(lambda: bench.output_record().highest_v > 4.9, "the sine's top")
         ticks = bench.ticks
         wait_for(lambda: bench.ticks > ticks + 1000, "a period")
         assert bench.stop() == 0, bench.log()

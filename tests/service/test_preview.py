@@ -10,7 +10,7 @@ from rtloop.configuration.file import load, parse
 from rtloop.configuration.prepare import prepare
 from rtloop.service.changing.change_history import Change, ChangeHistory
 from rtloop.service.changing.preview import lengthen_step, loop_figures, step_duration_ms
-from tests.asked import run
+from tests.command_line import run
 from tests.faults.bench import Bench
 from tests.paper_configuration import PAPER, TEXT, built
 from tests.service.http import answer

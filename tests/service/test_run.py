@@ -44,7 +44,7 @@ def run(*arguments: str | Path, **options: object) -> tuple[int, dict, str]:
     return finish(start("run", *arguments, "--json", **options))
 
 
-def children(process: subprocess.Popen[str]) -> dict[str, int]:
+def process_ids(process: subprocess.Popen[str]) -> dict[str, int]:
     """Return the process IDs of loop and recorder, by their modules, as soon as both have started."""
     pids: dict[str, int] = {}
     deadline = time.monotonic() + TIMEOUT_S
@@ -131,7 +131,7 @@ def test_signals_ramp_down_and_complete_the_recording(tmp_path: Path, numbers: l
 
 def test_a_killed_loop_is_parked_and_said(tmp_path: Path) -> None:
     process = start("run", PAPER, "--out", tmp_path, "--json")
-    loop = children(process)["engine.process"]
+    loop = process_ids(process)["engine.process"]
     wait_for_ticks(tmp_path)
     os.kill(loop, signal.SIGKILL)
     code, summary, err = finish(process)
@@ -145,7 +145,7 @@ def test_a_killed_loop_is_parked_and_said(tmp_path: Path) -> None:
 
 def test_a_killed_recorder_is_replaced_and_nothing_is_lost(tmp_path: Path) -> None:
     process = start("run", PAPER, "--out", tmp_path, "--duration", "6", "--json")
-    recorder = children(process)["capture.recorder"]
+    recorder = process_ids(process)["capture.recorder"]
     wait_for_ticks(tmp_path)
     os.kill(recorder, signal.SIGKILL)
     code, summary, err = finish(process)
@@ -163,7 +163,7 @@ def test_a_killed_recorder_is_replaced_and_nothing_is_lost(tmp_path: Path) -> No
 
 def test_a_loop_without_its_supervisor_parks_and_ends(tmp_path: Path) -> None:
     process = start("run", PAPER, "--out", tmp_path, "--json")
-    pids = children(process)
+    pids = process_ids(process)
     wait_for_ticks(tmp_path)
     process.kill()
     process.communicate(timeout=TIMEOUT_S)
@@ -214,7 +214,7 @@ def _drop_realtime() -> None:
 
 def test_eight_axes_lose_nothing(tmp_path: Path) -> None:
     config = tmp_path / "eight.toml"
-    config.write_text(eight_axes())
+    config.write_text(eight_axis_text())
     code, summary, _ = run(config, "--duration", "1", "--out", tmp_path)
     assert code == 0
     assert summary["ticks_logged"] == 10_000
@@ -222,7 +222,7 @@ def test_eight_axes_lose_nothing(tmp_path: Path) -> None:
     assert [axis["name"] for axis in summary["axes"]] == [f"a{i}" for i in range(8)]
 
 
-def eight_axes() -> str:
+def eight_axis_text() -> str:
     """Return a configuration with the paper's axis eight times, each on a separate plant."""
     text = PAPER.read_text()
     head, axis = text[: text.index("[[axis]]")], text[text.index("[[axis]]") : text.index("[recording]")]

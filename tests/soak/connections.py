@@ -20,7 +20,7 @@ from pathlib import Path
 from rtloop.errors import RtloopError
 from tests.faults.account import account
 from tests.faults.bench import Bench
-from tests.service.hostile import EXPENSIVE, HOSTILE, every
+from tests.service.hostile import EXPENSIVE, HOSTILE, requests_with_each_value
 from tests.service.http import exchange
 
 STOPS_S = 0.5
@@ -56,7 +56,10 @@ def send_hostile_requests(path: Path, end: threading.Event, answers: dict[int, i
     Code 0 counts requests without a valid answer.
     """
     while not end.is_set():
-        requests = [*every(HOSTILE), *((resource, json.dumps(body).encode()) for resource, body in EXPENSIVE.items())]
+        requests = [
+            *requests_with_each_value(HOSTILE),
+            *((resource, json.dumps(body).encode()) for resource, body in EXPENSIVE.items()),
+        ]
         fifo = ("/reference", b'{"axis": "x", "reference": {"kind": "table", "file": "fifo"}}')
         for number, (resource, body) in enumerate([*requests, *[fifo] * 40]):
             if end.is_set() or number % WORKERS != worker:

@@ -24,8 +24,8 @@ import numpy as np
 
 from rtloop import load
 from tests.faults.bench import Bench
-from tests.panel.page.browser import launched, opened
-from tests.panel.web.browser import Browser, unpacked
+from tests.panel.page.browser import launch_browser, open_panel
+from tests.panel.web.browser import Browser, unpack_message
 from tests.paper_configuration import TEXT
 
 CLIENTS, PAIRS, SECONDS = 4, 10, 10.0
@@ -63,7 +63,7 @@ class Clients:
     def _read_frames(self, stream: Any) -> None:
         """Store the size of each frame of a stream, to its end."""
         for message in stream:
-            self.frames.setdefault(unpacked(message)[0]["kind"], []).append(len(message))
+            self.frames.setdefault(unpack_message(message)[0]["kind"], []).append(len(message))
 
 
 class Pages:
@@ -76,7 +76,7 @@ class Pages:
     @contextmanager
     def connected(self) -> Iterator[None]:
         """Open the pages within the context."""
-        pages = [opened(self._chromium, self._address) for _ in range(CLIENTS)]
+        pages = [open_panel(self._chromium, self._address) for _ in range(CLIENTS)]
         for page in pages:
             for _ in range(STEPS):
                 page.click("#shorter")
@@ -105,7 +105,7 @@ def measure_load(folder: Path, pairs: int, seconds: float, cpu: int | None, page
         bench = stack.enter_context(Bench(folder, board=False, text=text))
         browser = Browser(bench)
         browser.log_in()
-        clients = Pages(browser, stack.enter_context(launched())) if pages else Clients(browser)
+        clients = Pages(browser, stack.enter_context(launch_browser())) if pages else Clients(browser)
         for number in range(2 * pairs):
             has_clients = (number + number // 2) % 2 == 1  # none, four, four, none: a drift affects both.
             with clients.connected() if has_clients else nullcontext():

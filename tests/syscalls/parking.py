@@ -25,7 +25,7 @@ from rtloop.supervision import parking
 from rtloop.supervision.hardware import Hardware, UnusableNote, read_note, write_note
 from rtloop.supervision.paths import block_path, hardware_path
 from tests.faults.configuration import BOARD_RATE_HZ, SLEW_V_PER_S, on_a_board
-from tests.service.fake_board import write_first
+from tests.service.fake_board import set_first_outputs
 from tests.syscalls import card
 from tests.syscalls.component import Case
 from tests.syscalls.traced import Outcome
@@ -78,7 +78,7 @@ class ParkingABoard(Case):
         self.memory.reset()
         facts = self.memory.facts
         facts["version"], facts["channels"], facts["rate_hz"] = board.VERSION, 1, BOARD_RATE_HZ
-        write_first(self.memory, [DRIVE_CODE])
+        set_first_outputs(self.memory, [DRIVE_CODE])
         facts["magic"] = board.MAGIC
 
     def written_v(self) -> list[float]:
@@ -118,7 +118,7 @@ class ParkingTheNoted(ParkingABoard):
         other_board = folder / "other"
         shutil.copy(self.card, other_board)
         fd = os.open(other_board, os.O_RDWR | os.O_CLOEXEC)
-        write_first(BoardMemory(fd), [0])
+        set_first_outputs(BoardMemory(fd), [0])
         os.close(fd)
         other_board.chmod(0o600)
         self.config.write_text(self.config.read_text().replace(f'"{self.card}"', f'"{other_board}"'))

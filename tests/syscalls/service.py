@@ -58,7 +58,7 @@ class StartingAService(Case):
         self.log, self.next_log, self.recordings = folder / "log", folder / "next-log", folder / "recordings"
         os.environ["RUNTIME_DIRECTORY"] = str(folder / "run")
         os.environ["NOTIFY_SOCKET"] = str(folder / "notify")
-        self.unseen_step_v = board().seen().largest_step_v
+        self.unseen_step_v = board().output_record().largest_step_v
 
     def warm_up(self) -> None:
         """Serve once in a child, then import all of its modules here, so that later children find them imported."""
@@ -121,7 +121,7 @@ class StartingAService(Case):
     def _board_problems(self, process: str) -> list[str]:
         """Return the problems of the board's output after `process`: an output that is not 0 V, a step too large."""
         bench = board()
-        record = bench.seen()
+        record = bench.output_record()
         problems = [] if record.last_v == 0.0 else [f"after {process} the output is at {record.last_v:.3f} V"]
         if record.largest_step_v > max(bench.bounds.step_v, self.unseen_step_v):
             problems.append(f"a step of {record.largest_step_v:.3f} V, allowed {bench.bounds.step_v:.3f} V")
@@ -169,7 +169,7 @@ class StoppingAService(StartingAService):
 
     def _terminate_once_up(self) -> None:
         """Send SIGTERM once the output is up and ticks are in the file."""
-        wait_for(lambda: board().seen().last_v > UP_V, "an output that is up", TIMEOUT_S)
+        wait_for(lambda: board().output_record().last_v > UP_V, "an output that is up", TIMEOUT_S)
         wait_for(lambda: self._flushed_ticks() > 0, "ticks in the file", TIMEOUT_S)
         terminate()
 

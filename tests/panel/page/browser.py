@@ -45,7 +45,7 @@ def chromium_path() -> str:
 
 
 @contextmanager
-def launched() -> Iterator[Any]:
+def launch_browser() -> Iterator[Any]:
     """Yield a new process of Chromium, which ends with the context."""
     path = chromium_path()
     from playwright.sync_api import sync_playwright
@@ -67,7 +67,7 @@ def start_panel(bench: Bench, service: str | None = None) -> tuple[str, subproce
     return addresses[0], process
 
 
-def opened(browser: Any, address: str, width: int = WIDTH, height: int = HEIGHT, scheme: str = "dark") -> Any:
+def open_panel(browser: Any, address: str, width: int = WIDTH, height: int = HEIGHT, scheme: str = "dark") -> Any:
     """Return a new window with the panel once it shows present values; `page.faults` collects errors of the page."""
     context = browser.new_context(viewport={"width": width, "height": height}, color_scheme=scheme)
     context.set_default_timeout(1000 * TIMEOUT_S)

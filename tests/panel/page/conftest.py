@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 
 from tests.faults.bench import Bench
-from tests.panel.page.browser import HEIGHT, WIDTH, await_text, chromium_path, launched
+from tests.panel.page.browser import HEIGHT, WIDTH, await_text, chromium_path, launch_browser
 from tests.panel.page.parts import open_parts_page
 from tests.panel.page.station import Station, Stations
 
@@ -30,7 +30,7 @@ def pytest_runtest_makereport(item: pytest.Item) -> Generator[None, pytest.TestR
 @pytest.fixture(scope="package")
 def browser() -> Iterator[Any]:
     """Yield the browser of the tests in this folder; Playwright's event loop ends with it."""
-    with launched() as browser:
+    with launch_browser() as browser:
         yield browser
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from tests.faults.bench import Bench
-from tests.panel.page.browser import opened, start_panel
+from tests.panel.page.browser import open_panel, start_panel
 
 CHANGES = ("[recording]", "[service]\narm = true\n[recording]")
 
@@ -21,7 +21,7 @@ class Station:
         with ExitStack() as ending:
             self.bench = ending.enter_context(Bench(folder, CHANGES))
             self.address = start_panel(self.bench)[0]
-            self.window = opened(browser, self.address)
+            self.window = open_panel(browser, self.address)
             ending.callback(self.window.context.close)
             self._ending = ending.pop_all()
 

@@ -14,7 +14,7 @@ from tests.faults.bench import Bench
 from tests.panel.page.browser import (
     await_text,
     chromium_path,
-    opened,
+    open_panel,
     start_by_client,
     start_panel,
     stop_by_keyboard,
@@ -49,11 +49,11 @@ def await_empty(page: Any, selector: str) -> None:
 
 def test_a_dead_process_is_named_and_old_values_are_grey_and_locked(browser: Any, bench_to_kill: Bench) -> None:
     address, panel = start_panel(bench_to_kill)
-    page = opened(browser, address)
+    page = open_panel(browser, address)
     start_by_client(page, bench_to_kill)
-    bench_to_kill.ask_for(board.FROZEN_INPUT)
+    bench_to_kill.cause_fault(board.FROZEN_INPUT)
     await_text(page, "#alarm", "Tripped: x: frozen 2000 ticks, its limit 2000 ticks; also stale. Use Reset to continue")
-    bench_to_kill.ask_for(board.NO_FAULT)
+    bench_to_kill.cause_fault(board.NO_FAULT)
     page.click("#reset")
     await_empty(page, "#alarm")
 

@@ -17,7 +17,7 @@ from tests.panel.page.browser import (
     await_number,
     await_text,
     hold_button,
-    opened,
+    open_panel,
     read_number,
     start_by_client,
     start_by_hand,
@@ -191,7 +191,7 @@ def test_a_page_delayed_by_a_second_keeps_input_and_messages(page: Any, bench: B
 
 def test_two_people_one_drives_and_both_may_stop(page: Any, browser: Any, address: str, bench: Bench) -> None:
     start_by_client(page, bench)
-    second_page = opened(browser, address)
+    second_page = open_panel(browser, address)
     second_page.fill("#who", "bob")
     await_text(second_page, "#drives", "ada drives")
     second_page.fill("#setpoint", "3")

@@ -14,7 +14,7 @@ from urllib.parse import urlsplit
 import pytest
 
 from tests.faults.bench import Bench
-from tests.panel.page.browser import AXE, TIMEOUT_S, await_text, opened, start_by_client, stop_by_keyboard
+from tests.panel.page.browser import AXE, TIMEOUT_S, await_text, open_panel, start_by_client, stop_by_keyboard
 
 MOVING = "[...document.querySelectorAll('*')].filter((e) => parseFloat(getComputedStyle(e).transitionDuration))"
 """Script: the elements with a transition."""
@@ -172,7 +172,7 @@ def test_a_page_of_another_origin_cannot_move_the_drive(
 
 
 def test_the_token_leaves_the_address_and_without_it_there_is_a_form(browser: Any, address: str) -> None:
-    page = opened(browser, address)
+    page = open_panel(browser, address)
     assert "token" not in page.url
     assert "#" not in page.url
     page.reload()

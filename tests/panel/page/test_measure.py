@@ -14,7 +14,7 @@ from tests.design.measured_loops import margins_of
 from tests.faults.bench import Bench
 from tests.faults.evidence import wait_for
 from tests.panel.measurement_rig import MODEL_HZ, SCAN_UM, make_configuration
-from tests.panel.page.browser import TIMEOUT_S, await_text, chromium_path, opened, start_panel
+from tests.panel.page.browser import TIMEOUT_S, await_text, chromium_path, open_panel, start_panel
 from tests.service.test_response import HELD_UM, LOOP
 
 COUNT_COLOURS = """(at) => {
@@ -37,7 +37,7 @@ def rig(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
 @pytest.fixture(scope="module")
 def measure_page(browser: Any, rig: Bench) -> Iterator[Any]:
     """Yield a page of the rig's panel that shows the view of measurements, under the name ada."""
-    page = opened(browser, start_panel(rig)[0])
+    page = open_panel(browser, start_panel(rig)[0])
     page.fill("#who", "ada")
     page.keyboard.press("Escape")
     page.keyboard.press("6")

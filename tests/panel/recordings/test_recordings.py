@@ -18,7 +18,7 @@ from rtloop.panel.web.recordings import Recordings
 from rtloop.recording.replay.replay import replay
 from tests.faults.bench import Bench
 from tests.panel.route_server import Response, RouteServer
-from tests.panel.web.browser import unpacked
+from tests.panel.web.browser import unpack_message
 
 RUN = 3
 """Number of the run that the panel shows."""
@@ -172,7 +172,7 @@ def test_figures_and_pictures_of_a_recording_are_served(panel: Panel, capture: d
 def test_sweeps_of_a_recording_have_its_samples(panel: Panel, capture: dict[str, Any]):
     recording, path = rtloop.load(panel.folder / capture["file"]), f"/api/recordings/{capture['file']}/sweep"
     signal = recording["x_position_um"][(recording["tick"] >= capture["first"])]
-    header, arrays = unpacked(panel.request(f"{path}?signals=x_position_um,tick&pixels=4000").body)
+    header, arrays = unpack_message(panel.request(f"{path}?signals=x_position_um,tick&pixels=4000").body)
     assert (header["first"], header["end"], header["signals"]) == (
         capture["first"],
         capture["end"],
@@ -182,7 +182,7 @@ def test_sweeps_of_a_recording_have_its_samples(panel: Panel, capture: dict[str,
     for bound in ("low", "high"):
         assert np.array_equal(arrays[f"x_position_um:{bound}"], signal.astype("<f4"))
     first = capture["first"] + 100
-    header, arrays = unpacked(
+    header, arrays = unpack_message(
         panel.request(f"{path}?signals=x_position_um&first={first}&ticks=1000&pixels=100&trigger={first + 500}").body
     )
     assert (header["first"], header["end"], header["trigger"]) == (first, first + 1000, first + 500)

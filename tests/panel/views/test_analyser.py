@@ -12,7 +12,7 @@ from rtloop.client.ticks.tick_stretch import DEADLINE_NS, Stretch
 from rtloop.panel.feed.rest_detector import find_axis, is_at_rest
 from rtloop.panel.protocol.subscriptions import validate_field
 from rtloop.panel.views.analyser import Analyser
-from tests.panel.web.browser import unpacked
+from tests.panel.web.browser import unpack_message
 
 RATE_HZ = 1000.0
 LOOP: Any = SimpleNamespace(rate_hz=RATE_HZ, unit=lambda _: "V", axes={"x": {}})
@@ -36,7 +36,7 @@ def test_a_reset_discards_earlier_samples_and_keeps_later_ones(cause: str) -> No
         analyser.reset()
     sine = np.sqrt(2) * np.sin(2 * np.pi * 100 * np.arange(4096) / RATE_HZ)
     feed(analyser, sine, tick, run=int(cause != "reset"))
-    header, arrays = unpacked(analyser.frame())
+    header, arrays = unpack_message(analyser.frame())
     assert header["averages_most"] == 7, "7 half-overlapping segments of 1024 samples fill the 4096 samples"
     assert header["rms"] == pytest.approx(1.0, rel=0.01)
     assert arrays["hz"][np.argmax(arrays["amplitude"])] == pytest.approx(100.0, abs=0.5)
@@ -44,7 +44,7 @@ def test_a_reset_discards_earlier_samples_and_keeps_later_ones(cause: str) -> No
 
 def test_the_spectrum_of_an_axis_at_rest_is_called_noise_until_its_reference_moves() -> None:
     analyser = Analyser(validate_field("spectrum", {"signal": "x_drive_v"}), LOOP)
-    at_rest = lambda: unpacked(analyser.frame())[0]["at_rest"]
+    at_rest = lambda: unpack_message(analyser.frame())[0]["at_rest"]
     tick = feed(analyser, np.zeros(170), 0, reference=5.0)
     assert at_rest()
     tick = feed(analyser, np.zeros(170), tick, reference=5.001)  # The reference steps between two stretches.

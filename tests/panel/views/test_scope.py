@@ -19,7 +19,7 @@ from rtloop.panel.service.service import Description
 from rtloop.panel.views.scope import Scope
 from rtloop.panel.views.xy_plot import extreme_indices
 from rtloop.signals import Signal, column_names
-from tests.panel.web.browser import unpacked
+from tests.panel.web.browser import unpack_message
 
 NAMES = column_names(["x"], [])
 LOOP = Description(
@@ -65,7 +65,7 @@ def test_a_run_that_ends_shows_its_open_sweep():
     second_run = make_stretch(0, 50, run=1)
     history.append(second_run)
     scope.feed(second_run, [])
-    header, arrays = unpacked(scope.frame(history))
+    header, arrays = unpack_message(scope.frame(history))
     assert (header["run"], header["trigger"], header["end"], header["number"]) == (0, 95, 100, 1)
     assert set(arrays["x_reference_um:low"].tolist()) == {7.0}
     assert scope.frame(history) is None
@@ -81,11 +81,11 @@ def test_a_roll_and_a_long_sweep_grow():
     ticks = make_stretch(0, 1500, x_reference_um=(np.arange(5000) >= 1000).astype(float))
     history.append(ticks)
     growing.feed(ticks, [])
-    header, arrays = unpacked(roll.frame(history))
+    header, arrays = unpack_message(roll.frame(history))
     assert (header["first"], header["end"], header["cause"]) == (500, 1500, "roll")
     assert arrays["tick:low"][0] == 500 + 0
     assert arrays["tick:high"][-1] == 1499
-    header, arrays = unpacked(growing.frame(history))
+    header, arrays = unpack_message(growing.frame(history))
     assert (header["complete"], header["trigger"], header["end"]) == (False, 1000, 3000)
     assert np.nanmax(arrays["tick:high"]) == 1499
     assert growing.frame(history) is None
@@ -149,7 +149,7 @@ def test_timing_covers_the_last_minute():
     for first in range(0, 90_000, 170):
         end = min(first + 170, 90_000)
         timing.feed(make_stretch(first, end, lateness_us=lateness_us, exec_us=10 * lateness_us))
-    header, arrays = unpacked(timing.frame())
+    header, arrays = unpack_message(timing.frame())
     last_minute = lateness_us[30_000:]
     assert header["window_s"] == 60
     assert header["ticks"] == arrays["counts"].sum() == 60_000

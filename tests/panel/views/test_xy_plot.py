@@ -14,7 +14,7 @@ from rtloop.panel.protocol.subscriptions import validate_field
 from rtloop.panel.service.service import Description
 from rtloop.panel.views.xy_plot import MODEL_BINS, XyPlot, extreme_indices, order_extremes
 from rtloop.signals import Signal
-from tests.panel.web.browser import unpacked
+from tests.panel.web.browser import unpack_message
 
 RATE_HZ, THRESHOLDS_V, WEIGHTS = 4000, (0.0, 1.0, 3.0, 5.0), (2.0, 1.0, 0.6, 0.4)
 NAMES = ("tick", "deadline_ns", "x_drive_v", "x_position_um", "x_reference_um", "mode")
@@ -42,7 +42,7 @@ def make_frame(drive: np.ndarray, position: np.ndarray, reference: np.ndarray) -
     history.append(Stretch(NAMES, 0, rows))
     frame = XyPlot(validate_field("xy", {"axis": "x", "seconds": 1.0}), LOOP).frame(history)
     assert frame is not None
-    return unpacked(frame)
+    return unpack_message(frame)
 
 
 def test_at_rest_there_is_noise_and_no_width_of_a_loop() -> None:

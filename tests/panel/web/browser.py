@@ -20,7 +20,7 @@ from tests.panel.route_server import Response, exchange
 TIMEOUT_S = 30.0
 
 
-def unpacked(message: Any) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+def unpack_message(message: Any) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     """Return header and arrays (float32) of a binary message, decoded by the description of the format alone."""
     size = struct.unpack_from("<I", message)[0]
     header = json.loads(message[4 : 4 + size])
@@ -82,7 +82,7 @@ class Browser:
     def next_message(self, live: ClientConnection, kind: str) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
         """Read up to the next message of a kind; return its header and arrays."""
         for message in live:
-            header, arrays = unpacked(message)
+            header, arrays = unpack_message(message)
             if header["kind"] == kind:
                 return header, arrays
         raise AssertionError(f"the connection ended without a message {kind}")

@@ -28,7 +28,7 @@ from rtloop.panel.web.rates import MAX_CLIENTS, ClientRateLimits, RateLimit, ide
 from rtloop.panel.web.security import MAX_SESSIONS, Sessions, host_name
 from rtloop.panel.web.server import MAX_CONNECTIONS, read_or_make_token
 from tests.faults.bench import Bench
-from tests.panel.web.browser import Browser, unpacked
+from tests.panel.web.browser import Browser, unpack_message
 from tests.users import ATTACKER, ROOT_ONLY, VICTIM, Raised, as_user
 
 STOP = ("POST", "/api/stop")
@@ -305,7 +305,7 @@ def test_a_client_that_never_reads_is_dropped(browser: Browser):
             "Sec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==\r\n\r\n".encode()
         )
         for message in other_live:
-            if unpacked(message)[0]["unix_s"] > 0:
+            if unpack_message(message)[0]["unix_s"] > 0:
                 break
         for _ in range(40):
             browser.next_message(other_live, "state")

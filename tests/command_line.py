@@ -1,4 +1,4 @@
-"""Commands as somebody gives them, in this process."""
+"""Commands of the command line, run in this process as a user types them."""
 
 from __future__ import annotations
 
@@ -11,18 +11,18 @@ from rtloop.cli import main
 
 
 def run(*arguments: Any) -> Result:
-    """What came of it; an exception that reached the terminal is a fault."""
+    """Run `rtloop ARGUMENTS`; return its exit code and output. An exception that is no exit fails the test."""
     result = CliRunner().invoke(main, [str(argument) for argument in arguments])
     assert result.exception is None or isinstance(result.exception, SystemExit), result.exception
     return result
 
 
 def answer(*arguments: Any, code: int = 0) -> dict[str, Any]:
-    """Its one JSON object, which strict readers take."""
+    """Run `rtloop ARGUMENTS --json`, which must end with `code`; return its JSON object, without NaN and Infinity."""
     result = run(*arguments, "--json")
     assert result.exit_code == code, result.output
-    return json.loads(result.stdout, parse_constant=_refused)
+    return json.loads(result.stdout, parse_constant=_refuse_constant)
 
 
-def _refused(constant: str) -> None:
+def _refuse_constant(constant: str) -> None:
     raise AssertionError(f"{constant} is no JSON")
