@@ -37,7 +37,7 @@ quick: $(TESTED) ## checks of names, types of imports, and the tests that finish
 # Large arrays come and go by the thousand: asking the system for the memory of each costs a quarter of some tests' time.
 test: export MALLOC_MMAP_THRESHOLD_ := 268435456
 test: export MALLOC_TRIM_THRESHOLD_ := 536870912
-test: $(TESTED) ## all checks and tests: ten minutes on two cores
+test: $(TESTED) ## all checks and tests: twelve minutes on two cores
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/pyright --pythonpath $(BIN)/python & types=$$!; \
