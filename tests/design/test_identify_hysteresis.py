@@ -1,4 +1,4 @@
-"""Hysteresis from slow sines: against the rig's own plays, and what is refused."""
+"""Hysteresis identified from slow sines, compared with the plays of drawn rigs; refusals of unsuitable recordings."""
 
 from __future__ import annotations
 
@@ -25,13 +25,14 @@ from tests.design.rigs import EQ_4, SLOW_S, drawn, slow_sine
 DRIVES = st.lists(st.floats(-10, 10), min_size=1, max_size=60)
 
 
-def run_of(drive: np.ndarray, position: np.ndarray) -> AxisRecording:
+def make_recording(drive: np.ndarray, position: np.ndarray) -> AxisRecording:
+    """Return a recording of `drive` (V) and `position` (µm) with the period SLOW_S."""
     return AxisRecording("made", SLOW_S, drive, position, position, True, "", "")
 
 
-def made_of(model: PlayModel, drive: np.ndarray, offset: float = 0.0) -> AxisRecording:
-    """A recording without noise or dynamics: a tick's position was measured before its drive was written."""
-    return run_of(drive, offset + np.concatenate([[0.0], model_output(model, drive)[:-1]]))
+def record_model(model: PlayModel, drive: np.ndarray, offset: float = 0.0) -> AxisRecording:
+    """Return a model's recording without noise or dynamics; positions were measured before the drive was written."""
+    return make_recording(drive, offset + np.concatenate([[0.0], model_output(model, drive)[:-1]]))
 
 
 @given(DRIVES)
@@ -70,7 +71,7 @@ def test_h_over_h_of_eq_4() -> None:
 @given(st.lists(st.floats(0.3, 4.0), min_size=2, max_size=8), st.floats(-5, 5))
 def test_without_noise_the_weights_come_back(slopes: list[float], offset: float) -> None:
     model = PlayModel(np.linspace(0.2, 8.0, len(slopes)), np.diff(slopes, prepend=0.0))
-    fit = identify_hysteresis([made_of(model, slow_sine(), offset)], thresholds_v=model.thresholds.tolist())
+    fit = identify_hysteresis([record_model(model, slow_sine(), offset)], thresholds_v=model.thresholds.tolist())
     assert np.allclose(fit.model.weights, model.weights, atol=1e-8)
     assert fit.offsets_um[0] == pytest.approx(offset, abs=1e-8)
     assert fit.max_error_um < 1e-8
@@ -91,34 +92,34 @@ def test_a_drawn_rig_is_found_within_one_percent_of_its_range(seed: int, placeme
 
 
 def test_several_recordings_share_the_weights_and_have_offsets_of_their_own() -> None:
-    runs = [made_of(EQ_4, slow_sine(), 1.0), made_of(EQ_4, slow_sine(5.0), -2.0)]
+    runs = [record_model(EQ_4, slow_sine(), 1.0), record_model(EQ_4, slow_sine(5.0), -2.0)]
     fit = identify_hysteresis(runs, thresholds_v=EQ_4.thresholds.tolist())
     assert np.allclose(fit.model.weights, EQ_4.weights, atol=1e-8)
     assert np.allclose(fit.offsets_um, (1.0, -2.0), atol=1e-8)
 
 
 def test_weights_that_no_inverse_has_are_found_free_and_kept_invertible_on_request() -> None:
-    true = PlayModel(np.array([0.1, 2.0, 5.0]), np.array([2.0, -2.5, 3.0]))
-    runs, given_v = [made_of(true, slow_sine())], true.thresholds.tolist()
-    free = identify_hysteresis(runs, thresholds_v=given_v, weights="free")
-    assert np.allclose(free.model.weights, true.weights)
+    model = PlayModel(np.array([0.1, 2.0, 5.0]), np.array([2.0, -2.5, 3.0]))
+    runs, thresholds_v = [record_model(model, slow_sine())], model.thresholds.tolist()
+    free = identify_hysteresis(runs, thresholds_v=thresholds_v, weights="free")
+    assert np.allclose(free.model.weights, model.weights)
     assert not free.is_invertible
     with pytest.raises(UnsuitableData, match=r"allowed: every partial sum above 0.*invertible"):
         feedforward_section(free.model, [])
-    kept = identify_hysteresis(runs, thresholds_v=given_v)
-    assert np.all(np.cumsum(kept.model.weights) >= kept.least_slope_um_per_v * (1 - 1e-9))
-    kept.model.inverse()
+    invertible = identify_hysteresis(runs, thresholds_v=thresholds_v)
+    assert np.all(np.cumsum(invertible.model.weights) >= invertible.least_slope_um_per_v * (1 - 1e-9))
+    invertible.model.inverse()
 
 
 def test_a_section_reads_back_to_the_same_bits() -> None:
-    fit = identify_hysteresis([made_of(EQ_4, slow_sine())])
+    fit = identify_hysteresis([record_model(EQ_4, slow_sine())])
     options = parse_feedforward(feedforward_section(fit.model, ["from here"]), "made")
     assert options.thresholds_v == tuple(fit.model.thresholds.tolist())
     assert options.weights_um_per_v == tuple(fit.model.weights.tolist())
 
 
 @pytest.mark.parametrize(
-    ("drive", "thresholds_v", "says"),
+    ("drive", "thresholds_v", "message"),
     [
         (
             np.linspace(0, 10, 5000),
@@ -130,16 +131,16 @@ def test_a_section_reads_back_to_the_same_bits() -> None:
         (np.array([0.0, *[10.0, -10.0] * 60]), None, "these drives do not determine 15 weights"),
     ],
 )
-def test_a_drive_that_shows_too_little_is_refused(drive: np.ndarray, thresholds_v, says: str) -> None:
-    with pytest.raises(UnsuitableData, match=says):
-        identify_hysteresis([made_of(EQ_4, drive)], thresholds_v=thresholds_v)
+def test_a_drive_that_shows_too_little_is_refused(drive: np.ndarray, thresholds_v, message: str) -> None:
+    with pytest.raises(UnsuitableData, match=message):
+        identify_hysteresis([record_model(EQ_4, drive)], thresholds_v=thresholds_v)
 
 
 @pytest.mark.parametrize("rail_um", [30.0, 42.0])
 def test_clipped_readings_are_refused(rail_um: float) -> None:
     drive = slow_sine()
     position = np.clip(
-        made_of(EQ_4, drive).position_um + np.random.default_rng(1).normal(0, 0.01, drive.size), -99, rail_um
+        record_model(EQ_4, drive).position_um + np.random.default_rng(1).normal(0, 0.01, drive.size), -99, rail_um
     )
     with pytest.raises(UnsuitableData, match="saturated: the reading stays at"):
         require_usable("made", drive, position, position / 10)
@@ -147,66 +148,66 @@ def test_clipped_readings_are_refused(rail_um: float) -> None:
 
 def test_a_whole_recording_is_not_taken_for_clipped() -> None:
     drive = slow_sine()
-    exact = made_of(EQ_4, drive).position_um
+    exact = record_model(EQ_4, drive).position_um
     require_usable("made", drive, exact, exact / 10)
     measured = drawn(7).measure(drive, SLOW_S).position_um
     require_usable("made", drive, measured, measured / 10)
 
 
 @pytest.mark.parametrize(
-    ("drive", "says"),
+    ("drive", "message"),
     [(slow_sine(0.001), "too little excitation: the position moves by"), (np.zeros(25_000), "the drive stays at 0 V")],
 )
-def test_a_position_within_its_noise_is_too_little(drive: np.ndarray, says: str) -> None:
+def test_a_position_within_its_noise_is_too_little(drive: np.ndarray, message: str) -> None:
     noise = np.random.default_rng(1).normal(0, 0.01, 25_000)
-    with pytest.raises(UnsuitableData, match=says):
+    with pytest.raises(UnsuitableData, match=message):
         require_usable("made", drive, noise, noise)
 
 
 def test_options_that_cannot_be_are_named() -> None:
     with pytest.raises(ValueError, match="placement: 'random'; allowed: auto, chebyshev, chebyshev-from-0, uniform"):
-        identify_hysteresis([run_of(np.zeros(9), np.zeros(9))], placement="random")  # type: ignore[arg-type]
+        identify_hysteresis([make_recording(np.zeros(9), np.zeros(9))], placement="random")  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="number of operators: 65; allowed: 1 to 64"):
         place_thresholds(65, 10.0, "uniform")
 
 
 @pytest.mark.parametrize("dead_band_v", [0.0, 0.1])
 def test_a_dead_band_is_found_where_there_is_one(dead_band_v: float) -> None:
-    """The stage's own thresholds are not those of the fit; noise is."""
+    """The stage has other thresholds than the fit, and noise of 20 nm."""
     thresholds = dead_band_v + np.array([0.0, 0.7, 1.9, 3.6, 5.2, 7.1])
     drive = 10 * np.sin(2 * np.pi * np.arange(30_000) / 12_000)
-    held, moved = np.zeros(thresholds.size), []
+    outputs_v, positions_um = np.zeros(thresholds.size), []
     for u in drive:
-        held = np.maximum(u - thresholds, np.minimum(u + thresholds, held))
-        moved.append(held @ [3.0, 0.5, 0.4, 0.3, 0.3, 0.2])
-    position = np.append(0.0, moved[:-1]) + np.random.default_rng(1).normal(0, 0.02, drive.size)
-    fit = identify_hysteresis([run_of(drive, position)])
+        outputs_v = np.maximum(u - thresholds, np.minimum(u + thresholds, outputs_v))
+        positions_um.append(outputs_v @ [3.0, 0.5, 0.4, 0.3, 0.3, 0.2])
+    position = np.append(0.0, positions_um[:-1]) + np.random.default_rng(1).normal(0, 0.02, drive.size)
+    fit = identify_hysteresis([make_recording(drive, position)])
     assert (fit.model.thresholds[0] > 0) == (dead_band_v > 0)
     assert fit.placement == ("chebyshev" if dead_band_v else "chebyshev-from-0")
 
 
 def test_a_wrong_sign_and_a_position_that_does_not_follow_are_named() -> None:
-    """The last position is another axis's, which moves at twice the frequency."""
+    """The last position belongs to another axis, which moves at twice the frequency."""
     drive = slow_sine()
-    run = made_of(EQ_4, drive)
+    run = record_model(EQ_4, drive)
     other_axis_um = 30.0 * np.sin(4 * np.pi * 0.1 * SLOW_S * np.arange(drive.size))
-    for wrong, says in (
+    for recording, message in (
         (
-            run_of(drive, -run.position_um),
+            make_recording(drive, -run.position_um),
             r"the sign of drive or position is wrong: .* falls by [34]\.\d+ µm per volt of drive",
         ),
         (
-            run_of(-drive, run.position_um),
+            make_recording(-drive, run.position_um),
             r"the sign of drive or position is wrong: .* falls by [34]\.\d+ µm per volt of drive",
         ),
         (
-            run_of(drive, other_axis_um),
+            make_recording(drive, other_axis_um),
             r"no sum of play operators .* error of \d+ % of the position's range; .* up to 15 %",
         ),
     ):
         for identify in (identify_hysteresis, identify_from_parts):
-            with pytest.raises(UnsuitableData, match=says):
-                identify([wrong])
+            with pytest.raises(UnsuitableData, match=message):
+                identify([recording])
 
 
 @pytest.mark.parametrize(("truth", "creeps"), [(creeping_plays, True), (preisach, False)])
@@ -220,11 +221,11 @@ def test_what_plays_leave_is_called_creep_where_a_lag_over_time_explains_it(trut
 
 
 def test_a_copy_of_a_recording_is_no_independent_evidence() -> None:
-    """By its ticks: other names and headers do not make it another measurement."""
+    """A copy is recognised by its ticks, whatever its name and header."""
     drive_v = slow_sine()
-    run = run_of(drive_v, 2.0 * drive_v)
-    other = replace(run, name="other", position_um=run.position_um + 1.0)
-    runs, sentences = distinct([run, replace(run, name="copy", digest="another"), other])
-    assert [one.name for one in runs] == [run.name, "other"]
+    run = make_recording(drive_v, 2.0 * drive_v)
+    second_run = replace(run, name="other", position_um=run.position_um + 1.0)
+    runs, sentences = distinct([run, replace(run, name="copy", digest="another"), second_run])
+    assert [kept_run.name for kept_run in runs] == [run.name, "other"]
     assert sentences == [f"copy: not used, because it is a copy of {run.name}, with the same ticks"]
     assert distinct([replace(run, name="copy")], [run])[0] == []

@@ -1,4 +1,4 @@
-"""Dynamics from a recording that does not begin at rest: its free motion is found, and none where there is none."""
+"""Dynamics from recordings that begin in motion or at rest: free motion is reported only where the plant has it."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ RATE_HZ, HZ, ZETA, GAIN, NOISE_UM = 20_000.0, 1150.0, 0.03, 3.2, 0.004
 
 
 def recording(samples: int, skipped: int) -> Excitation:
-    """A random drive through ω²/(s² + 2ζω s + ω²), held over each tick; the recording begins after `skipped` ticks."""
+    """Return a random drive (V) and its position behind GAIN ω²/(s² + 2ζω s + ω²), without `skipped` first ticks."""
     rng = np.random.default_rng(3)
     drive_v = np.repeat(rng.uniform(-0.5, 0.5, (samples + skipped) // 2), 2)
     omega = 2 * np.pi * HZ

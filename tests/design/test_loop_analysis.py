@@ -60,7 +60,7 @@ def test_paper_step_eqs_5_and_20() -> None:
 
 
 def test_step_overshoot_of_d_eq_5() -> None:
-    """14.474 % of D(0), where the text of the paper says 9.5 %. The loop is opened by an all but absent controller."""
+    """14.474 % of D(0), where the text of the paper says 9.5 %. A gain of 1e-9 leaves the loop practically open."""
     response = step_response(continuous_loop(Transfer.from_zpk([], [], 1e-9), PAPER_D), 0.1)
     assert 100 * (response.position.max() / 1e-9 / 1.01086419 - 1) == pytest.approx(14.474, abs=0.02)
 
@@ -81,7 +81,7 @@ def test_resonance_shift_tolerated_by_the_paper() -> None:
 
 
 @pytest.mark.parametrize(
-    ("method", "prewarp_hz", "none", "one"),
+    ("method", "prewarp_hz", "without_delay", "with_delay"),
     [
         ("matched", None, 1.640, 1.558),
         ("tustin", None, 4.894, 6.764),
@@ -89,11 +89,11 @@ def test_resonance_shift_tolerated_by_the_paper() -> None:
         ("foh", None, 1.647, 1.549),
     ],
 )
-def test_sensitivity_peak_as_it_runs(method, prewarp_hz, none, one) -> None:
+def test_sensitivity_peak_as_it_runs(method, prewarp_hz, without_delay, with_delay) -> None:
     """max|S| of eqs (5) and (20) at 10 kHz with 0 and 1 samples of delay, computed independently."""
     controller = discretise_controller(PAPER_C, T, method, prewarp_hz)
-    assert analyse_discrete(controller, PAPER_D, 0).max_sensitivity == pytest.approx(none, abs=1e-3)
-    assert analyse_discrete(controller, PAPER_D, 1).max_sensitivity == pytest.approx(one, abs=1e-3)
+    assert analyse_discrete(controller, PAPER_D, 0).max_sensitivity == pytest.approx(without_delay, abs=1e-3)
+    assert analyse_discrete(controller, PAPER_D, 1).max_sensitivity == pytest.approx(with_delay, abs=1e-3)
 
 
 def test_static_values_survive_sampling() -> None:
@@ -106,10 +106,10 @@ def test_static_values_survive_sampling() -> None:
 
 
 def test_discrete_step_equals_a_simulation_tick_by_tick() -> None:
-    """An oracle from scipy.linalg.expm, with the delay as a queue."""
+    """The oracle steps the plant by scipy.linalg.expm, with the delay as a queue."""
     a, b = np.array([[0.0, 1.0], [-9e4, -40.0]]), np.array([0.0, 9e4])
-    grown = linalg.expm(np.block([[a, b[:, None]], [np.zeros((1, 3))]]) * 1e-3)
-    ad, bd = grown[:2, :2], grown[:2, 2]
+    exponential = linalg.expm(np.block([[a, b[:, None]], [np.zeros((1, 3))]]) * 1e-3)
+    ad, bd = exponential[:2, :2], exponential[:2, 2]
     x, integral, queue, positions, commands = np.zeros(2), 0.0, [0.0, 0.0], [], []
     for _ in range(200):
         positions.append(x[0])
@@ -180,7 +180,7 @@ def test_unstable_loop_is_reported_not_raised() -> None:
 
 
 def test_undamped_plant_can_be_looked_at() -> None:
-    """An undamped resonance lies on the axis itself, where the plant has no response."""
+    """The poles of an undamped resonance lie on the imaginary axis, where the plant has no finite response."""
     plant = Transfer.from_factors(1e6, [], [[1, 0, 1e6]])
     analysis = analyse_continuous(Transfer.from_factors(0.2, [[1, 0]], [[1, 500]]), plant)
     assert analysis.stable
@@ -188,17 +188,17 @@ def test_undamped_plant_can_be_looked_at() -> None:
 
 
 def test_shifted_resonance_keeps_damping_and_static_gain() -> None:
-    moved = shift_resonance(PAPER_D, 2.0)
-    assert moved.dc_gain == pytest.approx(PAPER_D.dc_gain)
+    shifted = shift_resonance(PAPER_D, 2.0)
+    assert shifted.dc_gain == pytest.approx(PAPER_D.dc_gain)
     sizes = np.abs(PAPER_D.poles)
     lightest = np.argmin(np.abs(PAPER_D.poles + 27.5 - 3741.5j))
-    assert np.min(np.abs(moved.poles - 1.02 * PAPER_D.poles[lightest])) < 1e-9 * sizes[lightest]
+    assert np.min(np.abs(shifted.poles - 1.02 * PAPER_D.poles[lightest])) < 1e-9 * sizes[lightest]
     with pytest.raises(ValueError, match="all poles are real"):
         shift_resonance(Transfer.from_zpk([], [-1], 1), 1.0)
 
 
 def test_delay_margin_of_an_integrator() -> None:
-    """L = ω_c/s has 90° left at ω_c, at which a delay of a quarter of the circle's time takes them."""
+    """L = ω_c/s has a phase margin of 90° at ω_c; a delay of a quarter period of ω_c uses it up."""
     loop = continuous_loop(Transfer.from_zpk([], [0.0], 400.0), Transfer.from_zpk([], [-1e7], 1e7))
     assert delay_margin(loop) == pytest.approx((np.pi / 2 / 400.0, 400.0 / (2 * np.pi)), rel=1e-3)
 

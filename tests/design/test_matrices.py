@@ -1,4 +1,4 @@
-"""Functions of matrices and grids agree with those of scipy and numpy, which compute them in other ways."""
+"""Functions of matrices and grids agree with scipy and numpy, which use other algorithms."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A closed loop's response from a multisine, against loops of known transfer function that scipy simulates."""
+"""Response of a closed loop from a multisine, compared with loops of known transfer function, simulated by scipy."""
 
 from __future__ import annotations
 
@@ -30,101 +30,102 @@ LOOPS = (
 )
 
 
-def whole(lines: LineGrid, found: dict[str, np.ndarray], periods: int) -> PeriodSignals:
-    parts = (found[name][lines.samples : (periods + 1) * lines.samples].reshape(periods, -1)
+def split_periods(lines: LineGrid, signals: dict[str, np.ndarray], periods: int) -> PeriodSignals:
+    """Return the signals of `periods` periods of the multisine, without the first."""
+    parts = (signals[name][lines.samples : (periods + 1) * lines.samples].reshape(periods, -1)
              for name in ("error_um", "command_um", "position_um"))  # fmt: skip
     return PeriodSignals(*parts)
 
 
-def measured(loop: TrueLoop, near_hz: float, periods: int = 4, seed: int = 0) -> tuple[LoopMeasurement, float]:
-    """As a service does it; and how far the true position went, in any of the runs."""
+def measure(loop: TrueLoop, near_hz: float, periods: int = 4, seed: int = 0) -> tuple[LoopMeasurement, float]:
+    """Measure a loop as the service does. Return the measurement and the largest |true position| (µm) of all runs."""
     lines = make_grid(RATE_HZ, 1.0, 2.0, 4400.0, near_hz)
-    period, furthest = excitation.first_period(lines, AMPLITUDE_UM), 0.0
-    found = loop.run(excitation_sequence(period, 2, 0.0, FADE), seed)
-    for aim in excitation.AMPLITUDE_RATIOS:
-        furthest = max(furthest, float(np.abs(found["true_um"]).max()))
-        period = excitation.shape_period(lines, period, whole(lines, found, 2), AMPLITUDE_UM, aim)
-        count = periods if aim == excitation.AMPLITUDE_RATIOS[-1] else 2
-        found = loop.run(excitation_sequence(period, count, 0.0, FADE), seed + 1)
-    return measure_loop(found, RATE_HZ, near_hz), max(furthest, float(np.abs(found["true_um"]).max()))
+    period, furthest_um = excitation.first_period(lines, AMPLITUDE_UM), 0.0
+    signals = loop.run(excitation_sequence(period, 2, 0.0, FADE), seed)
+    for ratio in excitation.AMPLITUDE_RATIOS:
+        furthest_um = max(furthest_um, float(np.abs(signals["true_um"]).max()))
+        period = excitation.shape_period(lines, period, split_periods(lines, signals, 2), AMPLITUDE_UM, ratio)
+        count = periods if ratio == excitation.AMPLITUDE_RATIOS[-1] else 2
+        signals = loop.run(excitation_sequence(period, count, 0.0, FADE), seed + 1)
+    return measure_loop(signals, RATE_HZ, near_hz), max(furthest_um, float(np.abs(signals["true_um"]).max()))
 
 
 @pytest.mark.parametrize("loop", LOOPS, ids=lambda loop: f"{loop.hz:g} Hz, delay {loop.delay_ticks}")
 def test_margins_are_those_of_the_loop_and_the_position_keeps_within_the_amplitude(loop: TrueLoop) -> None:
-    found, furthest_um = measured(loop, near_hz=1.05 * loop.hz)
-    true = loop.margins(found.response.hz[0], found.response.hz[-1])
-    assert found.margins.gain_margin.value == pytest.approx(true["gain_margin"], rel=0.02)
-    assert found.margins.phase_margin_deg.value == pytest.approx(true["phase_margin_deg"], abs=2.0)
-    assert found.margins.modulus_margin.value == pytest.approx(true["modulus_margin"], rel=0.02)
+    measurement, furthest_um = measure(loop, near_hz=1.05 * loop.hz)
+    true = loop.margins(measurement.response.hz[0], measurement.response.hz[-1])
+    assert measurement.margins.gain_margin.value == pytest.approx(true["gain_margin"], rel=0.02)
+    assert measurement.margins.phase_margin_deg.value == pytest.approx(true["phase_margin_deg"], abs=2.0)
+    assert measurement.margins.modulus_margin.value == pytest.approx(true["modulus_margin"], rel=0.02)
     assert furthest_um <= AMPLITUDE_UM
 
 
 @pytest.mark.parametrize("noise_um", [0.010, 0.100])
 @pytest.mark.parametrize("shift", [-0.1, 0.0, 0.1])
 def test_a_shifted_resonance_is_found(shift: float, noise_um: float) -> None:
-    """0.06 % at 10 nm and 0.25 % at 100 nm are what retuning needs."""
+    """Retuning needs 0.06 % with noise of 10 nm, and 0.25 % with 100 nm."""
     loop = TrueLoop(595.5 * (1 + shift), 0.007, 1, 20.0, noise_um=noise_um)
-    found, _ = measured(loop, near_hz=595.5)
-    assert found.mode is not None
-    assert found.mode.hz == pytest.approx(loop.hz, rel=0.0006 if noise_um == 0.010 else 0.0025)
-    assert abs(found.mode.hz - loop.hz) < 4 * found.mode.hz_std
-    assert abs(found.mode.damping - loop.damping) < 4 * found.mode.damping_std
+    measurement, _ = measure(loop, near_hz=595.5)
+    assert measurement.mode is not None
+    assert measurement.mode.hz == pytest.approx(loop.hz, rel=0.0006 if noise_um == 0.010 else 0.0025)
+    assert abs(measurement.mode.hz - loop.hz) < 4 * measurement.mode.hz_std
+    assert abs(measurement.mode.damping - loop.damping) < 4 * measurement.mode.damping_std
 
 
 def test_standard_deviations_are_those_of_repeated_measurements() -> None:
     loop = TrueLoop(595.5, 0.007, 1, 40.0)
     lines = make_grid(RATE_HZ, 0.5, 4.0, 4400.0, 595.5)
-    period = excitation.fit_period(lines, *_answers(loop, lines), AMPLITUDE_UM)
+    period = excitation.fit_period(lines, *_responses(loop, lines), AMPLITUDE_UM)
     reference = excitation_sequence(period, 3, 0.0, FADE)
     errors, squares = [], []
     for seed in range(20):
-        found = measure_response(lines, whole(lines, loop.run(reference, seed), 3))
+        response = measure_response(lines, split_periods(lines, loop.run(reference, seed), 3))
         true = loop.open(lines.hz)
-        squares.append(np.abs(found.plant * found.controller / true - 1) ** 2 / found.spread**2)
-        mode = fit_light_mode(found, RATE_HZ, 595.5)
+        squares.append(np.abs(response.plant * response.controller / true - 1) ** 2 / response.spread**2)
+        mode = fit_light_mode(response, RATE_HZ, 595.5)
         assert mode is not None
         errors.append((mode.hz - loop.hz) / mode.hz_std)
-    known = np.mean(squares, axis=0)[lines.hz < 1000]
-    assert np.median(known) == pytest.approx(1.0, abs=0.25)
+    mean_squares = np.mean(squares, axis=0)[lines.hz < 1000]
+    assert np.median(mean_squares) == pytest.approx(1.0, abs=0.25)
     assert np.sqrt(np.mean(np.square(errors))) == pytest.approx(1.0, abs=0.45)
 
 
 def test_a_margin_says_how_far_off_it_is_where_the_light_mode_decides_it() -> None:
-    """Between the lines about the mode, a margin is no more certain than the mode's frequency and damping."""
+    """A margin between the lines around the mode is as uncertain as the mode's frequency and damping."""
     loop = TrueLoop(150.0, 0.02, 0, 20.0)
     lines = make_grid(RATE_HZ, 1.0, 2.0, 4400.0, loop.hz)
     period = excitation.first_period(lines, AMPLITUDE_UM)
-    for aim in excitation.AMPLITUDE_RATIOS:
-        before = loop.run(excitation_sequence(period, 2, 0.0, FADE), seed=99)
-        period = excitation.shape_period(lines, period, whole(lines, before, 2), AMPLITUDE_UM, aim)
+    for ratio in excitation.AMPLITUDE_RATIOS:
+        signals = loop.run(excitation_sequence(period, 2, 0.0, FADE), seed=99)
+        period = excitation.shape_period(lines, period, split_periods(lines, signals, 2), AMPLITUDE_UM, ratio)
     reference, true = excitation_sequence(period, 4, 0.0, FADE), loop.margins(lines.hz[0], lines.hz[-1])
-    found = [measure_loop(loop.run(reference, seed), RATE_HZ, loop.hz).margins for seed in range(20)]
+    measured_margins = [measure_loop(loop.run(reference, seed), RATE_HZ, loop.hz).margins for seed in range(20)]
     for name in ("gain_margin", "modulus_margin"):
-        off = [(getattr(one, name).value - true[name]) / getattr(one, name).std for one in found]
-        assert 0.6 < np.sqrt(np.mean(np.square(off))) < 1.7  # without the mode's own uncertainty: 2.3
+        errors = [(getattr(run, name).value - true[name]) / getattr(run, name).std for run in measured_margins]
+        assert 0.6 < np.sqrt(np.mean(np.square(errors))) < 1.7  # without the mode's own uncertainty: 2.3
 
 
-def _answers(loop: TrueLoop, lines: LineGrid) -> tuple[np.ndarray, np.ndarray]:
-    """Position and command per reference."""
+def _responses(loop: TrueLoop, lines: LineGrid) -> tuple[np.ndarray, np.ndarray]:
+    """Return the responses of position and command to the reference, at the excited lines."""
     opened = loop.open(lines.hz)
     z = np.exp(2j * np.pi * lines.hz / RATE_HZ)
     return opened / (1 + opened), (loop.kp + loop.ki_per_s / RATE_HZ / (z - 1)) / (1 + opened)
 
 
 def test_what_is_not_linear_is_told_from_noise() -> None:
-    """A command that is bent repeats itself from period to period: differences between them show nothing of it."""
+    """Distortion repeats itself in every period: the differences between periods do not show it."""
     loop = TrueLoop(595.5, 0.02, 0, 40.0, noise_um=1e-4)
     lines = make_grid(RATE_HZ, 0.25, 8.0, 2000.0, 595.5)
-    reference = excitation_sequence(excitation.fit_period(lines, *_answers(loop, lines), AMPLITUDE_UM), 2, 0.0, FADE)
-    straight = measure_response(lines, whole(lines, loop.run(reference), 2))
-    bent = measure_response(lines, whole(lines, loop.run(reference, bend=lambda v: v + 5.0 * v**2), 2))
-    assert np.median(straight.spread / straight.spread_of_noise) < 2
-    assert np.median(bent.spread / bent.spread_of_noise) > 10
+    reference = excitation_sequence(excitation.fit_period(lines, *_responses(loop, lines), AMPLITUDE_UM), 2, 0.0, FADE)
+    linear = measure_response(lines, split_periods(lines, loop.run(reference), 2))
+    distorted = measure_response(lines, split_periods(lines, loop.run(reference, bend=lambda v: v + 5.0 * v**2), 2))
+    assert np.median(linear.spread / linear.spread_of_noise) < 2
+    assert np.median(distorted.spread / distorted.spread_of_noise) > 10
 
 
 def test_where_nothing_stands_out_there_is_no_light_mode() -> None:
-    found, _ = measured(TrueLoop(595.5, 0.9, 0, 40.0), near_hz=1000.0)
-    assert found.mode is None
+    measurement, _ = measure(TrueLoop(595.5, 0.9, 0, 40.0), near_hz=1000.0)
+    assert measurement.mode is None
 
 
 @settings(max_examples=25, deadline=None)
@@ -165,13 +166,13 @@ def test_the_multisine_is_found_in_a_record_from_itself_alone() -> None:
     lines = make_grid(RATE_HZ, 0.5, 10.0, 1000.0)
     small = excitation_sequence(excitation.first_period(lines, 1.0), 2, 7.0, FADE)
     large = excitation_sequence(3 * excitation.first_period(lines, 1.0), 4, 7.0, FADE)
-    rest = np.full(3000, 7.0)
+    pause = np.full(3000, 7.0)
     ramp = 7.0 + 0.001 * np.arange(20_000)
-    part = find_periodic_part(np.concatenate([rest, small, rest, large, rest, ramp]))
+    part = find_periodic_part(np.concatenate([pause, small, pause, large, pause, ramp]))
     assert part is not None
     assert (part.samples, part.periods) == (lines.samples, 4)
     assert part.start == 3000 + small.size + 3000 + lines.samples
-    assert np.array_equal(part.grid(np.concatenate([rest, small, rest, large]), RATE_HZ).excited, lines.excited)
+    assert np.array_equal(part.grid(np.concatenate([pause, small, pause, large]), RATE_HZ).excited, lines.excited)
 
 
 def test_of_a_multisine_that_begins_at_once_the_first_period_is_left_out() -> None:
@@ -185,19 +186,19 @@ def test_of_a_multisine_that_begins_at_once_the_first_period_is_left_out() -> No
 
 
 def test_a_short_move_before_the_multisine_does_not_count_as_time_to_settle() -> None:
-    """The first period is left to settle, whatever the reference did long before."""
+    """The first period is excluded for settling, whatever the reference did before."""
     lines = make_grid(RATE_HZ, 0.5, 10.0, 1000.0)
     move = np.array([0.0, 0.1, 0.2, 0.3])
-    rest = np.full(6000, 0.3)
+    pause = np.full(6000, 0.3)
     tone = 0.3 + np.tile(excitation.first_period(lines, 1.0), 4)
-    part = find_periodic_part(np.concatenate([move, rest, tone, rest]))
+    part = find_periodic_part(np.concatenate([move, pause, tone, pause]))
     assert part is not None
     assert part.periods == 3
-    assert abs(part.start - (move.size + rest.size + lines.samples)) <= 1
+    assert abs(part.start - (move.size + pause.size + lines.samples)) <= 1
 
 
 def test_the_misfit_of_a_mode_is_one_where_noise_is_all_that_is_left() -> None:
-    """Of pairs of numbers with eight and two parameters taken off: few lines show whether they are counted."""
+    """The misfit of only 14 lines shows whether the fitted parameters are subtracted from the degrees of freedom."""
     hz = 595.5 * np.linspace(0.9, 1.1, 14)
     z = np.exp(2j * np.pi * hz / RATE_HZ)
     pole = np.exp(2 * np.pi * 595.5 / RATE_HZ * (-0.01 + 1j * np.sqrt(1 - 0.01**2)))
@@ -212,15 +213,15 @@ def test_the_misfit_of_a_mode_is_one_where_noise_is_all_that_is_left() -> None:
         assert mode is not None
         modes.append(mode)
     assert np.mean([mode.misfit**2 for mode in modes]) == pytest.approx(1.0, abs=0.1)
-    off = [(mode.hz - 595.5) / mode.hz_std for mode in modes]
-    assert np.sqrt(np.mean(np.square(off))) == pytest.approx(0.95, abs=0.2)  # a misfit below 1 does not narrow them
+    errors = [(mode.hz - 595.5) / mode.hz_std for mode in modes]
+    assert np.sqrt(np.mean(np.square(errors))) == pytest.approx(0.95, abs=0.2)  # a misfit below 1 does not narrow them
 
 
 def test_curves_of_a_measurement_are_those_of_its_loop_and_of_the_models() -> None:
-    """S = 1/(1 + L); where L is off by a fraction, S is off by |T| of it."""
+    """S = 1/(1 + L): a relative error of L changes S by |T| times that fraction."""
     loop = TrueLoop(595.5, 0.02, 1, 40.0, noise_um=1e-3)
     lines = make_grid(RATE_HZ, 0.5, 4.0, 2000.0, 595.5)
-    reference = excitation_sequence(excitation.fit_period(lines, *_answers(loop, lines), AMPLITUDE_UM), 3, 0.0, FADE)
+    reference = excitation_sequence(excitation.fit_period(lines, *_responses(loop, lines), AMPLITUDE_UM), 3, 0.0, FADE)
     controller = discretise_controller(Transfer.from_zpk([], [0.0], 30.0), 1 / RATE_HZ)
     model = discrete_loop(controller, Transfer.from_zpk([], [-900.0], 900.0))
     curves = measure_loop(loop.run(reference), RATE_HZ, 595.5, model).for_json()["response"]
@@ -243,28 +244,28 @@ def test_a_reference_without_a_multisine_is_refused(reference: np.ndarray) -> No
 def test_a_period_with_a_missed_tick_is_left_out() -> None:
     loop = TrueLoop(595.5, 0.02, 0, 40.0)
     lines = make_grid(RATE_HZ, 0.25, 8.0, 2000.0, 595.5)
-    found = loop.run(excitation_sequence(excitation.first_period(lines, 1.0), 4, 0.0, FADE))
-    missed = np.zeros(found["reference_um"].size)
+    signals = loop.run(excitation_sequence(excitation.first_period(lines, 1.0), 4, 0.0, FADE))
+    missed = np.zeros(signals["reference_um"].size)
     missed[round(2.5 * lines.samples)] = 1.0
-    assert measure_loop({**found, "periods_missed": missed}, RATE_HZ).response.periods == 3
+    assert measure_loop({**signals, "periods_missed": missed}, RATE_HZ).response.periods == 3
     missed[lines.samples :: lines.samples] = 1.0
     with pytest.raises(ValueError, match=r"periods of the multisine in the recording: \d; allowed: at least 2"):
-        measure_loop({**found, "periods_missed": missed}, RATE_HZ)
+        measure_loop({**signals, "periods_missed": missed}, RATE_HZ)
 
 
 def test_what_reaches_the_command_past_the_controller_is_not_the_controllers() -> None:
-    """A second row of taps, and a second column: the loop is the same, the error another."""
+    """Command taps and feedforward change the recorded error, but not the loop."""
     loop = TrueLoop(595.5, 0.02, 1, 40.0, noise_um=1e-4)
     lines = make_grid(RATE_HZ, 0.5, 4.0, 2000.0, 595.5)
-    reference = excitation_sequence(excitation.fit_period(lines, *_answers(loop, lines), AMPLITUDE_UM), 3, 0.0, FADE)
+    reference = excitation_sequence(excitation.fit_period(lines, *_responses(loop, lines), AMPLITUDE_UM), 3, 0.0, FADE)
     taps, feed = [0.3, -0.1, 0.05], 0.2 * np.roll(reference, 7)
-    past = signal.lfilter(taps, 1.0, reference) + feed
-    found = loop.run(reference, past=past)
-    with_it = measure_loop({**found, "feed_um": feed}, RATE_HZ, 595.5, command_taps=taps)
-    without = measure_loop(found, RATE_HZ, 595.5)
+    path_um = signal.lfilter(taps, 1.0, reference) + feed
+    signals = loop.run(reference, past=path_um)
+    with_paths = measure_loop({**signals, "feed_um": feed}, RATE_HZ, 595.5, command_taps=taps)
+    without_paths = measure_loop(signals, RATE_HZ, 595.5)
     true = loop.open(lines.hz)
-    assert np.median(np.abs(with_it.response.plant * with_it.response.controller / true - 1)) < 1e-3
-    assert np.median(np.abs(without.response.plant * without.response.controller / true - 1)) > 0.1
+    assert np.median(np.abs(with_paths.response.plant * with_paths.response.controller / true - 1)) < 1e-3
+    assert np.median(np.abs(without_paths.response.plant * without_paths.response.controller / true - 1)) > 0.1
 
 
 def test_a_margin_without_a_standard_deviation_is_shown():

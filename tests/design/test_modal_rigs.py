@@ -1,4 +1,4 @@
-"""Strictly proper rigs by the whole chain (forty in tests.soak.chain), and the stage that the pages walk through."""
+"""The design chain on strictly proper random rigs (forty in tests.soak.chain) and on the documentation's stage."""
 
 import json
 from pathlib import Path
@@ -27,7 +27,7 @@ ONE_MODE_LATE_BY_3, TWO_MODES_LATE_BY_1 = 14, 38
 
 @pytest.mark.parametrize("seed", [ONE_MODE_LATE_BY_3, TWO_MODES_LATE_BY_1])
 def test_a_rig_drawn_at_random_gets_a_loop_that_runs(tmp_path, seed) -> None:
-    """Modes and delay are the rig's own; the loop meets its specification on the model, and runs on the rig."""
+    """The rig's modes and delay are identified; the loop meets its specification on the model, and runs on the rig."""
     rig = modal_rig(seed)
     chain, written = designed_for(rig, tmp_path)
     assert chain.stage.dynamics.delay_ticks == rig.delay_ticks > 0
@@ -62,11 +62,11 @@ def test_the_stage_of_ones_own_keeps_its_specification(tmp_path, monkeypatch) ->
     assert axis.interlocks.oscillation_swings > 0
     trips, _ = run(out, prepare(load(out)).checks[0].running)
     assert trips == []
-    monkeypatch.setattr(theme, "THEMES", {"light": theme.LIGHT})  # both are drawn where a report is looked at
-    _experiments_speak_of_the_stage_alone(load(out), tmp_path)
+    monkeypatch.setattr(theme, "THEMES", {"light": theme.LIGHT})  # one theme is enough here; users get both
+    _check_experiment_reports(load(out), tmp_path)
 
 
-ASKED_FOR: dict[str, dict[str, object]] = {
+EXPERIMENT_OPTIONS: dict[str, dict[str, object]] = {
     "characterise": {"frequency_hz": 1.0},
     "step-response": {},
     "compensation": {},
@@ -75,24 +75,26 @@ ASKED_FOR: dict[str, dict[str, object]] = {
     "harmonic": {"frequencies_hz": (0.5, 5.0, 60.0, 790.0, 800.0, 810.0, 1200.0)},
     "disturbance": {},
 }
-"""All but robustness, which is run as a command; what is set makes them shorter."""
+"""Options that shorten the experiments; all experiments but robustness, which is run as a command."""
 
 
-def _experiments_speak_of_the_stage_alone(made: Configuration, folder: Path) -> None:
-    """What they find is beside the stage's specification and its own models, and what nobody set fits its limits."""
-    asked = load_specification(DEPLOY / "own-stage-spec.toml").design.specification
-    stage = Setting(made.loop.rate_hz, made.axes[0], is_virgin=True, specification=asked)
-    values = asked.model_dump(mode="json", exclude_defaults=True)
+def _check_experiment_reports(made: Configuration, folder: Path) -> None:
+    """Check that experiments compare the stage with its specification and models, and that defaults fit its limits."""
+    specification = load_specification(DEPLOY / "own-stage-spec.toml").design.specification
+    stage = Setting(made.loop.rate_hz, made.axes[0], is_virgin=True, specification=specification)
+    values = specification.model_dump(mode="json", exclude_defaults=True)
     files = []
-    for name, given in ASKED_FOR.items():
+    for name, raw_options in EXPERIMENT_OPTIONS.items():
         experiment = EXPERIMENTS[name]
-        options = experiment.fit_options(experiment.options.model_validate(given), stage)
+        options = experiment.fit_options(experiment.options.model_validate(raw_options), stage)
         runs = experiment.runs(options, stage)
-        for number, one in enumerate(runs):
-            text = derive_configuration(made, "x", name, options.model_dump(mode="json"), one, len(runs), values).text
-            files += record(folder / f"{name}-{number}.mcap", text, one.timeline.ticks)
-    takings = load_runs(files)
-    content = make_report(takings).content
+        for number, planned_run in enumerate(runs):
+            text = derive_configuration(
+                made, "x", name, options.model_dump(mode="json"), planned_run, len(runs), values
+            ).text
+            files += record(folder / f"{name}-{number}.mcap", text, planned_run.timeline.ticks)
+    recorded_runs = load_runs(files)
+    content = make_report(recorded_runs).content
     assert not any(word in json.dumps(content, ensure_ascii=False).lower() for word in ("paper", "eq (", "fig "))
     rows = {row["quantity"]: row for section in content["experiments"] for row in section["rows"]}
     assert {section["problem"] for section in content["experiments"]} == {None}
@@ -100,8 +102,8 @@ def _experiments_speak_of_the_stage_alone(made: Configuration, folder: Path) -> 
     assert rows["settling time to 5 %, median"]["met"]
     assert rows["remaining error at 2.9 Hz"]["met"]
     assert rows["remaining error at 50 Hz"]["met"] is None  # asked up to 5 Hz
-    disturbed = [taken for taken in takings if taken.experiment == "disturbance"]
-    curves = EXPERIMENTS["disturbance"].analyse(disturbed, options).curves  # of the last one
+    disturbed = [recorded_run for recorded_run in recorded_runs if recorded_run.experiment == "disturbance"]
+    curves = EXPERIMENTS["disturbance"].analyse(disturbed, options).curves  # of the last run
     assert curves["time_ms"] == pytest.approx(0.1 * np.arange(1500))  # 150 ms of ticks of 0.1 ms, from the step on
     assert 0.0 < curves["time_ms"][np.abs(curves["step"]).argmax()] < 10.0
     for quantity in (
@@ -112,7 +114,7 @@ def _experiments_speak_of_the_stage_alone(made: Configuration, folder: Path) -> 
 
 
 def test_no_loop_is_designed_on_a_model_that_explains_nothing(tmp_path) -> None:
-    """Two modes by one pole."""
+    """A model with one pole cannot describe two modes."""
     with pytest.raises(
         UnsuitableData, match=r"no model explains the step. The best model has order 1, .* Use a step up and down"
     ):

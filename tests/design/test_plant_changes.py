@@ -1,4 +1,4 @@
-"""Changes of a plant, one at a time: what moves and what stays."""
+"""Changes of a plant, one at a time: one property changes and the others stay."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def test_gain_changes_alone() -> None:
 
 
 def test_a_search_ends_at_half_the_frequency_and_before_damping_reaches_one() -> None:
-    """Beyond ±50 % nobody speaks of a shifted resonance; a damping ratio of 1 has no resonance."""
+    """The search range of the resonance is ±50 %; a damping ratio of 1 has no resonance."""
     changes = plant_changes(PLANT)
     assert list(changes) == ["resonance", "damping", "gain"]
     assert changes["resonance"][1:3] == (50.0, 50.0)
