@@ -22,7 +22,7 @@ SYSTEMS = {"eq 5": PAPER_D, "eq 20": PAPER_C, "order 20": ORDER_20, "far apart":
 
 
 def balanced_50_digits(transfer: Transfer):
-    """Poles and residues, Gramians in modal coordinates, eigenvectors of their product: all at 50 digits."""
+    """Return a balanced a, b, c, d and the Hankel singular values, from residues and modal Gramians at 50 digits."""
     mp.mp.dps = 50
     zeros, poles = ([mp.mpc(complex(root)) for root in roots] for roots in (transfer.zeros, transfer.poles))
     n = len(poles)
@@ -31,8 +31,8 @@ def balanced_50_digits(transfer: Transfer):
         value = mp.mpf(transfer.gain)
         for zero in zeros:
             value *= pole - zero
-        for j, other in enumerate(poles):
-            value /= pole - other if i != j else 1
+        for j, other_pole in enumerate(poles):
+            value /= pole - other_pole if i != j else 1
         residues.append(value)
     p = mp.matrix(n, n)
     q = mp.matrix(n, n)
@@ -42,20 +42,20 @@ def balanced_50_digits(transfer: Transfer):
             q[i, j] = -mp.conj(residues[i]) * residues[j] / (mp.conj(poles[i]) + poles[j])
     values, vectors = mp.eig(p * q)
     falling = sorted(range(n), key=lambda i: -values[i].real)
-    turn = mp.matrix(n, n)
+    transformation = mp.matrix(n, n)
     for column, i in enumerate(falling):
         for row in range(n):
-            turn[row, column] = vectors[row, i]
-    back = turn**-1
-    a = back * mp.diag(poles) * turn
-    b = back * mp.matrix([1] * n)
-    c = mp.matrix([residues]) * turn
+            transformation[row, column] = vectors[row, i]
+    inverse = transformation**-1
+    a = inverse * mp.diag(poles) * transformation
+    b = inverse * mp.matrix([1] * n)
+    c = mp.matrix([residues]) * transformation
     hankel = [float(mp.sqrt(abs(values[i].real))) for i in falling]
     return a, b, c, mp.mpf(transfer.high_frequency_gain), np.array(hankel)
 
 
 def response_50_digits(parts, keep: int, method: str, s: complex) -> complex:
-    """Of the truncated or residualised system; balancing up to a scale of each state is enough for both."""
+    """Return the truncated or residualised system's response at `s`; balancing up to scales of the states is enough."""
     a, b, c, d, _ = parts
     n = a.rows
     system = mp.mpc(s) * mp.eye(n) - a
@@ -71,11 +71,11 @@ def test_hankel_singular_values_and_reduction_at_50_digits(name) -> None:
     """Relative accuracy of each value above 1e-13 of the largest, and of the reduced response over all frequencies."""
     transfer = SYSTEMS[name]
     parts = balanced_50_digits(transfer)
-    found, exact = hankel_singular_values(transfer), parts[-1]
+    computed, exact = hankel_singular_values(transfer), parts[-1]
     count = int(np.sum(exact > 1e-13 * exact[0]))
-    assert found.size >= count
-    assert np.max(np.abs(found[:count] - exact[:count])) < 1e-12 * exact[0]
-    assert found[:count] == pytest.approx(exact[:count], rel=1e-6)
+    assert computed.size >= count
+    assert np.max(np.abs(computed[:count] - exact[:count])) < 1e-12 * exact[0]
+    assert computed[:count] == pytest.approx(exact[:count], rel=1e-6)
     gaps = np.flatnonzero(exact[:-1] > 1.05 * exact[1:]) + 1
     keep = int(gaps[len(gaps) // 2])
     points = 1j * np.geomspace(1e-2, 1e7, 12)
@@ -86,7 +86,7 @@ def test_hankel_singular_values_and_reduction_at_50_digits(name) -> None:
 
 
 def test_a_lag_has_half_its_gain() -> None:
-    """σ of k/(τs + 1) is k/2, and nothing of it changes when nothing is left out."""
+    """σ of k/(τs + 1) is k/2, and a reduction to the same order keeps pole and gain."""
     lag = Transfer.from_factors(6.0, [], [[0.25, 1.0]])
     assert hankel_singular_values(lag) == pytest.approx([3.0], rel=1e-14)
     same = reduce_order(lag, 1).transfer
@@ -126,9 +126,9 @@ def test_modes_that_are_not_stable_stay() -> None:
 
 
 def test_repeated_poles_are_reduced_through_lyapunov_equations() -> None:
-    """1/(s + 1)³: σ from its Gramians in exact arithmetic by 50 digits of slightly parted poles."""
+    """The oracle for 1/(s + 1)³ is σ at 50 digits for poles that are 1e-4 apart."""
     triple = Transfer.from_factors(1.0, [], [[1, 1], [1, 1], [1, 1]])
-    parted = Transfer.from_zpk([], [-1.0, -1.0 - 1e-4, -1.0 + 1e-4], 1.0)
-    assert hankel_singular_values(triple) == pytest.approx(balanced_50_digits(parted)[-1], rel=1e-3)
+    separated = Transfer.from_zpk([], [-1.0, -1.0 - 1e-4, -1.0 + 1e-4], 1.0)
+    assert hankel_singular_values(triple) == pytest.approx(balanced_50_digits(separated)[-1], rel=1e-3)
     with pytest.raises(ValueError, match="cannot be reduced"):
         reduce_order(Transfer.from_factors(1.0, [], [[1, -1], [1, -1], [1, 3]]), 2)

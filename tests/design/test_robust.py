@@ -1,4 +1,4 @@
-"""Robust controllers: scenarios, the search and its proof against plants put together independently, the command."""
+"""Robust controllers: scenarios, search, proof and command, compared with plants that scipy samples independently."""
 
 import contextlib
 import json
@@ -56,50 +56,53 @@ generations = 80
 """
 
 
-def sampled(gain_percent: float, shift_percent: float, factor: float, delay_ticks: int):
-    """G(z) of the stage, changed, by scipy: numerator and denominator."""
+def sample_stage(gain_percent: float, shift_percent: float, factor: float, delay_ticks: int):
+    """Return numerator and denominator of G(z) of the changed stage, by scipy."""
     omega, ratio = OMEGA * (1 + shift_percent / 100), RATIO * factor
     plain = ([(1 + gain_percent / 100) * omega**2], [1.0, 2 * ratio * omega, omega**2])
-    above, below, _ = signal.cont2discrete(plain, PERIOD_S, method="zoh")
-    return np.trim_zeros(above[0], "f"), np.append(below, np.zeros(delay_ticks))
+    numerator, denominator, _ = signal.cont2discrete(plain, PERIOD_S, method="zoh")
+    return np.trim_zeros(numerator[0], "f"), np.append(denominator, np.zeros(delay_ticks))
 
 
-def at(polynomials, z):
+def evaluate(polynomials, z):
+    """Return the value of (numerator, denominator) at z."""
     return np.polyval(polynomials[0], z) / np.polyval(polynomials[1], z)
 
 
-def written(controller: Transfer):
-    """C(z) of the zeros, poles and gain that "matched" makes, as polynomials: numerator and denominator."""
-    found = discretise_controller(controller, PERIOD_S, "matched")
-    return found.gain * np.real(np.poly(found.zeros)), np.real(np.poly(found.poles))
+def matched_polynomials(controller: Transfer):
+    """Return numerator and denominator of C(z) of a controller discretised by "matched"."""
+    discrete = discretise_controller(controller, PERIOD_S, "matched")
+    return discrete.gain * np.real(np.poly(discrete.zeros)), np.real(np.poly(discrete.poles))
 
 
-def closed_loop(controller, plant):
+def loop_polynomial(controller, plant):
+    """Return the characteristic polynomial of the closed loop."""
     return np.polyadd(np.polymul(controller[1], plant[1]), np.polymul(controller[0], plant[0]))
 
 
-def noise(controller, plant) -> float:
-    """rms of v per rms of white noise: the norm of the impulse response of C/(1 + L)."""
-    above, below = np.polymul(controller[0], plant[1]), closed_loop(controller, plant)
-    above = np.concatenate([np.zeros(below.size - above.size), above])
-    return float(np.linalg.norm(signal.lfilter(above, below, np.eye(1, 20_000)[0])))
+def noise_gain(controller, plant) -> float:
+    """Return the rms of v per rms of white noise: the norm of the impulse response of C/(1 + L)."""
+    numerator, denominator = np.polymul(controller[0], plant[1]), loop_polynomial(controller, plant)
+    numerator = np.concatenate([np.zeros(denominator.size - numerator.size), numerator])
+    return float(np.linalg.norm(signal.lfilter(numerator, denominator, np.eye(1, 20_000)[0])))
 
 
-def peak(controller, plant) -> float:
-    """max |S| on a dense grid."""
+def peak_sensitivity(controller, plant) -> float:
+    """Return max |S| on a dense grid."""
     z = np.exp(1j * np.linspace(1e-3, np.pi, 100_000))
-    return float(np.max(1 / np.abs(1 + at(controller, z) * at(plant, z))))
+    return float(np.max(1 / np.abs(1 + evaluate(controller, z) * evaluate(plant, z))))
 
 
 def decay_ms(controller, plant) -> float:
-    """Time constant of the slowest closed-loop mode between 0.55 and 1.85 times the resonance."""
-    poles = np.roots(closed_loop(controller, plant))
+    """Return the time constant (ms) of the slowest closed-loop mode between 0.55 and 1.85 times the resonance."""
+    poles = np.roots(loop_polynomial(controller, plant))
     band = np.abs(np.angle(poles)) / PERIOD_S / OMEGA
     counted = np.abs(poles[(band > 0.55) & (band < 1.85)])
     return float(np.max(-1e3 * PERIOD_S / np.log(counted), initial=0.0))
 
 
-def a_point(random) -> np.ndarray:
+def random_point(random) -> np.ndarray:
+    """Return a random point of the search for a controller with two biquads, within the bounds."""
     low, high = point_bounds(2)
     return np.clip(np.array([-3.0, -3.0, *([-1.0, 0.5, -0.8, -0.5] * 2)]) + 0.4 * random.standard_normal(10), low, high)
 
@@ -109,31 +112,32 @@ def test_a_scenario_is_the_plant_with_its_resonance_damping_gain_and_delay_chang
     family = Family(STAGE, 0, RANGE, PERIOD_S)
     changed = sampled_plant(family.plant(Scenario((7.0,), 0.5, -4.0, delay_ticks)), PERIOD_S, delay_ticks)
     z = np.exp(2j * np.pi * np.geomspace(1.0, 4900.0, 60) * PERIOD_S)
-    np.testing.assert_allclose(changed.response(z), at(sampled(-4.0, 7.0, 0.5, delay_ticks), z), rtol=1e-8)
+    np.testing.assert_allclose(changed.response(z), evaluate(sample_stage(-4.0, 7.0, 0.5, delay_ticks), z), rtol=1e-8)
 
 
 def test_modes_that_are_damped_or_beyond_half_the_rate_do_not_move() -> None:
     poles = [*np.roots([1, 0.02 * 3000, 3000.0**2]), *np.roots([1, 2000, 2000.0**2]), *np.roots([1, 500, 4e4**2])]
     model = Transfer.from_zpk([], poles, 1.0)
     assert np.abs(light_modes(model, PERIOD_S)) == pytest.approx([3000.0])
-    moved = Family(model, 0, RANGE, PERIOD_S).plant(Scenario((5.0,), 1.0, 0.0, 0))
-    assert sorted(np.abs(moved.poles)) == pytest.approx([2000.0] * 2 + [3150.0] * 2 + [4e4] * 2)
-    assert moved.dc_gain == pytest.approx(model.dc_gain, rel=1e-12)
+    changed = Family(model, 0, RANGE, PERIOD_S).plant(Scenario((5.0,), 1.0, 0.0, 0))
+    assert sorted(np.abs(changed.poles)) == pytest.approx([2000.0] * 2 + [3150.0] * 2 + [4e4] * 2)
+    assert changed.dc_gain == pytest.approx(model.dc_gain, rel=1e-12)
 
 
 def test_two_modes_move_by_themselves_in_every_combination() -> None:
     model = Transfer.from_zpk([], [*np.roots([1, 30, 3000.0**2]), *np.roots([1, 80, 8000.0**2])], 1.0)
-    found = {one.resonance for one in Family(model, 2, RANGE, PERIOD_S).corner_scenarios()}
-    assert {(-8.0, 8.0), (8.0, -8.0), (0.0, 8.0), (0.0, 0.0)} <= found
-    assert {one.delay_ticks for one in Family(model, 2, RANGE, PERIOD_S).corner_scenarios()} == {2}
+    resonances = {scenario.resonance for scenario in Family(model, 2, RANGE, PERIOD_S).corner_scenarios()}
+    assert {(-8.0, 8.0), (8.0, -8.0), (0.0, 8.0), (0.0, 0.0)} <= resonances
+    assert {scenario.delay_ticks for scenario in Family(model, 2, RANGE, PERIOD_S).corner_scenarios()} == {2}
     both = RANGE.model_copy(update={"delay_ticks": (0, 1)})
-    assert {one.delay_ticks for one in Family(model, 2, both, PERIOD_S).corner_scenarios()} == {0, 1}
-    swept = [(one.delay_ticks, one.resonance[0]) for one in Family(model, 2, both, PERIOD_S).sweep_scenarios(3)]
+    assert {scenario.delay_ticks for scenario in Family(model, 2, both, PERIOD_S).corner_scenarios()} == {0, 1}
+    sweep = Family(model, 2, both, PERIOD_S).sweep_scenarios(3)
+    swept = [(scenario.delay_ticks, scenario.resonance[0]) for scenario in sweep]
     assert set(swept) == {(ticks, percent) for ticks in (0, 1) for percent in (-8.0, 0.0, 8.0)}
 
 
 def test_a_search_finds_the_minimum_of_a_bent_valley_and_its_seed_alone_decides(tmp_path, monkeypatch) -> None:
-    """Neither numpy's global generator nor files in the working directory have a part in it."""
+    """Numpy's global generator and files in the working directory do not change the result."""
 
     def rosenbrock(points):
         return np.sum(100 * (points[:, 1:] - points[:, :-1] ** 2) ** 2 + (1 - points[:, :-1]) ** 2, axis=1)
@@ -150,55 +154,57 @@ def test_a_search_finds_the_minimum_of_a_bent_valley_and_its_seed_alone_decides(
 
 
 def test_a_search_that_finds_nothing_better_stays_where_it_started() -> None:
-    found = minimise(lambda points: np.sum(points**2, axis=1), np.zeros(3), 1.0, 2, np.random.default_rng(1))
-    assert (found.point.tolist(), found.cost) == ([0.0, 0.0, 0.0], 0.0)
+    result = minimise(lambda points: np.sum(points**2, axis=1), np.zeros(3), 1.0, 2, np.random.default_rng(1))
+    assert (result.point.tolist(), result.cost) == ([0.0, 0.0, 0.0], 0.0)
 
 
 def test_what_is_written_is_the_controller_that_was_searched() -> None:
-    """C(z) of the file, by "matched", at every frequency; its integrator stays one."""
+    """C(z) by "matched" and by state matrices equals the searched C(z) at every frequency."""
     rng, z = np.random.default_rng(5), np.exp(1j * np.linspace(0.01, 3.1, 200))
     for _ in range(50):
-        point = a_point(rng)
-        numerator, denominator = written(point_transfer(point, PERIOD_S))
+        point = random_point(rng)
+        numerator, denominator = matched_polynomials(point_transfer(point, PERIOD_S))
         np.testing.assert_allclose(
-            at((numerator, denominator), z), build_candidates(point[None]).response(z)[0], rtol=1e-7
+            evaluate((numerator, denominator), z), build_candidates(point[None]).response(z)[0], rtol=1e-7
         )  # fmt: skip
         a, b, c, d = (part[0] for part in build_candidates(point[None]).matrices())
         by_states = signal.ss2tf(a, b[:, None], c[None], np.array([[d]]))
-        np.testing.assert_allclose(at((by_states[0][0], by_states[1]), z), at((numerator, denominator), z), rtol=1e-5)
+        np.testing.assert_allclose(
+            evaluate((by_states[0][0], by_states[1]), z), evaluate((numerator, denominator), z), rtol=1e-5
+        )
 
 
 def test_what_is_searched_is_the_worst_of_the_closed_loops() -> None:
-    """Poles from polynomials of L, |S| from their ratio: none of them stacked."""
+    """The oracle has poles from polynomials of L and |S| from their ratio, one plant after the other."""
     family = Family(STAGE, 1, RANGE, PERIOD_S)
     scenarios = [family.nominal, Scenario((8.0,), 0.5, 5.0, 1), Scenario((-8.0,), 2.0, -5.0, 3)]
     objective = Objective(family, scenarios, WALLS, 2)
-    rng, judged = np.random.default_rng(8), 0
+    rng, stable_count = np.random.default_rng(8), 0
     for _ in range(20):
-        point = a_point(rng)
+        point = random_point(rng)
         point[:2] = rng.uniform(-8.0, -4.0), -0.5
-        found = objective.measure(point[None])
-        controller = written(point_transfer(point, PERIOD_S))
+        measures = objective.measure(point[None])
+        controller = matched_polynomials(point_transfer(point, PERIOD_S))
         radii, decays, peaks, at_5 = [], [], [], []
-        for one in scenarios:
-            plant = sampled(one.gain, one.resonance[0], one.damping, one.delay_ticks)
-            radii.append(np.abs(np.roots(closed_loop(controller, plant))).max())
+        for scenario in scenarios:
+            plant = sample_stage(scenario.gain, scenario.resonance[0], scenario.damping, scenario.delay_ticks)
+            radii.append(np.abs(np.roots(loop_polynomial(controller, plant))).max())
             decays.append(1e-3 * decay_ms(controller, plant))
-            peaks.append(np.max(1 / np.abs(1 + at(controller, objective.z) * at(plant, objective.z))))
+            peaks.append(np.max(1 / np.abs(1 + evaluate(controller, objective.z) * evaluate(plant, objective.z))))
             low = np.exp(2j * np.pi * 5.0 * PERIOD_S)
-            at_5.append(1 / np.abs(1 + at(controller, low) * at(plant, low)))
-        assert found.radius[0] == pytest.approx(max(radii), abs=1e-6)
+            at_5.append(1 / np.abs(1 + evaluate(controller, low) * evaluate(plant, low)))
+        assert measures.radius[0] == pytest.approx(max(radii), abs=1e-6)
         if max(radii) < 0.9999:
-            judged += 1
-            assert found.decay_s[0] == pytest.approx(max(decays), rel=1e-4)
-            assert found.disturbance[0] == pytest.approx(max(at_5), rel=1e-6)
-            assert found.sensitivity[0] == pytest.approx(max(peaks), rel=1e-6)
-    assert judged >= 3
+            stable_count += 1
+            assert measures.decay_s[0] == pytest.approx(max(decays), rel=1e-4)
+            assert measures.disturbance[0] == pytest.approx(max(at_5), rel=1e-6)
+            assert measures.sensitivity[0] == pytest.approx(max(peaks), rel=1e-6)
+    assert stable_count >= 3
 
 
 @pytest.fixture(scope="module", autouse=True)
-def short_proofs():
-    """Of fewer plants: each costs some ten milliseconds."""
+def reduced_proofs():
+    """Prove on fewer plants: each plant takes some ten milliseconds."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(certificate, "SWEEP_POINTS", 5)
         patch.setattr(certificate, "RANDOM_PLANTS", 10)
@@ -206,33 +212,38 @@ def short_proofs():
 
 
 @pytest.fixture(scope="module")
-def found(short_proofs):
+def solution(reduced_proofs):
+    """Return the controller designed for SPEC, with its proof."""
     return find_robust_controller(DesignOptions.model_validate(tomllib.loads(SPEC)))
 
 
-def test_a_controller_damps_the_resonance_and_keeps_its_walls_wherever_the_plant_lies(found) -> None:
+def test_a_controller_damps_the_resonance_and_keeps_its_walls_wherever_the_plant_lies(solution) -> None:
     """Plants between the scenarios: all stable, max |S| ≤ 2, the disturbance held, the resonance damped."""
-    controller, random = written(found.controller), np.random.default_rng(1)
+    controller, random = matched_polynomials(solution.controller), np.random.default_rng(1)
     low = np.exp(2j * np.pi * 5.0 * PERIOD_S)
     for _ in range(20):
-        plant = sampled(random.uniform(-5, 5), random.uniform(-8, 8), np.exp(random.uniform(*np.log([0.5, 2]))), 0)
-        assert np.abs(np.roots(closed_loop(controller, plant))).max() < 1
-        assert peak(controller, plant) <= 2.0 + 1e-9
-        assert noise(controller, plant) <= 3.0 + 1e-9
-        assert 1 / np.abs(1 + at(controller, low) * at(plant, low)) <= 0.1 + 1e-9
-        assert decay_ms(controller, plant) < 1e3 / (0.5 * RATIO * OMEGA) / 5  # left alone it rings for 53 ms
+        plant = sample_stage(random.uniform(-5, 5), random.uniform(-8, 8), np.exp(random.uniform(*np.log([0.5, 2]))), 0)
+        assert np.abs(np.roots(loop_polynomial(controller, plant))).max() < 1
+        assert peak_sensitivity(controller, plant) <= 2.0 + 1e-9
+        assert noise_gain(controller, plant) <= 3.0 + 1e-9
+        assert 1 / np.abs(1 + evaluate(controller, low) * evaluate(plant, low)) <= 0.1 + 1e-9
+        assert decay_ms(controller, plant) < 1e3 / (0.5 * RATIO * OMEGA) / 5  # without control it rings for 53 ms
 
 
-def test_a_proof_is_what_its_worst_plants_do(found) -> None:
-    proof, controller = found.certificate, written(found.controller)
-    for worst, value_of in ((proof.noise_gain, noise), (proof.sensitivity, peak), (proof.decay_ms, decay_ms)):
-        scenario = worst.scenario
-        plant = sampled(scenario.gain, scenario.resonance[0], scenario.damping, scenario.delay_ticks)
-        assert worst.value == pytest.approx(value_of(controller, plant), rel=1e-5)
+def test_a_proof_is_what_its_worst_plants_do(solution) -> None:
+    proof, controller = solution.certificate, matched_polynomials(solution.controller)
+    for figure, value_of in (
+        (proof.noise_gain, noise_gain),
+        (proof.sensitivity, peak_sensitivity),
+        (proof.decay_ms, decay_ms),
+    ):
+        scenario = figure.scenario
+        plant = sample_stage(scenario.gain, scenario.resonance[0], scenario.damping, scenario.delay_ticks)
+        assert figure.value == pytest.approx(value_of(controller, plant), rel=1e-5)
 
 
 def test_a_proof_names_the_plant_that_is_worst() -> None:
-    """An integrator alone on a lightly damped mode: worst where its damping is least and the gain highest."""
+    """An integrator on a lightly damped mode is worst where the damping is least and the gain highest."""
     family = Family(STAGE, 0, RANGE, PERIOD_S)
     controller = discretise_controller(Transfer.from_zpk([-1e4], [0.0, -1e4 * 1.0001], 45.0), PERIOD_S, "matched")
     proof = certify(controller, family, WALLS)
@@ -260,7 +271,7 @@ def test_what_cannot_be_is_refused_with_what_misses() -> None:
 
 
 @pytest.mark.parametrize(
-    ("section", "key", "value", "said"),
+    ("section", "key", "value", "message"),
     [
         ("scenarios", "damping", [], "damping"),
         ("scenarios", "damping", [-1.0], "factors from 0.01 to 10"),
@@ -270,25 +281,25 @@ def test_what_cannot_be_is_refused_with_what_misses() -> None:
         ("plant", "gain", -1.0, "a gain at 0 Hz above 0"),
     ],
 )
-def test_a_specification_that_cannot_be_is_a_clear_error(tmp_path, section, key, value, said) -> None:
+def test_a_specification_that_cannot_be_is_a_clear_error(tmp_path, section, key, value, message) -> None:
     raw = tomllib.loads(SPEC)
     raw[section] |= {key: value}
     (tmp_path / "spec.toml").write_text(text("", raw))
     result = CliRunner().invoke(main, ["design", "robust", str(tmp_path / "spec.toml")])
     assert result.exit_code == 78
-    assert said in result.stderr
+    assert message in result.stderr
     assert "Traceback" not in result.stderr
 
 
-def test_the_command_puts_the_controller_into_a_configuration_and_keeps_its_words(tmp_path, found) -> None:
+def test_the_command_puts_the_controller_into_a_configuration_and_keeps_its_words(tmp_path, solution) -> None:
     (tmp_path / "spec.toml").write_text(SPEC)
     design, out = DesignOptions.model_validate(tomllib.loads(SPEC)), tmp_path / "made.toml"
-    text = robust_configuration(found, design, "spec.toml", SPEC, "z", "spec.toml")
+    text = robust_configuration(solution, design, "spec.toml", SPEC, "z", "spec.toml")
     out.write_text(text.replace("gain = ", "# a word of mine\ngain = ", 1))
     arguments = ["design", "robust", str(tmp_path / "spec.toml"), "--config", str(out)]
-    made = CliRunner().invoke(main, [*arguments, "--axis", "z", "--out", str(out), "--json"])
-    assert made.exit_code == 0, made.stderr
-    report, axis = json.loads(made.stdout), tomllib.loads(out.read_text())["axis"][0]
+    result = CliRunner().invoke(main, [*arguments, "--axis", "z", "--out", str(out), "--json"])
+    assert result.exit_code == 0, result.stderr
+    report, axis = json.loads(result.stdout), tomllib.loads(out.read_text())["axis"][0]
     assert axis["controller"]["zeros"] == report["zeros"] == tomllib.loads(text)["axis"][0]["controller"]["zeros"]
     assert axis["controller"]["method"] == "matched"
     assert report["worst"]["sensitivity"]["value"] <= 2.0

@@ -1,4 +1,4 @@
-"""`design auto --robust`: recordings to a loop with taps; refusals; many modes; poles beyond reach."""
+"""`design auto --robust` from recordings to a loop with taps; refusals; plants with many modes or very fast poles."""
 
 import json
 import math
@@ -51,6 +51,7 @@ steps_um = [10.0]
 
 @pytest.fixture(scope="module")
 def recordings(tmp_path_factory):
+    """Return the paths of the recordings of deploy/own-stage-sine.toml and deploy/own-stage.toml."""
     folder = tmp_path_factory.mktemp("recorded")
     return [
         str(record(folder / f"{name}.mcap", (DEPLOY / f"{name}.toml").read_text(encoding="utf-8"), ticks)[0])
@@ -59,15 +60,16 @@ def recordings(tmp_path_factory):
 
 
 @pytest.fixture(autouse=True)
-def few_places(monkeypatch) -> None:
-    """In the proofs: those of the search and of the taps have tests of their own."""
+def reduced_proofs(monkeypatch) -> None:
+    """Prove on fewer plants; other tests cover the proofs of the search and of the taps."""
     monkeypatch.setattr(certificate, "SWEEP_POINTS", 3)
     monkeypatch.setattr(certificate, "RANDOM_PLANTS", 10)
     monkeypatch.setattr(shape_module, "SWEEP_PLACES", 3)
     monkeypatch.setattr(shape_module, "PROOF_PLACES", 5)
 
 
-def automatically(recordings, folder, text: str):
+def design_auto(recordings, folder, text: str):
+    """Run `design auto --robust` with the specification `text`; return the result of the command."""
     (folder / "spec.toml").write_text(text, encoding="utf-8")
     arguments = [*recordings, "--robust", "--specs", folder / "spec.toml", "--out", folder / "made.toml", "--json"]
     return CliRunner().invoke(main, ["design", "auto", *map(str, arguments)])
@@ -75,11 +77,11 @@ def automatically(recordings, folder, text: str):
 
 @pytest.mark.usefixtures("few_simulated_steps")
 def test_two_recordings_become_a_loop_with_taps_that_keeps_its_promise(recordings, tmp_path) -> None:
-    """The step on the rig is the one that is promised; the interlocks are armed; progress is on stderr alone."""
-    result = automatically(recordings, tmp_path, SPEC.format(percent=3.0))
+    """The step on the rig is as predicted; the interlocks are armed; stdout has JSON alone."""
+    result = design_auto(recordings, tmp_path, SPEC.format(percent=3.0))
     assert result.exit_code == 0, result.output
-    found = json.loads(result.stdout)
-    assert found["meets"]
+    report = json.loads(result.stdout)
+    assert report["meets"]
     (axis,) = load(tmp_path / "made.toml").axes
     assert sum(axis.prefilter.taps) == pytest.approx(1.0, abs=1e-9)
     assert len(axis.prefilter.taps) == len(axis.prefilter.command_taps) == 30
@@ -95,9 +97,9 @@ def test_two_recordings_become_a_loop_with_taps_that_keeps_its_promise(recording
 
 def test_what_cannot_be_had_is_refused_and_nothing_is_written(recordings, tmp_path) -> None:
     """No mode of 800 Hz dies away in a thousandth of a millisecond."""
-    few = "restarts = 2\ngenerations = 60"
-    text = SPEC.format(percent=3.0).replace(few, "restarts = 1\ngenerations = 9\ndecay_ms = 0.001")
-    refused = automatically(recordings, tmp_path, text)
+    budget = "restarts = 2\ngenerations = 60"
+    text = SPEC.format(percent=3.0).replace(budget, "restarts = 1\ngenerations = 9\ndecay_ms = 0.001")
+    refused = design_auto(recordings, tmp_path, text)
     assert refused.exit_code == 1, refused.output
     assert "allowed: up to 0.001" in refused.stderr
     assert "Use wider limits, smaller ranges in [scenarios]" in refused.stderr
@@ -107,7 +109,7 @@ def test_what_cannot_be_had_is_refused_and_nothing_is_written(recordings, tmp_pa
 def test_a_disturbance_beyond_half_the_rate_is_refused_without_a_stated_range_too(recordings, tmp_path) -> None:
     text = SPEC.replace("[scenarios]\nresonance_percent = {percent}\n", "")
     text += "[specification.disturbance]\nlargest_um = 1.0\nerror_um = 0.1\nup_to_hz = 6000.0\n"
-    refused = automatically(recordings, tmp_path, text)
+    refused = design_auto(recordings, tmp_path, text)
     assert refused.exit_code == 1, refused.output
     assert "up_to_hz: 6000 Hz; allowed: below half of controller.rate_hz, 5000 Hz" in refused.stderr
     assert "no controller" not in refused.stderr  # which would blame the range of the resonance
@@ -120,7 +122,7 @@ def test_a_disturbance_beyond_half_the_rate_is_refused_without_a_stated_range_to
 )
 def test_a_specification_that_says_too_little_is_refused_first(recordings, tmp_path, line, key) -> None:
     text = SPEC.format(percent=3.0).replace(line, "").replace("[specification.command]\n\n", "")
-    result = automatically(recordings, tmp_path, text)
+    result = design_auto(recordings, tmp_path, text)
     assert result.exit_code == 78
     assert key in result.stderr
     assert "search" not in result.stderr
@@ -130,7 +132,7 @@ def test_a_reference_beyond_the_drive_is_refused_before_the_search(recordings, t
     """The stage reaches 20 µm at 10 V."""
     command, larger = "reference_um = 18.0\ncommand_um = 19.5", "reference_um = 30.0\ncommand_um = 33.0"
     text = SPEC.format(percent=3.0).replace(command, larger)
-    refused = automatically(recordings, tmp_path, text)
+    refused = design_auto(recordings, tmp_path, text)
     assert refused.exit_code == 1, refused.output
     assert "specification.command.reference_um: value is 30 µm; allowed: up to 20 µm" in refused.stderr
     assert "search" not in refused.stderr
@@ -138,10 +140,10 @@ def test_a_reference_beyond_the_drive_is_refused_before_the_search(recordings, t
 
 
 def test_a_controller_without_taps_is_written_all_the_same(recordings, tmp_path, monkeypatch) -> None:
-    """Its loop is stable, its file says what is missing, and the exit code that the design is not complete."""
+    """The written loop is stable; the file names the reason, and the exit code shows that the design is incomplete."""
     reason = "shape: no taps settle within 2.7 ms"
     monkeypatch.setattr("rtloop.design.robust.chain.design_taps", Mock(side_effect=NoDesign(reason)))
-    refused = automatically(recordings, tmp_path, SPEC.format(percent=3.0))
+    refused = design_auto(recordings, tmp_path, SPEC.format(percent=3.0))
     assert refused.exit_code == 1, refused.output
     assert reason in refused.stderr
     assert f"{tmp_path / 'made.toml'} is written with the controller that was found, but without taps" in refused.stderr
@@ -154,58 +156,59 @@ def test_a_controller_without_taps_is_written_all_the_same(recordings, tmp_path,
 
 
 def modal(hz, damping, gain) -> Transfer:
-    """Σ g ω²/(s² + 2ζω s + ω²), by scipy's polynomials."""
+    """Return Σ g ω²/(s² + 2ζω s + ω²), added by numpy's polynomials."""
     omega = 2 * np.pi * np.array(hz)
-    below = [np.poly1d([1.0, 2 * z * w, w**2]) for z, w in zip(damping, omega, strict=True)]
-    above = np.poly1d([0.0])
+    denominators = [np.poly1d([1.0, 2 * z * w, w**2]) for z, w in zip(damping, omega, strict=True)]
+    numerator = np.poly1d([0.0])
     for i, w in enumerate(omega):
-        others = [one for k, one in enumerate(below) if k != i]
-        above += math.prod(others, start=np.poly1d([gain[i] * w**2]))
-    poles = np.concatenate([one.roots for one in below])
-    return Transfer.from_zpk(above.roots, poles, above.coeffs[0])
+        other_factors = [factor for k, factor in enumerate(denominators) if k != i]
+        numerator += math.prod(other_factors, start=np.poly1d([gain[i] * w**2]))
+    poles = np.concatenate([factor.roots for factor in denominators])
+    return Transfer.from_zpk(numerator.roots, poles, numerator.coeffs[0])
 
 
 def test_of_many_light_modes_those_that_stand_out_move_by_themselves() -> None:
     hz, damping, gain = [200.0, 500.0, 900.0, 1500.0], [0.02, 0.02, 0.003, 0.02], [0.9, 0.02, 0.06, 0.02]
     family = Family(modal(hz, damping, gain), 1, ScenarioOptions(), PERIOD_S)
     assert family.leading == (0, 2)  # g/2ζ: 22, 0.5, 10, 0.5
-    shifts = {one.resonance for one in family.corner_scenarios()}
+    shifts = {scenario.resonance for scenario in family.corner_scenarios()}
     assert {(10.0, 0.0, -10.0, 0.0), (-10.0, 0.0, 10.0, 0.0), (10.0,) * 4, (-10.0,) * 4} <= shifts
-    assert all(one[1] == one[3] == 0 or len(set(one)) == 1 for one in shifts)
-    assert np.all([len(set(one.resonance)) == 4 for one in family.random_scenarios(20, 0)])  # the proof moves each
+    assert all(shift[1] == shift[3] == 0 or len(set(shift)) == 1 for shift in shifts)
+    random_scenarios = family.random_scenarios(20, 0)  # the proof shifts each mode
+    assert np.all([len(set(scenario.resonance)) == 4 for scenario in random_scenarios])
     bands = family.bands / (2 * np.pi)
     expected = [[110.0, np.sqrt(200 * 500)], [np.sqrt(500 * 900), np.sqrt(900 * 1500)]]
     np.testing.assert_allclose(bands, expected, rtol=1e-9)
 
 
 def test_a_pole_beyond_reach_in_s_is_a_finite_one_that_answers_alike_at_the_ticks() -> None:
-    """What identification makes of a delay by a part of a tick: a pole at z ≈ 0, here at −1e25 rad/s."""
+    """Identification models a delay of a part of a tick by a pole at z ≈ 0, here at −1e25 rad/s."""
     rates = np.array([-1e25, complex(-100.0, 5000.0), complex(-100.0, -5000.0)])
     residues = np.array([[0.3, 0.1 - 0.2j, 0.1 + 0.2j]])
-    reach, kept = _limit_fast_rates(rates, residues, PERIOD_S)
-    assert -20 / PERIOD_S < reach[0].real < -10 / PERIOD_S
-    np.testing.assert_array_equal(reach[1:], rates[1:])
+    finite_rates, finite_residues = _limit_fast_rates(rates, residues, PERIOD_S)
+    assert -20 / PERIOD_S < finite_rates[0].real < -10 / PERIOD_S
+    np.testing.assert_array_equal(finite_rates[1:], rates[1:])
     z = np.exp(2j * np.pi * np.geomspace(1.0, 4900.0, 30) * PERIOD_S)
 
-    def answer(poles, parts):
+    def response(poles, parts):
         return np.sum(parts[0] / (z[:, None] - np.exp(poles * PERIOD_S)), axis=1)
 
-    np.testing.assert_allclose(answer(reach, kept), answer(rates, residues), rtol=1e-5)
+    np.testing.assert_allclose(response(finite_rates, finite_residues), response(rates, residues), rtol=1e-5)
 
 
 BOUC_WEN_ODD = 9
 
 
 def test_an_actuator_that_is_no_sum_of_plays_gets_no_promise(tmp_path) -> None:
-    """It is said before minutes are spent, with what was left and how to go on."""
+    """The refusal names the cause and the option that allows the design."""
     rig = noisy_rig(BOUC_WEN_ODD)
     assert rig.bouc_wen is not None
     sine = record(tmp_path / "sine.mcap", rig.configuration(sine=True), round(SINE_S * 1000))[0]
     steps = record(tmp_path / "steps.mcap", rig.configuration(sine=False), round(STEPS_S * RATE_HZ))[0]
-    result = automatically([str(sine), str(steps)], tmp_path, SPEC.format(percent=3.0))
+    result = design_auto([str(sine), str(steps)], tmp_path, SPEC.format(percent=3.0))
     assert result.exit_code == 1
     assert "no sum of play operators describes the actuator" in result.stderr
     assert "simulation.residual_percent" in result.stderr
     assert not (tmp_path / "made.toml").exists()
-    said = CliRunner().invoke(main, ["identify", "hysteresis", str(sine)]).stdout
-    assert "the actuator is no sum of plays" in said
+    output = CliRunner().invoke(main, ["identify", "hysteresis", str(sine)]).stdout
+    assert "the actuator is no sum of plays" in output

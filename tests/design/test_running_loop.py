@@ -1,4 +1,4 @@
-"""The loop as it runs, with taps, sections and delay, between ticks too: against a simulation in tiny steps."""
+"""The discretised loop with taps, sections and delay, at and between ticks, compared with simulation in small steps."""
 
 from __future__ import annotations
 
@@ -25,41 +25,41 @@ TICKS = 500
 
 
 def controller() -> SampledController:
-    """v = KP e + KI T Σ e up to the tick before."""
+    """Return the controller v = KP e + KI T Σ e, with the sum up to the tick before."""
     return SampledController(System(np.eye(1), np.ones(1), np.array([KI * PERIOD_S]), KP), PERIOD_S)
 
 
-def by_hand(
+def simulate_step(
     delay_ticks: int, path: tuple[np.ndarray, np.ndarray, list[float] | None], plants: int = 1, cross: float = 0.0
 ):
-    """Positions (POINTS·TICKS,) of axis 0 and its commands (TICKS,) after a unit step there, by expm of T/POINTS.
+    """Return positions (POINTS·TICKS,) and commands (TICKS,) of axis 0 after its unit step, by expm of T/POINTS.
 
-    Of two `plants` each one's input takes `cross` of the other one's command; the other's loop is closed, too.
+    With two `plants`, the input of each has `cross` times the other's command added; both loops are closed.
     """
     a = np.array([[0.0, 1.0], [-(OMEGA**2), -2 * ZETA * OMEGA]])
-    grown = linalg.expm(np.block([[a, np.array([[0.0], [OMEGA**2]])], [np.zeros((1, 3))]]) * PERIOD_S / POINTS)
+    exponential = linalg.expm(np.block([[a, np.array([[0.0], [OMEGA**2]])], [np.zeros((1, 3))]]) * PERIOD_S / POINTS)
     taps, command_taps, section = path
     step = np.ones(TICKS)
-    wanted = signal.lfilter(taps, 1.0, step)
+    filtered = signal.lfilter(taps, 1.0, step)
     if section is not None:
-        wanted = signal.lfilter(section[:3], [1.0, *section[3:]], wanted)
-    direct = signal.lfilter(command_taps, 1.0, step) if command_taps.size else 0 * step
+        filtered = signal.lfilter(section[:3], [1.0, *section[3:]], filtered)
+    feedforward = signal.lfilter(command_taps, 1.0, step) if command_taps.size else 0 * step
     states, sums = np.zeros((plants, 2)), np.zeros(plants)
     queues = [[0.0] * delay_ticks for _ in range(plants)]
     positions, commands = [], []
     for k in range(TICKS):
-        errors = np.array([wanted[k] if i == 0 else 0.0 for i in range(plants)]) - states[:, 0]
+        errors = np.array([filtered[k] if i == 0 else 0.0 for i in range(plants)]) - states[:, 0]
         v = KP * errors + KI * PERIOD_S * sums
-        v[0] += direct[k]
+        v[0] += feedforward[k]
         sums += errors
         commands.append(v[0])
-        held = v + cross * (v.sum() - v) if plants > 1 else v
+        inputs = v + cross * (v.sum() - v) if plants > 1 else v
         for i in range(plants):
-            queues[i].append(held[i])
-        now = np.array([queue.pop(0) for queue in queues])
+            queues[i].append(inputs[i])
+        delayed = np.array([queue.pop(0) for queue in queues])
         for _ in range(POINTS):
             positions.append(states[0, 0])
-            states = states @ grown[:2, :2].T + np.outer(now, grown[:2, 2])
+            states = states @ exponential[:2, :2].T + np.outer(delayed, exponential[:2, 2])
     return np.array(positions), np.array(commands)
 
 
@@ -71,36 +71,36 @@ PATHS = [
 ]
 
 
-def path_of(taps: np.ndarray, command_taps: np.ndarray, section: list[float] | None) -> ReferencePath:
+def reference_path(taps: np.ndarray, command_taps: np.ndarray, section: list[float] | None) -> ReferencePath:
     return ReferencePath(taps, command_taps, np.array([section] if section else []).reshape(-1, 5))
 
 
 @pytest.mark.parametrize("delay_ticks", [0, 1, 3])
 @pytest.mark.parametrize("path", PATHS)
 def test_steps_of_the_loop_as_it_runs(path, delay_ticks: int) -> None:
-    loop = discrete_loop(controller(), PLANT, delay_ticks, path_of(*path))
+    loop = discrete_loop(controller(), PLANT, delay_ticks, reference_path(*path))
     assert loop.is_stable
-    positions, commands = by_hand(delay_ticks, path)
-    found = step_response(loop, (TICKS - 1) * PERIOD_S)
-    np.testing.assert_allclose(found.position, positions, atol=1e-11)
-    np.testing.assert_allclose(found.command[::POINTS], commands, atol=1e-11)
-    np.testing.assert_allclose(found.time_s, np.arange(TICKS * POINTS) * PERIOD_S / POINTS, atol=1e-12)
+    positions, commands = simulate_step(delay_ticks, path)
+    response = step_response(loop, (TICKS - 1) * PERIOD_S)
+    np.testing.assert_allclose(response.position, positions, atol=1e-11)
+    np.testing.assert_allclose(response.command[::POINTS], commands, atol=1e-11)
+    np.testing.assert_allclose(response.time_s, np.arange(TICKS * POINTS) * PERIOD_S / POINTS, atol=1e-12)
 
 
 @pytest.mark.parametrize("delay_ticks", [0, 2])
 @pytest.mark.parametrize("path", PATHS)
 def test_steps_of_one_of_two_coupled_axes(path, delay_ticks: int) -> None:
     cross = 0.2
-    one = controller().system
-    both = CoupledSystem(np.eye(2), np.eye(2), KI * PERIOD_S * np.eye(2), KP * np.eye(2))
-    assert one.d == both.d[0, 0]
+    single = controller().system
+    coupled = CoupledSystem(np.eye(2), np.eye(2), KI * PERIOD_S * np.eye(2), KP * np.eye(2))
+    assert single.d == coupled.d[0, 0]
     plant = CoupledPlant((PLANT, PLANT), (delay_ticks,) * 2, np.array([[1.0, cross], [cross, 1.0]]))
-    loop = CoupledLoop(SampledCoupledSystem(both, PERIOD_S), plant).axis_loop(0, path_of(*path))
+    loop = CoupledLoop(SampledCoupledSystem(coupled, PERIOD_S), plant).axis_loop(0, reference_path(*path))
     assert loop.is_stable
-    positions, commands = by_hand(delay_ticks, path, 2, cross)
-    found = step_response(loop, (TICKS - 1) * PERIOD_S)
-    np.testing.assert_allclose(found.position, positions, atol=1e-11)
-    np.testing.assert_allclose(found.command[::POINTS], commands, atol=1e-11)
+    positions, commands = simulate_step(delay_ticks, path, 2, cross)
+    response = step_response(loop, (TICKS - 1) * PERIOD_S)
+    np.testing.assert_allclose(response.position, positions, atol=1e-11)
+    np.testing.assert_allclose(response.command[::POINTS], commands, atol=1e-11)
 
 
 def test_sections_of_finite_memory_settle_after_two_ticks_each() -> None:
@@ -112,28 +112,29 @@ def test_sections_of_finite_memory_settle_after_two_ticks_each() -> None:
     assert 6 <= path.settling_ticks <= 8
 
 
-def settled(path) -> Loop:
-    return discrete_loop(controller(), PLANT, 1, path_of(*path))
+def loop_with_path(path) -> Loop:
+    """Return the loop with one sample of delay and a reference path."""
+    return discrete_loop(controller(), PLANT, 1, reference_path(*path))
 
 
 @pytest.mark.parametrize("path", PATHS)
 def test_figures_of_a_step_are_those_between_ticks(path) -> None:
-    """An integrator: the final value is that of the error's path, and nothing of the command's.
+    """With an integrator, the path to the error alone decides the final value, and the path to the command does not.
 
-    Where that is more than 5 % from the reference there is neither overshoot nor settling time.
+    Where the final value is more than 5 % from the reference there is neither overshoot nor settling time.
     """
-    positions, commands = by_hand(1, path)
+    positions, commands = simulate_step(1, path)
     taps, _, section = path
     final = taps.sum() * (1.0 if section is None else sum(section[:3]) / (1 + sum(section[3:])))
-    found = step_metrics(settled(path), ())
-    assert found.static_error_percent == pytest.approx(100 * abs(1 - final), abs=1e-8)
-    assert found.peak_command == pytest.approx(np.abs(commands).max(), abs=1e-6)
+    metrics = step_metrics(loop_with_path(path), ())
+    assert metrics.static_error_percent == pytest.approx(100 * abs(1 - final), abs=1e-8)
+    assert metrics.peak_command == pytest.approx(np.abs(commands).max(), abs=1e-6)
     if abs(1 - final) > 0.05:
-        assert np.isnan([found.overshoot_percent, found.settling_time_s]).all()
+        assert np.isnan([metrics.overshoot_percent, metrics.settling_time_s]).all()
         return
-    assert found.overshoot_percent == pytest.approx(100 * max(0.0, positions.max() / final - 1), abs=1e-3)
+    assert metrics.overshoot_percent == pytest.approx(100 * max(0.0, positions.max() / final - 1), abs=1e-3)
     outside = np.flatnonzero(np.abs(positions - final) > 0.05 * final)[-1]
-    assert found.settling_time_s == pytest.approx((outside + 0.5) * PERIOD_S / POINTS, abs=0.51 * PERIOD_S / POINTS)
+    assert metrics.settling_time_s == pytest.approx((outside + 0.5) * PERIOD_S / POINTS, abs=0.51 * PERIOD_S / POINTS)
 
 
 def test_without_an_integrator_the_command_path_moves_the_final_value() -> None:
@@ -147,15 +148,15 @@ def test_without_an_integrator_the_command_path_moves_the_final_value() -> None:
 
 @pytest.mark.parametrize("path", PATHS)
 def test_responses_to_the_reference_are_those_of_its_step(path) -> None:
-    """The z-transform of the differences of a step's answer."""
-    loop, hz = settled(path), np.array([1.0, 30.0, 88.0, 300.0])
-    positions, commands = by_hand(1, path)
-    tail = TICKS + 1  # what is left after so many ticks is far below the tolerance of a decayed answer
-    back = np.exp(-2j * np.pi * hz[:, None] * PERIOD_S * np.arange(tail - 1))
+    """The oracle is the z-transform of the differences of the step response."""
+    loop, hz = loop_with_path(path), np.array([1.0, 30.0, 88.0, 300.0])
+    positions, commands = simulate_step(1, path)
+    tail = TICKS + 1  # after so many ticks the transient is far below the tolerance
+    exponentials = np.exp(-2j * np.pi * hz[:, None] * PERIOD_S * np.arange(tail - 1))
     position, command = loop.response_from_reference(hz)
-    for found, answer, final in (
+    for response, step_values, final in (
         (position, positions[::POINTS], loop.final_values[0]),
         (command, commands, loop.final_values[1]),
     ):
-        assert abs(answer[-1] - final) < 1e-3
-        np.testing.assert_allclose(found, (np.diff(answer, prepend=0.0) * back).sum(axis=1), atol=5e-3)
+        assert abs(step_values[-1] - final) < 1e-3
+        np.testing.assert_allclose(response, (np.diff(step_values, prepend=0.0) * exponentials).sum(axis=1), atol=5e-3)

@@ -1,4 +1,4 @@
-"""python-control's second opinion on every shipped loop: it agrees, and a wrong number in it is found."""
+"""python-control agrees with rtloop on every shipped loop, and the comparison detects a wrong number."""
 
 from pathlib import Path
 
@@ -38,15 +38,15 @@ def test_python_control_agrees_and_a_wrong_gain_or_delay_is_found(name: str) -> 
         opinion = second_opinion(numbers)
         assert disagreements(check.on_model, opinion) == []
         louder = second_opinion(numbers._replace(controller=(a, b, 1.01 * np.asarray(c), 1.01 * d)))
-        later = check.loop(check.plant, check.delay_ticks + 1)
-        for faults in (disagreements(check.on_model, louder), disagreements(later, opinion)):
+        delayed = check.loop(check.plant, check.delay_ticks + 1)
+        for faults in (disagreements(check.on_model, louder), disagreements(delayed, opinion)):
             assert faults[0].startswith("closed-loop poles:")
             assert any(fault.startswith("step response: rtloop and python-control differ by") for fault in faults)
-        assert disagreements(later, second_opinion(numbers._replace(delay_ticks=check.delay_ticks + 1))) == []
+        assert disagreements(delayed, second_opinion(numbers._replace(delay_ticks=check.delay_ticks + 1))) == []
 
 
 def test_axes_that_share_a_controller_are_judged_together() -> None:
-    """Found: a gain wrong by 1 %, each coupling taken for the other, a sample of delay more in the other axis."""
+    """The comparison detects a gain wrong by 1 %, swapped couplings, and one more sample of delay in the other axis."""
     prepared = prepare(load(DEPLOY / "laws" / "coupled.toml"))
     assert faults_on_models(prepared) == []
     a, b, c, d = prepared.checks[0].together.linear.system
@@ -54,10 +54,10 @@ def test_axes_that_share_a_controller_are_judged_together() -> None:
     axes = [LoopNumbers((a, b, c, d), axis.model, check.delay_ticks, axis.prefilter, 1e-4) for axis, check in pairs]
     coupling = np.array([[1.0, 0.15], [-0.12, 1.0]])
     louder = [numbers._replace(controller=(a, b, 1.01 * c, 1.01 * d)) for numbers in axes]
-    later = [axes[0], axes[1]._replace(delay_ticks=axes[1].delay_ticks + 1)]
+    delayed = [axes[0], axes[1]._replace(delay_ticks=axes[1].delay_ticks + 1)]
     for place, check in enumerate(prepared.checks):
         assert disagreements(check.on_model, coupled_opinion(axes, coupling, place)) == []
-        for wrong in ((louder, coupling), (axes, coupling.T), (later, coupling)):
+        for wrong in ((louder, coupling), (axes, coupling.T), (delayed, coupling)):
             faults = disagreements(check.on_model, coupled_opinion(*wrong, place))
             assert faults[0].startswith("closed-loop poles:")
 

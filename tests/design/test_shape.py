@@ -1,4 +1,4 @@
-"""Taps by linear programming, against steps that scipy simulates by itself, between ticks too."""
+"""Taps by linear programming, compared with steps that the tests simulate with scipy, at and between ticks."""
 
 import json
 import re
@@ -34,24 +34,24 @@ OPTIONS = ShapeOptions(
 SUBJECT = Subject(CONTROLLER, STAGE, 1, BOUNDS, 0.004, OPTIONS)
 
 
-def simulated(taps, command_taps, shift_percent: float, delay_ticks: int, ticks: int = 300):
-    """x at FINE points a tick and v at ticks after a unit step: the loop's equations, one point after the other."""
+def simulate(taps, command_taps, shift_percent: float, delay_ticks: int, ticks: int = 300):
+    """Return x at FINE points a tick and v at each tick after a unit step, from the loop's equations point by point."""
     omega = OMEGA * (1 + shift_percent / 100)
     plant = signal.tf2ss([omega**2], [1.0, 2 * RATIO * omega, omega**2])
     a, b, c, _, _ = signal.cont2discrete(plant, PERIOD_S / FINE, method="zoh")
     z, p, k = CONTROLLER.zeros, CONTROLLER.poles, CONTROLLER.gain
-    above, below = k * np.real(np.poly(z)), np.real(np.poly(p))
-    above = np.concatenate([np.zeros(below.size - above.size), above])
+    numerator, denominator = k * np.real(np.poly(z)), np.real(np.poly(p))
+    numerator = np.concatenate([np.zeros(denominator.size - numerator.size), numerator])
     q = np.concatenate([np.cumsum(taps), np.full(ticks, np.sum(taps))])
     w = np.concatenate([np.cumsum(command_taps), np.full(ticks, np.sum(command_taps))])
-    state, errors, answers = np.zeros(2), np.zeros(below.size), np.zeros(below.size - 1)
+    state, errors, outputs = np.zeros(2), np.zeros(denominator.size), np.zeros(denominator.size - 1)
     position, command = [], []
     for tick in range(ticks):
         x = float((c @ state)[0])
         errors = np.concatenate([[q[tick] - x], errors[:-1]])
-        answer = float(above @ errors - below[1:] @ answers)
-        answers = np.concatenate([[answer], answers[:-1]])
-        command.append(answer + w[tick])
+        output = float(numerator @ errors - denominator[1:] @ outputs)
+        outputs = np.concatenate([[output], outputs[:-1]])
+        command.append(output + w[tick])
         held = command[tick - delay_ticks] if tick >= delay_ticks else 0.0
         for _ in range(FINE):
             state = a @ state + b[:, 0] * held
@@ -72,16 +72,16 @@ def test_taps_are_for_the_delay_of_the_rig_where_the_model_states_none(tmp_path,
 
 @pytest.mark.parametrize("delay_ticks", [0, 1, 2])
 def test_responses_are_those_of_the_loop_between_ticks_too(delay_ticks) -> None:
-    found = step_responses(CONTROLLER, STAGE, delay_ticks, FINE, 150)
+    responses = step_responses(CONTROLLER, STAGE, delay_ticks, FINE, 150)
     for part, rows in enumerate([([1.0], [0.0]), ([0.0], [1.0])]):
-        x, v = simulated(*rows, 0.0, delay_ticks, 150)
-        np.testing.assert_allclose(found.position[part], x, atol=1e-9)
-        np.testing.assert_allclose(found.command[part], v, atol=1e-9)
+        x, v = simulate(*rows, 0.0, delay_ticks, 150)
+        np.testing.assert_allclose(responses.position[part], x, atol=1e-9)
+        np.testing.assert_allclose(responses.command[part], v, atol=1e-9)
 
 
 @pytest.fixture(scope="module", autouse=True)
-def few_places():
-    """Of each resonance: the tests' own simulation looks between them."""
+def reduced_proofs():
+    """Prove on fewer plants and draw fewer points; the tests simulate plants between them."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(shape_module, "SWEEP_PLACES", 3)
         patch.setattr(shape_module, "PROOF_PLACES", 9)
@@ -90,56 +90,57 @@ def few_places():
 
 
 @pytest.fixture(scope="module")
-def found(few_places):
+def design(reduced_proofs):
+    """Return the taps designed for SUBJECT, with their proof."""
     return design_taps(SUBJECT)
 
 
-def test_taps_keep_band_overshoot_undershoot_and_drive_wherever_the_resonance_is(found) -> None:
+def test_taps_keep_band_overshoot_undershoot_and_drive_wherever_the_resonance_is(design) -> None:
     time_ms = np.arange(1, 300 * FINE + 1) / FINE * PERIOD_S * 1e3
     for shift in np.linspace(-4, 4, 9):
-        x, v = simulated(found.taps.reference, found.taps.command, shift, 1)
-        assert np.all(np.abs(x[time_ms >= found.settling_ms] - 1) <= 0.05)
-        assert x.max() <= 1 + found.proof.overshoot + 1e-6
+        x, v = simulate(design.taps.reference, design.taps.command, shift, 1)
+        assert np.all(np.abs(x[time_ms >= design.settling_ms] - 1) <= 0.05)
+        assert x.max() <= 1 + design.proof.overshoot + 1e-6
         assert x.min() >= -0.05
         assert v.min() >= 1 - 46 / 40 - 1e-3
         assert v.max() <= 46 / 40 + 1e-3
         assert x[-1] == pytest.approx(1.0, abs=1e-4)
-    assert found.proof.overshoot <= 0.0042
-    assert found.taps.reference.sum() == pytest.approx(1.0, abs=1e-9)
-    assert found.fastest_ms == found.settling_ms < 2.0
-    alone, _ = simulated([1.0], [0.0], 0.0, 1)
-    outside = time_ms[np.abs(alone - 1) > 0.05].max()
-    assert outside > 2 * found.settling_ms  # what the taps are for
+    assert design.proof.overshoot <= 0.0042
+    assert design.taps.reference.sum() == pytest.approx(1.0, abs=1e-9)
+    assert design.fastest_ms == design.settling_ms < 2.0
+    without_taps, _ = simulate([1.0], [0.0], 0.0, 1)
+    outside = time_ms[np.abs(without_taps - 1) > 0.05].max()
+    assert outside > 2 * design.settling_ms  # without taps, settling takes more than twice as long
 
 
-def test_nothing_faster_exists_and_less_overshoot_costs_time(found) -> None:
-    """A point below the fastest there are no taps; the least overshoot never rises with the settling time."""
+def test_nothing_faster_exists_and_less_overshoot_costs_time(design) -> None:
+    """No taps settle a quarter tick faster than the fastest; the least overshoot never rises with the settling time."""
     family = SUBJECT.family()
     programme = build_programme(SUBJECT, [family.nominal, *family.sweep_scenarios(3)])
     fastest = fastest_settling(programme, 0.004)
-    assert fastest * 0.1 <= found.fastest_ms + 1e-9
+    assert fastest * 0.1 <= design.fastest_ms + 1e-9
     assert not programme.is_feasible(fastest - 0.25, 0.004)
-    least = [programme.least_overshoot_taps(fastest + more).overshoot for more in (0.0, 1.0, 3.0)]
-    assert least[0] >= least[1] - 1e-9 >= least[2] - 2e-9
-    assert least[0] <= 0.004
+    overshoots = [programme.least_overshoot_taps(fastest + more).overshoot for more in (0.0, 1.0, 3.0)]
+    assert overshoots[0] >= overshoots[1] - 1e-9 >= overshoots[2] - 2e-9
+    assert overshoots[0] <= 0.004
 
 
-def test_more_time_makes_a_quieter_command(found) -> None:
-    later = OPTIONS.model_copy(update={"settling_ms": found.fastest_ms + 0.3})
-    calm = design_taps(Subject(CONTROLLER, STAGE, 1, BOUNDS, 0.004, later))
-    assert calm.settling_ms == pytest.approx(found.fastest_ms + 0.3)
-    assert calm.variation < found.variation
-    x, _ = simulated(calm.taps.reference, calm.taps.command, 4.0, 1)
-    assert np.all(np.abs(x[round(calm.settling_ms * FINE * 10) :] - 1) <= 0.05)
+def test_more_time_makes_a_quieter_command(design) -> None:
+    slower_options = OPTIONS.model_copy(update={"settling_ms": design.fastest_ms + 0.3})
+    slower = design_taps(Subject(CONTROLLER, STAGE, 1, BOUNDS, 0.004, slower_options))
+    assert slower.settling_ms == pytest.approx(design.fastest_ms + 0.3)
+    assert slower.variation < design.variation
+    x, _ = simulate(slower.taps.reference, slower.taps.command, 4.0, 1)
+    assert np.all(np.abs(x[round(slower.settling_ms * FINE * 10) :] - 1) <= 0.05)
 
 
 def test_what_cannot_be_says_what_binds_and_the_fastest() -> None:
-    asked = Subject(CONTROLLER, STAGE, 1, BOUNDS, 0.004, OPTIONS.model_copy(update={"settling_ms": 0.4}))
+    too_fast = Subject(CONTROLLER, STAGE, 1, BOUNDS, 0.004, OPTIONS.model_copy(update={"settling_ms": 0.4}))
     with pytest.raises(
         NoDesign,
         match=r"settling_ms: 0.4 ms cannot be .* the fastest settling time is .*no limit on v .* Most helpful: ",
     ):
-        design_taps(asked)
+        design_taps(too_fast)
     wide = OPTIONS.scenarios.model_copy(update={"gain_percent": 4.0})
     with pytest.raises(NoDesign, match=r"overshoot_percent: 0.0001 % cannot be kept .* the least overshoot is"):
         design_taps(Subject(CONTROLLER, STAGE, 1, BOUNDS, 1e-6, OPTIONS.model_copy(update={"scenarios": wide})))
@@ -207,22 +208,23 @@ gain_percent = 0.0
 SECTIONS = "[[1.0, 0.0, 0.0, 0.0, 0.0]]"
 
 
-def shape(folder, config: str = CONFIG, spec: str = SPEC, *more: str):
+def run_shape(folder, config: str = CONFIG, spec: str = SPEC, *more: str):
+    """Run `design shape` on a configuration and a specification; return the result of the command."""
     (folder / "mine.toml").write_text(config)
     (folder / "spec.toml").write_text(spec)
     arguments = ["design", "shape", str(folder / "mine.toml"), "--spec", str(folder / "spec.toml"), *more]
     return CliRunner().invoke(main, arguments)
 
 
-def test_the_command_writes_both_rows_and_keeps_the_rest(tmp_path, found) -> None:
+def test_the_command_writes_both_rows_and_keeps_the_rest(tmp_path, design) -> None:
     """±10 V and 4.6 µm/V are the ±46 µm of the subject above: the same taps, in a file that keeps its comments."""
     out, plot = tmp_path / "made.toml", tmp_path / "taps.png"
-    result = shape(tmp_path, CONFIG, SPEC, "--out", str(out), "--plot", str(plot), "--json")
+    result = run_shape(tmp_path, CONFIG, SPEC, "--out", str(out), "--plot", str(plot), "--json")
     assert result.exit_code == 0, result.stderr
-    report, written = json.loads(result.stdout), tomllib.loads(out.read_text())["axis"][0]
-    assert written["prefilter"]["taps"] == report["taps"]
-    assert written["prefilter"]["command_taps"] == pytest.approx(found.taps.command.tolist(), abs=1e-6)
-    assert written["specification"] == "spec.toml"
+    report, axis = json.loads(result.stdout), tomllib.loads(out.read_text())["axis"][0]
+    assert axis["prefilter"]["taps"] == report["taps"]
+    assert axis["prefilter"]["command_taps"] == pytest.approx(design.taps.command.tolist(), abs=1e-6)
+    assert axis["specification"] == "spec.toml"
     assert "# my actuator" in out.read_text()
     assert plot.read_bytes().startswith(b"\x89PNG")
     assert len(report["trade_off"]) > 5
@@ -230,14 +232,14 @@ def test_the_command_writes_both_rows_and_keeps_the_rest(tmp_path, found) -> Non
 
 def test_the_command_prints_figures_and_the_written_file_on_stdout(tmp_path) -> None:
     out = tmp_path / "made.toml"
-    result = shape(tmp_path, CONFIG, SPEC, "--out", str(out))
+    result = run_shape(tmp_path, CONFIG, SPEC, "--out", str(out))
     assert result.exit_code == 0, result.stderr
     assert re.search(r"settling time \(5 %\) [\d.]+ ms; with overshoot ≤ [\d.]+ %, the least possible", result.stdout)
     assert result.stdout.endswith(f"{out} is written. To judge it: rtloop design verify {out}\n")
 
 
 @pytest.mark.parametrize(
-    ("old", "new", "code", "said"),
+    ("old", "new", "code", "message"),
     [
         ("overshoot_percent = 0.4", "", 78, "overshoot_percent: missing; allowed: above 0 and up to 5"),
         ("overshoot_percent = 0.4", "overshoot_percent = 0.0", 78, "overshoot_percent: 0.0; allowed: above 0"),
@@ -256,28 +258,30 @@ def test_the_command_prints_figures_and_the_written_file_on_stdout(tmp_path) -> 
         (CONFIG[CONFIG.index("[axis.model]") : CONFIG.index("[axis.limits]")], "", 78, "model: missing"),
     ],
 )
-def test_a_specification_or_configuration_without_taps_is_refused(tmp_path, old, new, code, said) -> None:
-    """`old` becomes `new` in whichever of the two holds it."""
-    result = shape(tmp_path, CONFIG.replace(old, new), SPEC.replace(old, new))
+def test_a_specification_or_configuration_without_taps_is_refused(tmp_path, old, new, code, message) -> None:
+    """`new` replaces `old` in the configuration or in the specification."""
+    result = run_shape(tmp_path, CONFIG.replace(old, new), SPEC.replace(old, new))
     assert result.exit_code == code, result.output
-    assert said in result.stderr
+    assert message in result.stderr
     assert "Traceback" not in result.output
 
 
 def test_a_linear_programme_that_no_solver_finishes_is_refused_in_a_sentence(tmp_path, monkeypatch) -> None:
     failure = optimize.OptimizeResult(status=4, message="Serious difficulties. (HiGHS Status 4: Solve error)")
     monkeypatch.setattr("rtloop.design.robust.programme.linprog", lambda *_, **__: failure)
-    result = shape(tmp_path)
+    result = run_shape(tmp_path)
     assert result.exit_code == 1, result.output
-    said = "mine.toml: shape: the linear programme for the taps was not solved: Serious difficulties. (HiGHS Status 4"
-    assert said in result.stderr
+    message = (
+        "mine.toml: shape: the linear programme for the taps was not solved: Serious difficulties. (HiGHS Status 4"
+    )
+    assert message in result.stderr
     assert "Use another number of shape.taps or shape.points_per_tick" in result.stderr
     with pytest.raises(NoDesign, match="was not solved"):
         design_taps(SUBJECT)
 
 
 @pytest.mark.parametrize(
-    ("missed", "said"),
+    ("missed", "message"),
     [
         (
             {"overshoot": 0.02},
@@ -286,12 +290,12 @@ def test_a_linear_programme_that_no_solver_finishes_is_refused_in_a_sentence(tmp
         ({"excess": 0.01}, "fail the proof on 9 plants: .* and the command v exceeds its limits by 1 % of a step"),
     ],
 )
-def test_taps_that_their_proof_does_not_bear_out_are_refused(monkeypatch, missed, said) -> None:
-    """A plant that no programme has seen misses what is promised, whatever is tried: that is no warning."""
+def test_taps_that_their_proof_does_not_bear_out_are_refused(monkeypatch, missed, message) -> None:
+    """A plant outside the linear programme misses the designed figures in every round: an error, not a warning."""
     monkeypatch.setattr(shape_module, "MOST_ROUNDS", 2)
     real = shape_module.measure_step
-    monkeypatch.setattr(shape_module, "measure_step", lambda *of: real(*of)._replace(**missed))
-    with pytest.raises(NoDesign, match=said):
+    monkeypatch.setattr(shape_module, "measure_step", lambda *arguments: real(*arguments)._replace(**missed))
+    with pytest.raises(NoDesign, match=message):
         design_taps(SUBJECT)
 
 

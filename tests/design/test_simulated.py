@@ -1,4 +1,4 @@
-"""Simulated steps and rest: against recorded runs of the same rig, against scipy, and against what is linear."""
+"""Simulated steps and noise at rest, compared with recorded runs of the same rig, scipy and linear analysis."""
 
 from __future__ import annotations
 
@@ -75,7 +75,8 @@ command_um = 30.0
 """
 
 
-def linear(more: str = "") -> Configuration:
+def linear_rig(more: str = "") -> Configuration:
+    """Return the configuration LINEAR, whose inverse is exact, with the lines `more` added."""
     return parse(LINEAR + more, "linear", Path(), "linear")
 
 
@@ -95,19 +96,19 @@ def test_a_simulation_is_the_run_itself() -> None:
 
 
 def test_positions_between_ticks_are_those_of_the_held_displacement() -> None:
-    bench = Bench(linear(), {})
+    bench = Bench(linear_rig(), {})
     run = bench.run("x", (0.0, 10.0), 0.02)
-    found = bench.true_positions(run, "x").ravel()
+    true_um = bench.true_positions(run, "x").ravel()
     a = np.array([[0.0, 1.0], [-(OMEGA**2), -2 * ZETA * OMEGA]])
-    grown = linalg.expm(np.block([[a, np.array([[0.0], [OMEGA**2]])], [np.zeros((1, 3))]]) / RATE_HZ / POINTS)
+    exponential = linalg.expm(np.block([[a, np.array([[0.0], [OMEGA**2]])], [np.zeros((1, 3))]]) / RATE_HZ / POINTS)
     state, positions = np.zeros(2), []
     for displacement in run["x_hysteresis_um"][1:]:
         for _ in range(POINTS):
             positions.append(state[0])
-            state = grown[:2, :2] @ state + grown[:2, 2] * displacement
-    np.testing.assert_allclose(found[: len(positions)], positions, atol=1e-9)
-    np.testing.assert_allclose(found[::POINTS], run["x_true_position_um"], atol=1e-12)
-    assert found.max() > run["x_true_position_um"].max()
+            state = exponential[:2, :2] @ state + exponential[:2, 2] * displacement
+    np.testing.assert_allclose(true_um[: len(positions)], positions, atol=1e-9)
+    np.testing.assert_allclose(true_um[::POINTS], run["x_true_position_um"], atol=1e-12)
+    assert true_um.max() > run["x_true_position_um"].max()
 
 
 def test_a_disturbance_moves_it_between_ticks_too() -> None:
@@ -115,39 +116,39 @@ def test_a_disturbance_moves_it_between_ticks_too() -> None:
     text = quiet.replace("[driver.plant.sensor]", "[driver.plant.disturbance]\nstep_um = 2.0\n[driver.plant.sensor]")
     bench = Bench(parse(text, "linear", Path(), "linear"), {})
     run = bench.run("x", (0.0,), 0.02)
-    found = bench.true_positions(run, "x").ravel()
-    np.testing.assert_allclose(found[::POINTS], run["x_true_position_um"], atol=1e-12)
+    true_um = bench.true_positions(run, "x").ravel()
+    np.testing.assert_allclose(true_um[::POINTS], run["x_true_position_um"], atol=1e-12)
     time_s = np.arange(POINTS) / POINTS / RATE_HZ  # in the first period the controller has not moved yet
     damped = OMEGA * np.sqrt(1 - ZETA**2)
     decay = np.exp(-ZETA * OMEGA * time_s)
     swing = np.cos(damped * time_s) + ZETA * OMEGA / damped * np.sin(damped * time_s)
-    np.testing.assert_allclose(found[:POINTS], 2.0 * (1 - decay * swing), atol=1e-12)
+    np.testing.assert_allclose(true_um[:POINTS], 2.0 * (1 - decay * swing), atol=1e-12)
 
 
 def test_a_linear_rig_is_simulated_as_it_is_predicted() -> None:
-    """No dead band, no rounding: noise at rest and the figures of a large step are those of the linear loop."""
-    configuration = linear()
+    """Without dead band and rounding, noise at rest and a large step have the figures of the linear loop."""
+    configuration = linear_rig()
     check = prepare(configuration).checks[0]
     assert check.plant is not None
     assert check.running is not None
-    found = simulate(Bench(configuration, {}), configuration.axes[0], 1 / KI, DesignOptions())
+    simulation = simulate(Bench(configuration, {}), configuration.axes[0], 1 / KI, DesignOptions())
     noise = loop_quantities(check.loop(check.plant, 0), SensorOptions(noise_um=0.02))
-    assert found.noise_x_nm == pytest.approx(noise["noise_x_nm"], rel=0.1)
-    assert found.noise_v_nm == pytest.approx(noise["noise_v_nm"], rel=0.1)
-    largest = found.steps[-1]
+    assert simulation.noise_x_nm == pytest.approx(noise["noise_x_nm"], rel=0.1)
+    assert simulation.noise_v_nm == pytest.approx(noise["noise_v_nm"], rel=0.1)
+    largest = simulation.steps[-1]
     assert largest.height_um == 20.0
     assert largest.settling_ms == pytest.approx(1e3 * check.running.settling_time_s, abs=0.1)
     assert largest.overshoot_percent == pytest.approx(check.running.overshoot_percent, abs=0.1)
     assert largest.static_error_percent == pytest.approx(0.0, abs=0.02)
     assert largest.peak_drive_v == pytest.approx(20.0 * check.running.peak_command / 4.0, rel=0.01)
     assert (largest.limited, largest.trips) == ((), ())
-    assert found.omitted_heights_um == (40.0,)
-    assert found.truth == "the configured rig"
+    assert simulation.omitted_heights_um == (40.0,)
+    assert simulation.truth == "the configured rig"
 
 
 @pytest.mark.parametrize("latency_ticks", [0, 2])
 def test_both_rows_of_taps_sections_and_latency_are_predicted_as_they_run(latency_ticks: int) -> None:
-    """A rig without noise runs what the linear analysis says of the same configuration, at ticks and between."""
+    """A rig without noise follows the linear analysis of the same configuration, at and between ticks."""
     quiet = LINEAR.replace("noise_um = 0.02", "noise_um = 0.0").replace(
         "seed = 3", f"seed = 3\nlatency_ticks = {latency_ticks}"
     )
@@ -163,13 +164,14 @@ sections = [[0.2, 0.1, 0.05, -0.9, 0.25]]
     assert check.delay_ticks == latency_ticks
     bench = Bench(configuration, {})
     run = bench.run("x", (0.0, 10.0), 0.1)
-    answer = step_response(check.loop(check.plant, check.delay_ticks), 0.0999)
-    np.testing.assert_allclose(10.0 * answer.position, bench.true_positions(run, "x").ravel()[8000:], atol=1e-8)
-    np.testing.assert_allclose(10.0 * answer.command[::POINTS], run["x_command_um"][1000:], atol=1e-8)
+    response = step_response(check.loop(check.plant, check.delay_ticks), 0.0999)
+    np.testing.assert_allclose(10.0 * response.position, bench.true_positions(run, "x").ravel()[8000:], atol=1e-8)
+    np.testing.assert_allclose(10.0 * response.command[::POINTS], run["x_command_um"][1000:], atol=1e-8)
 
 
 @pytest.fixture(scope="module")
 def paper():
+    """Return the simulation of the paper's loop."""
     return simulate(Bench(PAPER, {}), PAPER.axes[0], 0.031, DesignOptions())
 
 
@@ -185,7 +187,7 @@ def test_what_is_not_linear_is_seen(paper) -> None:
 
 
 def test_noise_at_rest_is_that_of_a_run(paper) -> None:
-    """Of the recorded loop at rest at 5 µm, in another second, under another seed."""
+    """The oracle is the recorded loop at rest at 5 µm, at another time and with another seed."""
     text = changed(("seed = 1 ", "seed = 8 "), ("levels = [20.0, 0.0, -20.0, 0.0]", "levels = [5.0]"))
     recorded = RealLoop(text)
     recorded.run(15_000)
@@ -195,11 +197,11 @@ def test_noise_at_rest_is_that_of_a_run(paper) -> None:
     rms = {name: 1e3 * rows[:, names.index(name)].std() for name in ("x_command_um", "x_true_position_um")}
     assert paper.noise_v_nm == pytest.approx(rms["x_command_um"], rel=0.35)
     assert paper.noise_x_nm == pytest.approx(rms["x_true_position_um"], rel=0.6)
-    assert paper.noise_v_nm > 5 * 12.95  # what is linear says 13 nm
+    assert paper.noise_v_nm > 5 * 12.95  # the linear loop has 13 nm
 
 
 def test_an_amplifier_with_one_side_steps_to_that_side() -> None:
-    configuration = linear()
+    configuration = linear_rig()
     axis = configuration.axes[0].model_copy(update={"limits": LimitsOptions(drive_min_v=0.0, command_um=30.0)})
     configuration = replace(configuration, axes=(axis,))
     design = DesignOptions.model_validate({"simulation": {"steps_um": [20.0]}})
@@ -208,24 +210,24 @@ def test_an_amplifier_with_one_side_steps_to_that_side() -> None:
 
 
 def test_a_model_stands_for_hardware() -> None:
-    """With the hysteresis that a compensation experiment found, and without."""
+    """The rig is built without residual hysteresis, and with the value of a compensation experiment."""
     card = replace(PAPER, driver_kind="card", driver_options=Options())
-    stand = HardwareModel(PAPER.axes[0].model, 0.01, 0.01, None, 0.0)
+    exact = HardwareModel(PAPER.axes[0].model, 0.01, 0.01, None, 0.0)
     design = DesignOptions.model_validate({"simulation": {"steps_um": [20.0]}})
-    found = [
-        simulate(Bench(card, {"x": one}), card.axes[0], 0.031, design)
-        for one in (stand, stand._replace(residual_percent=3.75))
+    simulations = [
+        simulate(Bench(card, {"x": hardware}), card.axes[0], 0.031, design)
+        for hardware in (exact, exact._replace(residual_percent=3.75))
     ]
-    assert {one.truth for one in found} == {"a rig built from the axis's models"}
-    assert found[1].steps[0].overshoot_percent > found[0].steps[0].overshoot_percent
+    assert {simulation.truth for simulation in simulations} == {"a rig built from the axis's models"}
+    assert simulations[1].steps[0].overshoot_percent > simulations[0].steps[0].overshoot_percent
     with pytest.raises(ValueError, match=r"axis.x.model: missing; the simulation of the hardware"):
-        Bench(card, {"x": stand._replace(model=None)})
+        Bench(card, {"x": exact._replace(model=None)})
     with pytest.raises(ValueError, match=r"residual_percent: 90 %; allowed: above .* % and below .* %"):
-        Bench(card, {"x": stand._replace(residual_percent=90.0)})
+        Bench(card, {"x": exact._replace(residual_percent=90.0)})
 
 
 @pytest.mark.parametrize(
-    ("specification", "simulation", "heights_um", "judged"),
+    ("specification", "simulation", "heights_um", "counts"),
     [
         ({}, {}, (1.0, 5.0, 20.0, 40.0), False),
         ({"command": {"reference_um": 18.0, "command_um": 20.0}}, {}, (1.0, 5.0, 20.0, 40.0, 18.0), False),
@@ -236,10 +238,10 @@ def test_a_model_stands_for_hardware() -> None:
         ({}, {"judged": True}, (1.0, 5.0, 20.0, 40.0), True),
     ],
 )
-def test_the_step_that_is_asked_for_is_simulated_and_judged(specification, simulation, heights_um, judged) -> None:
-    """The size that the specification names is one of the heights; a hysteresis that is stated makes steps count."""
+def test_the_step_that_is_asked_for_is_simulated_and_judged(specification, simulation, heights_um, counts) -> None:
+    """The specification's height is simulated too; a stated residual hysteresis makes the steps count."""
     design = DesignOptions.model_validate({"specification": specification, "simulation": simulation})
-    assert (design.step_heights_um, design.judges_simulated_steps) == (heights_um, judged)
+    assert (design.step_heights_um, design.judges_simulated_steps) == (heights_um, counts)
 
 
 def test_what_cannot_run_is_not_simulated() -> None:
@@ -250,41 +252,42 @@ def test_what_cannot_run_is_not_simulated() -> None:
 
 @pytest.mark.parametrize("percent", [2.0, 3.75, 10.0])
 def test_hysteresis_that_is_left_is_as_much_as_was_said(percent: float) -> None:
-    """h/H of the changed actuator behind the inverse of the model, by plays written down here."""
+    """The oracle is h/H of the changed actuator behind the model's inverse, by plays that the test computes."""
     model = PlayModel(np.array([0.0, 1.0, 2.0, 4.0, 6.0]), np.array([1.3, 0.3, 0.2, 0.3, 0.2]))
     changed_model = add_residual_hysteresis(model, percent, 10.0)
     inverse = model.inverse()
     top = float(np.maximum(10.0 - model.thresholds, 0) @ model.weights)
     v = top * np.interp(np.arange(6001), [0, 1000, 3000, 5000, 6000], [0, 1, -1, 1, 0])
-    y = plays(plays(v, inverse), changed_model)
+    y = simulate_plays(simulate_plays(v, inverse), changed_model)
     down, up = y[1000:3001], y[3000:5001][::-1]
     assert 100 * np.abs(down - up).max() / np.ptp(y[1000:]) == pytest.approx(percent, rel=0.03)
     assert np.ptp(y) == pytest.approx(2 * top, rel=1e-3)
 
 
-def plays(values: np.ndarray, model: PlayModel) -> np.ndarray:
-    held, found = np.zeros(model.thresholds.size), []
+def simulate_plays(values: np.ndarray, model: PlayModel) -> np.ndarray:
+    """Return the weighted sum of a model's plays for each value, computed sample by sample from rest."""
+    outputs, positions = np.zeros(model.thresholds.size), []
     for value in values:
-        held = np.maximum(value - model.thresholds, np.minimum(value + model.thresholds, held))
-        found.append(model.weights @ held)
-    return np.array(found)
+        outputs = np.maximum(value - model.thresholds, np.minimum(value + model.thresholds, outputs))
+        positions.append(model.weights @ outputs)
+    return np.array(positions)
 
 
 def test_as_many_steps_keep_what_is_said_of_them() -> None:
-    """Counted on steps under other noise than that of the simulation, which decides what the paper's loop does."""
+    """The oracle counts steps under other noise draws; noise decides the overshoot of the paper's loop."""
     height_um, cycles = 5.0, 12
-    asked = DesignOptions().model_copy(update={"simulation": SimulationOptions(steps_um=(height_um,))})
+    design = DesignOptions().model_copy(update={"simulation": SimulationOptions(steps_um=(height_um,))})
     bench = Bench(PAPER, {})
-    (said,) = simulate(bench, PAPER.axes[0], 0.03, asked).steps
-    assert said.typical[0] < 0.9 * said.overshoot_percent
+    (simulated,) = simulate(bench, PAPER.axes[0], 0.03, design).steps
+    assert simulated.typical[0] < 0.9 * simulated.overshoot_percent
     overshoots = []
     for draw in range(100, 108):
         levels = (0.0, *cycles * (height_um, 0.0, -height_um, 0.0))
         position = bench.run("x", levels, 0.36, draw)["x_true_position_um"].reshape(len(levels), -1)[1:]
         upwards = position * np.tile([1, -1, -1, 1], cycles)[:, None] / height_um
         overshoots.append(100 * (upwards.max(axis=1) - upwards[:, -720:].mean(axis=1)))
-    assert 0.92 < np.mean(np.array(overshoots) <= said.overshoot_percent) < 0.98
-    assert 0.4 < np.mean(np.array(overshoots) <= said.typical[0]) < 0.6
+    assert 0.92 < np.mean(np.array(overshoots) <= simulated.overshoot_percent) < 0.98
+    assert 0.4 < np.mean(np.array(overshoots) <= simulated.typical[0]) < 0.6
 
 
 @pytest.mark.parametrize(
@@ -303,7 +306,7 @@ def test_noise_decides_a_figure_whose_quantile_is_far_from_its_median(quantile, 
 
 
 def test_steps_that_did_not_reach_their_reference_count_as_the_worst() -> None:
-    """95 of 100 steps keep what is promised; where fewer reach their reference there is no promise."""
-    good, unreached = [1.0, 2.0, 0.1], [np.nan, np.inf, 100.0]
-    assert step_quantiles(np.array([good] * 97 + [unreached] * 3)) == tuple(good)
-    assert step_quantiles(np.array([good] * 90 + [unreached] * 10)) == (np.inf, np.inf, 100.0)
+    """95 of 100 steps keep the figures; where fewer steps reach their reference, the figures are the worst."""
+    settled, unreached = [1.0, 2.0, 0.1], [np.nan, np.inf, 100.0]
+    assert step_quantiles(np.array([settled] * 97 + [unreached] * 3)) == tuple(settled)
+    assert step_quantiles(np.array([settled] * 90 + [unreached] * 10)) == (np.inf, np.inf, 100.0)

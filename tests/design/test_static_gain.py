@@ -1,4 +1,4 @@
-"""The gain at rest from a staircase: of a plant with a known gain, with noise, and with hysteresis that is left."""
+"""The static gain from a staircase, on plants of known gain with noise and with residual hysteresis."""
 
 from __future__ import annotations
 
@@ -19,35 +19,35 @@ def test_a_staircase_goes_out_and_back_in_equal_steps_without_a_jump():
     assert np.abs(np.diff(reference)).max() < 0.01
 
 
-@pytest.mark.parametrize(("noise_um", "misses"), [(0.01, 0.001), (0.1, 0.01)])
-def test_its_standard_deviation_covers_the_error_that_noise_makes(noise_um: float, misses: float):
+@pytest.mark.parametrize(("noise_um", "largest_std"), [(0.01, 0.001), (0.1, 0.01)])
+def test_its_standard_deviation_covers_the_error_that_noise_makes(noise_um: float, largest_std: float):
     random, reference = np.random.default_rng(1), staircase(0.0, 10.0, RATE_HZ)
-    found = []
+    gains = []
     for _ in range(20):
         position = reference + noise_um * random.standard_normal(reference.size)
-        found.append(static_gain(reference, position, reference / 0.95 + 2.0, RATE_HZ))
-    errors = np.array([(one.value - 0.95) / one.std for one in found])
+        gains.append(static_gain(reference, position, reference / 0.95 + 2.0, RATE_HZ))
+    errors = np.array([(gain.value - 0.95) / gain.std for gain in gains])
     assert np.abs(errors).max() < 3.0
-    assert max(one.std for one in found) < misses
-    assert (found[0].from_um, found[0].to_um) == (0.0, 10.0)
+    assert max(gain.std for gain in gains) < largest_std
+    assert (gains[0].from_um, gains[0].to_um) == (0.0, 10.0)
 
 
 def test_hysteresis_that_is_left_is_in_the_standard_deviation_and_its_turns_are_left_out():
-    """x = 0.97 v + 0.03 F_0.5[v]: of slope 1, and 0.97 for 1 µm after a turn."""
+    """x = 0.97 v + 0.03 F_0.5[v] has slope 1, and slope 0.97 for 1 µm after a turn."""
     command = staircase(0.0, 10.0, RATE_HZ)
     position = 0.97 * command + 0.03 * play_outputs(command, [0.5])[:, 0]
-    found = static_gain(command, position, command, RATE_HZ)
-    assert found.value == pytest.approx(1.0, abs=0.001)
-    assert 0.0 < found.std < 0.001
+    gain = static_gain(command, position, command, RATE_HZ)
+    assert gain.value == pytest.approx(1.0, abs=0.001)
+    assert 0.0 < gain.std < 0.001
 
 
 def test_its_standard_deviation_is_that_of_a_mean_of_slopes():
-    """Fourteen steps count; each of a slope of its own, here with a scatter of 2 %."""
+    """Fourteen steps count; their slopes scatter by 2 %."""
     command, random = staircase(0.0, 10.0, RATE_HZ), np.random.default_rng(2)
-    held = command.reshape(2 * STEPS + 1, -1)
+    plateaus = command.reshape(2 * STEPS + 1, -1)
     slopes = 1.0 + 0.02 * random.standard_normal(2 * STEPS)
-    levels = np.concatenate([[0.0], np.cumsum(slopes * np.diff(held[:, -1]))])
-    position = np.repeat(levels, held.shape[1])
+    levels = np.concatenate([[0.0], np.cumsum(slopes * np.diff(plateaus[:, -1]))])
+    position = np.repeat(levels, plateaus.shape[1])
     counted = np.delete(slopes, [0, STEPS])
     assert static_gain(command, position, command, RATE_HZ).std == pytest.approx(
         np.std(counted, ddof=1) / np.sqrt(14), rel=1e-9

@@ -1,4 +1,4 @@
-"""From the paper's data to the paper's controller, and what is said where a specification cannot be met."""
+"""Synthesis turns the paper's data into the paper's controller; errors name the requirement that cannot be met."""
 
 import json
 import tomllib
@@ -24,11 +24,11 @@ PAPER = synthesise(PAPER_D, PAPER_WEIGHTS, order=5)
 
 
 def numbers_of_eq_20(controller) -> dict[str, float]:
-    """The numbers that eq (20) prints: gain, and the coefficients of each factor."""
+    """Return the numbers that eq (20) prints: gain, and the coefficients of each factor."""
     zeros, poles = np.sort_complex(controller.zeros), np.sort_complex(controller.poles)
     real = poles[poles.imag == 0].real
-    above, pair = zeros[zeros.imag > 0], poles[poles.imag > 0][0]
-    first, second = above[np.argsort(np.abs(above))]
+    upper_zeros, pair = zeros[zeros.imag > 0], poles[poles.imag > 0][0]
+    first, second = upper_zeros[np.argsort(np.abs(upper_zeros))]
     return {
         "gain": controller.gain, "far zero": -zeros[zeros.imag == 0].real[0],
         "zeros 1, s": -2 * first.real, "zeros 1, 1": abs(first) ** 2,
@@ -66,23 +66,23 @@ def test_truncation_has_no_direct_part_and_residualisation_has() -> None:
 
 
 def test_the_order_is_the_lowest_that_loses_little() -> None:
-    """The norm that is reported is that of an independent grid."""
+    """The oracle of the reported norm is a dense grid of frequencies."""
     standard = augment(PAPER_D, PAPER_WEIGHTS)
     for loss, order in ((0.1, 5), (0.005, 8), (1e-5, 10)):
-        found = synthesise(PAPER_D, PAPER_WEIGHTS, largest_loss=loss)
-        a, b, c, d = realise_transfer(found.controller)
+        synthesis = synthesise(PAPER_D, PAPER_WEIGHTS, largest_loss=loss)
+        a, b, c, d = realise_transfer(synthesis.controller)
         norm = dense_norm(*standard.close_loop(Matrices(a, b[:, None], c[None], np.array([[d]]))))
-        assert found.controller.order == order
-        assert norm == pytest.approx(found.achieved, rel=1e-4)
-        assert norm <= (1 + loss) * found.hinf.gamma * (1 + 1e-5)
+        assert synthesis.controller.order == order
+        assert norm == pytest.approx(synthesis.achieved, rel=1e-4)
+        assert norm <= (1 + loss) * synthesis.hinf.gamma * (1 + 1e-5)
 
 
 def test_poles_at_1_beside_1e5_survive() -> None:
     """Synthesis at once over eight decades: the full controller keeps its γ, the reduced one its static gain."""
     weights = PAPER_WEIGHTS._replace(tracking=tracking_weight(1e-5, 1e3, 0.0))
-    found = synthesise(PAPER_D, weights, order=6)
-    assert found.hinf.achieved <= 1.002 * found.hinf.gamma
-    assert found.controller.dc_gain == pytest.approx(found.full.dc_gain, rel=1e-8)
+    synthesis = synthesise(PAPER_D, weights, order=6)
+    assert synthesis.hinf.achieved <= 1.002 * synthesis.hinf.gamma
+    assert synthesis.controller.dc_gain == pytest.approx(synthesis.full.dc_gain, rel=1e-8)
 
 
 def run(*arguments: str):
@@ -101,15 +101,15 @@ def test_the_command_writes_a_section_that_a_configuration_reads(tmp_path) -> No
     controller = TransferControllerOptions.model_validate(tomllib.loads(text)["axis"][0]["controller"]).transfer()
     assert [[root.real, root.imag] for root in controller.poles] == report["poles"]
     assert controller.gain == report["gain"]
-    again = run(str(SPEC))
-    assert again.exit_code == 0
-    alone = TransferControllerOptions.model_validate(tomllib.loads(again.stdout)["axis"]["controller"]).transfer()
-    assert alone.poles.tolist() == controller.poles.tolist()
-    assert alone.zeros.tolist() == controller.zeros.tolist()
+    printed = run(str(SPEC))
+    assert printed.exit_code == 0
+    reread = TransferControllerOptions.model_validate(tomllib.loads(printed.stdout)["axis"]["controller"]).transfer()
+    assert reread.poles.tolist() == controller.poles.tolist()
+    assert reread.zeros.tolist() == controller.zeros.tolist()
 
 
 @pytest.mark.parametrize(
-    ("old", "new", "code", "says"),
+    ("old", "new", "code", "message"),
     [
         ('rule = "printed"', 'rule = "implied"', 1, "Relax the hardest requirement: disturbance"),
         ("command_um = 40.0", "command_um = 30.0", 1, "allowed: at least 39.5305 µm, or a smaller reference_um"),
@@ -136,18 +136,18 @@ def test_the_command_writes_a_section_that_a_configuration_reads(tmp_path) -> No
         ("settling_ms = 3.0  ", "settling_ms = ", 78, "not valid TOML"),
     ],
 )
-def test_bad_specifications_say_what_would_help(tmp_path, old, new, code, says) -> None:
+def test_bad_specifications_say_what_would_help(tmp_path, old, new, code, message) -> None:
     spec = tmp_path / "spec.toml"
     assert TEXT.count(old) == 1
     spec.write_text(TEXT.replace(old, new), encoding="utf-8")
     result = run(str(spec))
     assert result.exit_code == code, result.stderr
-    assert says in result.stderr
+    assert message in result.stderr
     assert "Traceback" not in result.output
 
 
 def test_a_plant_that_no_command_stabilises_is_named(tmp_path) -> None:
-    """An unstable mode that a zero of the plant hides."""
+    """A zero of the plant cancels the unstable mode."""
     spec = tmp_path / "spec.toml"
     start, end = TEXT.index("gain = -20.7"), TEXT.index("[specification]")
     plant = "gain = 1.2e6\nnumerator = [[1.0, -5.0]]\ndenominator = [[1.0, -5.0], [1.0, 300.0], [1.0, 4e3]]\n"

@@ -1,4 +1,4 @@
-"""Strictly proper plants of one and two modes, as every textbook has them: from a specification to a file that runs."""
+"""Strictly proper textbook plants of one and two modes: from a specification to a configuration that runs."""
 
 import json
 import math
@@ -26,18 +26,18 @@ NOT_STRONGLY_STABILISABLE = Transfer.from_zpk([10.0], [50.0, -100.0], 50.0)
 
 
 def factors(modes: list[tuple[float, float]]) -> list[list[float]]:
-    """s² + 2ζω s + ω² of each (Hz, ζ)."""
+    """Return the coefficients of s² + 2ζω s + ω² for each mode (Hz, ζ)."""
     return [[1.0, 4 * math.pi * hz * damping, (2 * math.pi * hz) ** 2] for hz, damping in modes]
 
 
 def specification(
     folder: Path, modes: list[tuple[float, float]], settling_ms: float = 3.0, delay_ticks: int = 0
 ) -> Path:
-    """A plant of static gain 1 under the paper's specification."""
+    """Write the paper's specification for a plant of static gain 1; return the path."""
     denominator = factors(modes)
     path = folder / "spec.toml"
     path.write_text(
-        f'[plant]\nform = "factors"\ngain = {math.prod(one[-1] for one in denominator)!r}\nnumerator = []\n'
+        f'[plant]\nform = "factors"\ngain = {math.prod(factor[-1] for factor in denominator)!r}\nnumerator = []\n'
         f"denominator = {denominator}\ndelay_ticks = {delay_ticks}\n"
         f"[specification]\novershoot_percent = 0.0\nstatic_error_percent = 0.1\nsettling_ms = {settling_ms}\n"
         "[specification.disturbance]\nlargest_um = 3.285\nerror_um = 0.1\n"
@@ -54,10 +54,10 @@ def run(*arguments: str | Path) -> Result:
 @pytest.mark.parametrize("modes", [ONE_MODE, TWO_MODES], ids=["one mode", "two modes"])
 @pytest.mark.parametrize("delay_ticks", [0, 3])
 def test_what_is_written_passes_check(tmp_path, modes, delay_ticks) -> None:
-    """What `check` refuses, `prepare` raises. Warnings are errors here, so none of them reaches a terminal either."""
+    """`prepare` raises an error for every fault that `check` refuses. Warnings are errors in tests: none is printed."""
     out = tmp_path / "written.toml"
-    made = run("design", "synthesise", specification(tmp_path, modes, 8.0, delay_ticks), "--out", out)
-    assert made.exit_code == 0, made.output
+    result = run("design", "synthesise", specification(tmp_path, modes, 8.0, delay_ticks), "--out", out)
+    assert result.exit_code == 0, result.output
     (check,) = prepare(load(out)).checks
     assert check.running is not None
     assert check.running.stable
@@ -66,18 +66,18 @@ def test_what_is_written_passes_check(tmp_path, modes, delay_ticks) -> None:
 
 @pytest.mark.parametrize("modes", [ONE_MODE, TWO_MODES], ids=["one mode", "two modes"])
 def test_roots_far_beyond_the_rate_are_not_written_and_the_band_is_kept(tmp_path, modes) -> None:
-    """Against the controller without that step: its gain at 0 Hz, and its response up to half the rate."""
-    made = run("design", "synthesise", specification(tmp_path, modes), "--json")
-    assert made.exit_code == 0, made.output
-    found = json.loads(made.stdout)
-    zeros, poles = (np.array([complex(*root) for root in found[name]]) for name in ("zeros", "poles"))
+    """The oracle is the controller with all its roots: its gain at 0 Hz and its response up to half the rate."""
+    result = run("design", "synthesise", specification(tmp_path, modes), "--json")
+    assert result.exit_code == 0, result.output
+    report = json.loads(result.stdout)
+    zeros, poles = (np.array([complex(*root) for root in report[name]]) for name in ("zeros", "poles"))
     assert max(np.abs(zeros).max(), np.abs(poles).max()) < 1000 * HALF_RATE_RAD_S
     denominator = factors(modes)
-    plant = Transfer.from_factors(math.prod(one[-1] for one in denominator), [], denominator)
+    plant = Transfer.from_factors(math.prod(factor[-1] for factor in denominator), [], denominator)
     weights = PAPER_WEIGHTS._replace(disturbance=Transfer.from_zpk([-1.0], [-1000.0], 0.1 / 3.285))
     reference = synthesise(plant, weights).controller
     s = 1j * np.concatenate([[0.0], np.geomspace(1.0, HALF_RATE_RAD_S, 500)])
-    written = Transfer.from_zpk(zeros, poles, found["gain"]).response(s)
+    written = Transfer.from_zpk(zeros, poles, report["gain"]).response(s)
     error = np.abs(written - reference.response(s)) / np.abs(reference.response(s))
     assert error[0] < 1e-6
     assert error.max() < 2e-3
@@ -85,14 +85,14 @@ def test_roots_far_beyond_the_rate_are_not_written_and_the_band_is_kept(tmp_path
 
 def test_a_plant_that_only_an_unstable_controller_stabilises() -> None:
     """The search for the order begins at the number of unstable modes, which reduction keeps."""
-    found = synthesise(NOT_STRONGLY_STABILISABLE, PAPER_WEIGHTS)
-    assert np.sum(found.full.poles.real > 0) == 1
-    assert np.sum(found.controller.poles.real > 0) == 1
-    assert np.isfinite(found.achieved)
+    synthesis = synthesise(NOT_STRONGLY_STABILISABLE, PAPER_WEIGHTS)
+    assert np.sum(synthesis.full.poles.real > 0) == 1
+    assert np.sum(synthesis.controller.poles.real > 0) == 1
+    assert np.isfinite(synthesis.achieved)
 
 
 def test_the_file_holds_an_axis_that_a_running_service_can_take_the_controller_from(tmp_path) -> None:
-    """As `rtloop ctl controller` reads it: the axis of a whole configuration."""
+    """`rtloop ctl controller` reads the axis of a whole configuration."""
     out = tmp_path / "written.toml"
     assert run("design", "synthesise", specification(tmp_path, ONE_MODE), "--out", out, "--axis", "z").exit_code == 0
     (axis,) = load(out).axes
@@ -103,12 +103,12 @@ def test_the_file_holds_an_axis_that_a_running_service_can_take_the_controller_f
 
 
 def test_what_does_not_run_is_refused_with_what_would_help(tmp_path) -> None:
-    """Two milliseconds of settling behind 16 samples of delay, at a given order and without one."""
+    """The loop cannot settle within 2 ms behind 16 samples of delay."""
     spec = specification(tmp_path, ONE_MODE, 2.0, 16)
-    made = run("design", "synthesise", spec)
-    assert made.exit_code == 1
-    assert "settling" in made.stderr
-    assert "Traceback" not in made.output
+    result = run("design", "synthesise", spec)
+    assert result.exit_code == 1
+    assert "settling" in result.stderr
+    assert "Traceback" not in result.output
 
 
 def test_a_plant_of_repeated_poles_gets_a_rig_that_takes_them(tmp_path) -> None:
@@ -119,6 +119,6 @@ def test_a_plant_of_repeated_poles_gets_a_rig_that_takes_them(tmp_path) -> None:
         "gain = 1e24\nnumerator = []\ndenominator = [[1.0, 1e6], [1.0, 1e6], [1.0, 2000.0, 1e6], [1.0, 1000.0, 1e6]]\n"
     )
     spec.write_text(text[:start] + plant + text[end:], encoding="utf-8")
-    made = run("design", "synthesise", spec, "--out", out)
-    assert made.exit_code == 0, made.output
+    result = run("design", "synthesise", spec, "--out", out)
+    assert result.exit_code == 0, result.output
     assert prepare(load(out)).checks[0].running is not None

@@ -1,4 +1,4 @@
-"""What is written says the same values when it is read, and a file that is changed keeps its comments."""
+"""Written TOML reads back as the same values, and an edited file keeps its comments."""
 
 import tomllib
 
@@ -30,8 +30,8 @@ def test_whatever_is_changed_says_what_it_should(old, new):
 
 @pytest.mark.parametrize("number", [0.1, 1e-300, 5e-324, 1e22, -0.0, float("inf"), np.float64(2 / 3)])
 def test_a_number_keeps_its_bits(number):
-    found = tomllib.loads(write_section("x", {"a": number}))["x"]["a"]
-    assert np.float64(found).tobytes() == np.float64(number).tobytes()
+    number_read = tomllib.loads(write_section("x", {"a": number}))["x"]["a"]
+    assert np.float64(number_read).tobytes() == np.float64(number).tobytes()
 
 
 TEXT = """\
@@ -60,13 +60,13 @@ def test_comments_are_kept_and_what_is_new_has_its_place():
     del values["loop"]["mode"]
     values["axis"][0] |= {"specification": "spec.toml", "controller": {"gain": 3.0, "poles": [[-1.0, 2.0]] * 12}}
     values["axis"][0]["feedforward"]["weights"] = [4.0]
-    found = edit_text(TEXT, values, ["made anew"])
-    assert tomllib.loads(found) == values
-    assert found.startswith("# made anew\n")
+    text = edit_text(TEXT, values, ["made anew"])
+    assert tomllib.loads(text) == values
+    assert text.startswith("# made anew\n")
     for line in ("# the stage on the left table", "# as fast as the sensor", "# along the beam", "# where the disk is"):
-        assert line in found
-    assert "until there is a law" not in found
-    assert found.index("# made anew") < found.index("# the stage") < found.index("specification") < found.index('"y"')
+        assert line in text
+    assert "until there is a law" not in text
+    assert text.index("# made anew") < text.index("# the stage") < text.index("specification") < text.index('"y"')
 
 
 @pytest.mark.parametrize(
@@ -126,24 +126,24 @@ def test_comments_go_with_the_sections_that_are_written_anew():
     del values["schedule"]
     values["axis"]["controller"] = {"gain": 1.0, "list": [[1.0]]}
     values["axis"]["interlocks"]["swings"] = 8
-    found = edit_text(STALE, values, ["made anew"], ["controller", "limits"])
-    assert tomllib.loads(found) == values
-    assert found.startswith("#:schema ./rtloop.schema.json\n\n# made anew\n\n# my stage\n\n# its rate\n[loop]\n")
+    edited = edit_text(STALE, values, ["made anew"], ["controller", "limits"])
+    assert tomllib.loads(edited) == values
+    assert edited.startswith("#:schema ./rtloop.schema.json\n\n# made anew\n\n# my stage\n\n# its rate\n[loop]\n")
     for comment in ("integrator", "tenth of the rate", "1/s", "# off", "a step", "to 5 V", "a backup"):
-        assert comment not in found, comment
+        assert comment not in edited, comment
     for comment in ("above the limits", "nine tenths", "or it breaks", "# what trips\n[axis.interlocks]", "the stop"):
-        assert comment in found, comment
-    again = edit_text(found, values, ["made once more"], ["controller"])
-    assert again.startswith("#:schema ./rtloop.schema.json\n\n# made once more\n\n# made anew\n")
-    assert again.count("#:schema") == 1
+        assert comment in edited, comment
+    edited_twice = edit_text(edited, values, ["made once more"], ["controller"])
+    assert edited_twice.startswith("#:schema ./rtloop.schema.json\n\n# made once more\n\n# made anew\n")
+    assert edited_twice.count("#:schema") == 1
 
 
 def test_a_table_of_another_axis_keeps_its_comments():
     text = "# of x\n[[axis]]\n# old\n[axis.c]\na = 1\n# of y\n[[axis]]\n# still true\n[axis.c]\na = 1\n"
     values = {"axis": [{"c": {"a": 2}}, {"c": {"a": 1}}]}
-    found = edit_text(text, values, (), ["c"])
-    assert tomllib.loads(found) == values
-    assert found == text.replace("# old\n", "").replace("a = 1", "a = 2", 1)
+    edited = edit_text(text, values, (), ["c"])
+    assert tomllib.loads(edited) == values
+    assert edited == text.replace("# old\n", "").replace("a = 1", "a = 2", 1)
 
 
 @given(TABLES, TABLES, st.lists(KEYS))

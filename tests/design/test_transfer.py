@@ -1,4 +1,4 @@
-"""Transfer functions: four ways to write the same one, and what is refused."""
+"""Transfer functions: four forms of one function respond alike, and malformed forms are refused."""
 
 import math
 
@@ -48,7 +48,7 @@ def test_four_forms_of_one_transfer_function() -> None:
 
 @pytest.mark.parametrize("transfer", [PAPER_C, PAPER_D], ids=["C", "D"])
 def test_state_space_of_a_stiff_system_comes_back(transfer: Transfer) -> None:
-    """A modal sum computed here, from the factors, with poles from 1 to 6e4 rad/s."""
+    """The state space is a modal sum that the test computes from the roots, with poles from 1 to 6e4 rad/s."""
     poles, zeros = transfer.poles, transfer.zeros
     residues = [transfer.gain * np.prod(p - zeros) / np.prod(p - np.delete(poles, i)) for i, p in enumerate(poles)]
     real = np.zeros((poles.size, poles.size))
@@ -59,9 +59,9 @@ def test_state_space_of_a_stiff_system_comes_back(transfer: Transfer) -> None:
             c[i : i + 2] = residues[i].real - residues[i].imag, residues[i].real + residues[i].imag
         elif p.imag == 0:
             real[i, i], c[i] = p.real, residues[i].real
-    back = Transfer.from_state_space(real, b, c, transfer.high_frequency_gain)
-    assert back.zeros.size == zeros.size
-    assert back.response(S) == pytest.approx(transfer.response(S), rel=1e-6)
+    converted = Transfer.from_state_space(real, b, c, transfer.high_frequency_gain)
+    assert converted.zeros.size == zeros.size
+    assert converted.response(S) == pytest.approx(transfer.response(S), rel=1e-6)
 
 
 def test_zeros_at_infinity_of_a_state_space_are_left_out() -> None:

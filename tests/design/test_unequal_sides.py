@@ -1,4 +1,4 @@
-"""Steps on a drive of -2 … 10 V: their room, where they are simulated, and the bounds of taps."""
+"""Steps on a drive of -2 … 10 V: the range of positions, the simulated levels and the bounds of taps."""
 
 from __future__ import annotations
 
@@ -27,6 +27,7 @@ MODEL = PlayModel(np.array(THRESHOLDS_V), np.array(WEIGHTS_UM_PER_V))
 
 
 def stage(**limits: float) -> Configuration:
+    """Return the configuration of the stage with changed limits."""
     configuration = parse(STAGE, "stage", Path(), "stage")
     (axis,) = configuration.axes
     changed = LimitsOptions.model_validate(axis.limits.model_dump() | limits)
@@ -34,12 +35,12 @@ def stage(**limits: float) -> Configuration:
 
 
 def test_the_range_of_positions_is_that_of_the_loop_between_both_ends() -> None:
-    """By plays that move sample by sample: from rest to 10 V, and back to -2 V, where the memory takes 1.4 µm."""
+    """The oracle is plays, sample by sample: from rest to 10 V, and back to -2 V, where memory adds 1.4 µm."""
     high_um, low_um = curve([HIGHEST_V, LOWEST_V])
-    found = reachable_range(MODEL, LOWEST_V, HIGHEST_V)
-    assert found == pytest.approx((low_um, high_um))
+    position_range = reachable_range(MODEL, LOWEST_V, HIGHEST_V)
+    assert position_range == pytest.approx((low_um, high_um))
     assert low_um - curve([LOWEST_V])[0] > 1.0
-    assert found.span_um == pytest.approx(major_loop()[1])
+    assert position_range.span_um == pytest.approx(major_loop()[1])
     assert reachable_range(MODEL, -HIGHEST_V, -LOWEST_V) == pytest.approx((-high_um, -low_um))
     negative = PlayModel(MODEL.thresholds, -MODEL.weights)
     assert reachable_range(negative, LOWEST_V, HIGHEST_V) == pytest.approx((-high_um, -low_um))
@@ -62,10 +63,10 @@ def test_positions_are_held_where_the_drive_that_they_need_is_allowed(positions_
 
 
 def test_a_dead_band_takes_its_part_on_both_sides() -> None:
-    late = PlayModel(MODEL.thresholds + 0.5, MODEL.weights)
+    model = PlayModel(MODEL.thresholds + 0.5, MODEL.weights)
     position_um = curve([HIGHEST_V - 0.5])[0]
-    assert can_hold(late, [position_um - 1e-6], LOWEST_V, HIGHEST_V)
-    assert not can_hold(late, [position_um + 1e-3], LOWEST_V, HIGHEST_V)
+    assert can_hold(model, [position_um - 1e-6], LOWEST_V, HIGHEST_V)
+    assert not can_hold(model, [position_um + 1e-3], LOWEST_V, HIGHEST_V)
 
 
 @pytest.mark.usefixtures("few_simulated_steps")
@@ -82,18 +83,18 @@ def test_large_steps_are_simulated_within_the_range_of_the_longer_side(monkeypat
 
     monkeypatch.setattr(bench, "run", spied_run)
     design = DesignOptions(simulation=SimulationOptions(steps_um=(1.0, 20.0, 43.0, 46.0)))
-    found = simulate(bench, axis, 1 / 600.0, design)
+    simulation = simulate(bench, axis, 1 / 600.0, design)
     high_um, low_um = curve([HIGHEST_V, LOWEST_V])
     middle_um = (low_um + high_um) / 2
     expected = [(-1.0, 1.0), (0.0, 20.0), (middle_um - 21.5, middle_um + 21.5)]
-    assert [step.height_um for step in found.steps] == [1.0, 20.0, 43.0]
-    assert [step.levels_um for step in found.steps] == [pytest.approx(levels) for levels in expected]
+    assert [step.height_um for step in simulation.steps] == [1.0, 20.0, 43.0]
+    assert [step.levels_um for step in simulation.steps] == [pytest.approx(levels) for levels in expected]
     assert heights_um == {1.0, 20.0, 43.0}  # the first step of a run, too
-    for step in found.steps:
+    for step in simulation.steps:
         assert (step.limited, step.trips) == ((), ())
         assert step.static_error_percent < 2.0
-    assert found.omitted_heights_um == (46.0,)
-    assert found.as_dict()["range_um"] == pytest.approx([low_um, high_um])
+    assert simulation.omitted_heights_um == (46.0,)
+    assert simulation.as_dict()["range_um"] == pytest.approx([low_um, high_um])
 
 
 @pytest.mark.usefixtures("few_simulated_steps")
@@ -117,6 +118,7 @@ def test_omitted_steps_are_told_with_both_ends_of_the_range() -> None:
 
 
 def required(reference_um: float, command_um: float) -> DesignOptions:
+    """Return a design for steps of `reference_um` (µm) with commands up to `command_um` (µm)."""
     command = {"reference_um": reference_um, "command_um": command_um}
     return DesignOptions.model_validate({"specification": {"overshoot_percent": 1.0, "command": command}})
 
@@ -139,8 +141,8 @@ def test_taps_step_between_0_and_the_reference_where_the_sides_are_unequal() -> 
 
 def test_taps_of_a_drive_that_is_mostly_negative_are_those_of_its_mirror_image() -> None:
     (axis,), (mirrored,) = stage().axes, stage(drive_v=2.0, drive_min_v=-10.0).axes
-    found, expected = (step_bounds(one, MODEL_OPTIONS, required(34.5, 38.0)) for one in (mirrored, axis))
-    assert found == pytest.approx(expected)
+    bounds, expected = (step_bounds(side, MODEL_OPTIONS, required(34.5, 38.0)) for side in (mirrored, axis))
+    assert bounds == pytest.approx(expected)
 
 
 def test_equal_sides_keep_steps_to_both() -> None:

@@ -1,4 +1,4 @@
-"""Verification of the paper's loop: golden values of an independent computation, verdicts, robustness, report files."""
+"""Verification of the paper's loop: independently computed golden values, verdicts, robustness, report files."""
 
 import json
 import math
@@ -39,7 +39,7 @@ DEPLOY = Path(__file__).resolve().parents[2] / "deploy"
 PAPER_LOOP = continuous_loop(PAPER_C, PAPER_D)
 RUNNING = discretise_controller(PAPER_C, 1e-4, "tustin", 595.5)
 PAPER_TEXT = (DEPLOY / "paper.toml").read_text(encoding="utf-8")
-LATE = PAPER_TEXT.replace("latency_ticks = 0", "latency_ticks = 2")
+PAPER_WITH_LATENCY = PAPER_TEXT.replace("latency_ticks = 0", "latency_ticks = 2")
 MODEST = "[specification]\nsettling_ms = 5.0\novershoot_percent = 3.0\nstatic_error_percent = 0.2\n"
 
 
@@ -49,7 +49,7 @@ def run(*arguments: str):
 
 @pytest.fixture(autouse=True, scope="module")
 def unmeasured_host(tmp_path_factory):
-    """Nothing is known of this host's delay."""
+    """Set RUNTIME_DIRECTORY to an empty folder, which has no measured delay of this host."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("RUNTIME_DIRECTORY", str(tmp_path_factory.mktemp("run")))
         yield
@@ -57,10 +57,10 @@ def unmeasured_host(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def report(tmp_path_factory):
-    """The paper's configuration, with its pages."""
+    """Return the JSON report and the folder of the report files of the paper's configuration."""
     out = tmp_path_factory.mktemp("verification")
     result = run(str(DEPLOY / "paper.toml"), "--out", str(out), "--json")
-    assert result.exit_code == 1, result.stderr  # the answer is no
+    assert result.exit_code == 1, result.stderr  # the specification is not met
     return json.loads(result.stdout), out
 
 
@@ -82,7 +82,7 @@ def report(tmp_path_factory):
     ],
 )
 def test_the_papers_table_eqs_5_and_20(report, name, value, tolerance, met, claim) -> None:
-    """In continuous time, recomputed independently from the printed factors; verdicts against section III.E.2."""
+    """Continuous-time figures are recomputed independently from the printed factors; claims are of section III.E.2."""
     row = next(row for row in report[0]["axes"][0]["rows"] if row["name"] == name)
     assert row["continuous"] == pytest.approx(value, abs=tolerance)
     assert (row["continuous_met"], row["claim"]) == (met, claim)
@@ -98,13 +98,13 @@ def test_the_resonance_may_move_by(report) -> None:
         assert down < -5
         assert 1 < up < 2
         for percent, stable in ((up - 0.02, True), (up + 0.02, False), (down + 0.02, True), (down - 0.02, False)):
-            moved = robust_changes(PAPER_D)["resonance"].apply(PAPER_D, percent)
-            assert discrete_loop(RUNNING, moved, ticks).is_stable == stable
+            shifted = robust_changes(PAPER_D)["resonance"].apply(PAPER_D, percent)
+            assert discrete_loop(RUNNING, shifted, ticks).is_stable == stable
 
 
 def test_the_report_is_complete_and_stands_alone(report) -> None:
-    found, out = report
-    assert not found["meets"]
+    content, out = report
+    assert not content["meets"]
     assert {path.name for path in out.iterdir()} == {
         "verify.json", "verify.html", "x-bode.png", "x-sensitivity.png", "x-step.png",
     }  # fmt: skip
@@ -116,7 +116,7 @@ def test_the_report_is_complete_and_stands_alone(report) -> None:
     assert "MISSED" in html
     assert "C(s) is the controller in continuous time, without taps, hold and delay" in html
     assert "simulated steps" in html
-    assert [step["height_um"] for step in found["axes"][0]["simulated"]["steps"]] == [1.0, 5.0, 20.0, 40.0]
+    assert [step["height_um"] for step in content["axes"][0]["simulated"]["steps"]] == [1.0, 5.0, 20.0, 40.0]
     assert json.loads((out / "verify.json").read_text(encoding="utf-8"))["axes"][0]["name"] == "x"
 
 
@@ -135,9 +135,9 @@ def test_the_terminal_shows_required_achieved_verdict_and_claim() -> None:
 
 
 def test_a_missed_limit_of_the_loop_that_never_runs_is_not_judged(tmp_path) -> None:
-    """Quarters of the reference, 1 ms apart, take away the overshoot that C(s) has alone."""
+    """Twenty equal taps over 2 ms take away the overshoot that C(s) has without taps."""
     config = PAPER_TEXT.replace("# [axis.prefilter]", f"[axis.prefilter]\ntaps = {[0.05] * 20}")
-    verification = judged(tmp_path, "[specification]\novershoot_percent = 0.5\n", config)
+    verification = verify_paper(tmp_path, "[specification]\novershoot_percent = 0.5\n", config)
     (row,) = [row for row in verification.rows if row.name == "overshoot_percent"]
     assert row.continuous == pytest.approx(0.66, abs=5e-3)
     assert row.running is not None
@@ -184,13 +184,13 @@ def test_a_specification_that_is_met(tmp_path) -> None:
     assert limits["running"][0] <= limits["running_missed"][0] < 0 < limits["running_missed"][1] <= limits["running"][1]
 
 
-def judged(tmp_path, spec: str, config: str = "", simulated: bool = False):
-    """Axis x of the paper's configuration, or another, against a specification."""
+def verify_paper(tmp_path, spec: str, config: str = "", simulated: bool = False):
+    """Return the verification of axis x of `config` (default: the paper's configuration) against a specification."""
     (tmp_path / "spec.toml").write_text(spec)
     config = config or (DEPLOY / "paper.toml").read_text()
     configuration = parse(config.replace('"paper-spec.toml"', '"spec.toml"'), "paper", tmp_path, "paper.toml")
-    found = {"x": verify_axis(configuration, prepare(configuration).checks[0], None)}
-    return (add_simulation(configuration, found) if simulated else found)["x"][0]
+    verifications = {"x": verify_axis(configuration, prepare(configuration).checks[0], None)}
+    return (add_simulation(configuration, verifications) if simulated else verifications)["x"][0]
 
 
 PLANT = """[plant]
@@ -204,7 +204,7 @@ delay_ticks = {delay}
 
 
 @pytest.mark.parametrize(
-    ("change", "said"),
+    ("change", "message"),
     [
         ({}, None),
         ({"gain": -20.7 / 1.01086}, "gain at 0 Hz 1.01086, in the specification 1. The verification"),
@@ -213,27 +213,27 @@ delay_ticks = {delay}
         ({"damping": 40.0}, "response at 595.5 Hz, by 27.* %. The verification"),
     ],
 )
-def test_a_plant_of_the_specification_that_is_not_the_judged_model_is_named(change, said, tmp_path) -> None:
-    """At the resonance, whose peak is inverse to the damping, the model's response is 40/55 of the other: 27 % less."""
+def test_a_plant_of_the_specification_that_is_not_the_judged_model_is_named(change, message, tmp_path) -> None:
+    """The peak of a resonance is inverse to its damping: the model's peak is 40/55 of the specified one, 27 % less."""
     values = {"gain": -20.7, "damping": 55.0, "stiffness": 1.4e7, "delay": 0} | change
-    verification = judged(tmp_path, MODEST + PLANT.format(**values))
+    verification = verify_paper(tmp_path, MODEST + PLANT.format(**values))
     sentences = [line for line in verification.warnings if "differs from [plant] of the specification" in line]
-    assert len(sentences) == (0 if said is None else 1), verification.warnings
-    if said is not None:
-        assert re.search(said, sentences[0]), sentences
+    assert len(sentences) == (0 if message is None else 1), verification.warnings
+    if message is not None:
+        assert re.search(message, sentences[0]), sentences
 
 
 def test_robustness_that_is_asked_for(tmp_path) -> None:
     """The paper's resonance may rise by 1.82 % at 10 kHz, and rings for 31 ms; max |S| is 1.654."""
-    held = MODEST + "modulus_margin = 0.6\nresonance_decay_ms = 32.0\nresonance_shift_percent = 1.8\n"
-    found = judged(tmp_path, held)
-    assert found.meets_specification
-    rows = {row.name: row for row in found.rows}
+    met_spec = MODEST + "modulus_margin = 0.6\nresonance_decay_ms = 32.0\nresonance_shift_percent = 1.8\n"
+    verification = verify_paper(tmp_path, met_spec)
+    assert verification.meets_specification
+    rows = {row.name: row for row in verification.rows}
     assert rows["resonance_shift_percent"].running == pytest.approx(1.82, abs=0.005)
     assert rows["modulus_margin"].running == pytest.approx(1 / 1.65383, abs=1e-4)
-    missed = MODEST + "modulus_margin = 0.61\nresonance_decay_ms = 30.0\nresonance_shift_percent = 1.9\n"
-    found = judged(tmp_path, missed)
-    assert [row.name for row in found.missed_rows] == [
+    missed_spec = MODEST + "modulus_margin = 0.61\nresonance_decay_ms = 30.0\nresonance_shift_percent = 1.9\n"
+    verification = verify_paper(tmp_path, missed_spec)
+    assert [row.name for row in verification.missed_rows] == [
         "resonance_decay_ms",
         "resonance_shift_percent",
         "modulus_margin",
@@ -242,66 +242,66 @@ def test_robustness_that_is_asked_for(tmp_path) -> None:
 
 def test_scenarios_are_judged_where_they_are_asked_for(tmp_path) -> None:
     scenarios = "[scenarios]\nresonance_percent = {}\ndamping = [1.0]\ngain_percent = 0.0\n"
-    found = judged(tmp_path, MODEST + scenarios.format(1.0))
-    assert found.meets_specification
-    assert found.scenarios is not None
-    worst = {row.name: (row, one) for row, one in found.scenarios.rows}
-    row, one = worst["overshoot_percent"]
-    assert one.value >= (row.running or math.nan)
-    assert "resonance +1 %" in worst["resonance_decay_ms"][1].plant
-    found = judged(
+    verification = verify_paper(tmp_path, MODEST + scenarios.format(1.0))
+    assert verification.meets_specification
+    assert verification.scenarios is not None
+    worst_rows = {row.name: (row, worst) for row, worst in verification.scenarios.rows}
+    row, worst = worst_rows["overshoot_percent"]
+    assert worst.value >= (row.running or math.nan)
+    assert "resonance +1 %" in worst_rows["resonance_decay_ms"][1].plant
+    verification = verify_paper(
         tmp_path, f"[specification]\novershoot_percent = 1.48\nmodulus_margin = 0.603\n{scenarios.format(1.0)}"
     )
-    assert found.scenarios is not None
-    assert [row.name for row, _ in found.scenarios.missed_rows] == ["modulus_margin"]  # taps mend what a step does
-    assert not found.missed_rows
-    assert not found.meets_specification
-    found = judged(tmp_path, MODEST + scenarios.format(3.0))
-    assert found.scenarios is not None
-    assert not found.missed_rows
-    assert not found.meets_specification
-    assert "settling (5 %) with resonance +3 %" in answer(found)
-    assert text.scenarios(found)[0][0] == f"worst of {found.scenarios.count} scenarios, linear"
-    assert as_dict(replace(found, find_robustness=nothing_moved))["scenarios"]["rows"][0]["met"] is False
+    assert verification.scenarios is not None
+    assert [row.name for row, _ in verification.scenarios.missed_rows] == ["modulus_margin"]  # taps can correct a step
+    assert not verification.missed_rows
+    assert not verification.meets_specification
+    verification = verify_paper(tmp_path, MODEST + scenarios.format(3.0))
+    assert verification.scenarios is not None
+    assert not verification.missed_rows
+    assert not verification.meets_specification
+    assert "settling (5 %) with resonance +3 %" in answer(verification)
+    assert text.scenarios(verification)[0][0] == f"worst of {verification.scenarios.count} scenarios, linear"
+    assert as_dict(replace(verification, find_robustness=no_robustness))["scenarios"]["rows"][0]["met"] is False
 
 
-def nothing_moved() -> Robustness:
+def no_robustness() -> Robustness:
     return Robustness({}, {}, 0.0, 0)
 
 
 @pytest.mark.usefixtures("few_simulated_steps")
 def test_simulated_steps_are_shown_and_judged_where_they_are_asked_for(tmp_path) -> None:
-    shown = judged(tmp_path, MODEST + "[simulation]\nsteps_um = [2.0, 60.0]\n", simulated=True)
-    assert shown.meets_specification
-    assert shown.simulated is not None
-    assert shown.simulated.is_met(shown.simulated.steps[0], "overshoot_percent") is False
-    assert shown.simulated.omitted_heights_um == (60.0,)
-    assert any("Steps of 60 µm were left out" in note for note in text.simulation_notes(shown))
-    found = judged(tmp_path, MODEST + "[simulation]\nsteps_um = [2.0]\njudged = true\n", simulated=True)
-    assert not found.meets_specification
-    assert "simulated, settling (5 %) of 2 µm steps" in answer(found)
+    unjudged = verify_paper(tmp_path, MODEST + "[simulation]\nsteps_um = [2.0, 60.0]\n", simulated=True)
+    assert unjudged.meets_specification
+    assert unjudged.simulated is not None
+    assert unjudged.simulated.is_met(unjudged.simulated.steps[0], "overshoot_percent") is False
+    assert unjudged.simulated.omitted_heights_um == (60.0,)
+    assert any("Steps of 60 µm were left out" in note for note in text.simulation_notes(unjudged))
+    verification = verify_paper(tmp_path, MODEST + "[simulation]\nsteps_um = [2.0]\njudged = true\n", simulated=True)
+    assert not verification.meets_specification
+    assert "simulated, settling (5 %) of 2 µm steps" in answer(verification)
 
 
 @pytest.mark.usefixtures("few_simulated_steps")
 def test_a_stated_hysteresis_makes_the_steps_count(tmp_path) -> None:
-    """Without `judged`: 18 µm are asked for, simulated beside the others, and miss the settling time."""
+    """The specification's step of 18 µm is simulated too; it counts without `judged`, and misses the settling time."""
     command = "[specification.command]\nreference_um = 18.0\ncommand_um = 30.0\n"
     spec = MODEST.replace("settling_ms = 5.0", "settling_ms = 4.0") + command
-    found = judged(tmp_path, spec + "[simulation]\nresidual_percent = 3.0\n", simulated=True)
-    assert found.simulated is not None
-    assert 18.0 in [step.height_um for step in found.simulated.steps]
-    assert not found.meets_specification
-    assert "of 18 µm steps" in answer(found)
+    verification = verify_paper(tmp_path, spec + "[simulation]\nresidual_percent = 3.0\n", simulated=True)
+    assert verification.simulated is not None
+    assert 18.0 in [step.height_um for step in verification.simulated.steps]
+    assert not verification.meets_specification
+    assert "of 18 µm steps" in answer(verification)
 
 
 @pytest.mark.usefixtures("few_simulated_steps")
 def test_what_trips_is_said(tmp_path) -> None:
     """An interlock at 6 µm ends a step of 10 µm."""
     config = PAPER_TEXT.replace("position_um = 60.0", "position_um = 6.0")
-    found = judged(tmp_path, "[simulation]\nsteps_um = [10.0]\njudged = true\n", config, simulated=True)
-    assert found.simulated is not None
-    assert found.simulated.steps[0].trips == ("position",)
-    assert "steps of 10 µm, which trip" in answer(found)
+    verification = verify_paper(tmp_path, "[simulation]\nsteps_um = [10.0]\njudged = true\n", config, simulated=True)
+    assert verification.simulated is not None
+    assert verification.simulated.steps[0].trips == ("position",)
+    assert "steps of 10 µm, which trip" in answer(verification)
 
 
 def test_what_cannot_be_simulated_is_said(tmp_path) -> None:
@@ -309,9 +309,9 @@ def test_what_cannot_be_simulated_is_said(tmp_path) -> None:
     config = PAPER_TEXT
     for old, new in (('# mode = "closed_loop"', 'mode = "off"'), ("[[axis]]\n", CHANNEL), ("[recording]", SECOND)):
         config = config.replace(old, new + ("" if old.startswith("#") else old), 1)
-    found = judged(tmp_path, MODEST, config, simulated=True)
-    assert found.simulated is None
-    assert any("steps are not simulated" in warning for warning in found.warnings)
+    verification = verify_paper(tmp_path, MODEST, config, simulated=True)
+    assert verification.simulated is None
+    assert any("steps are not simulated" in warning for warning in verification.warnings)
 
 
 CHANNEL = '[driver.channels.y]\ninput = "adc1"\noutput = "dac1"\num_per_v = 10.0\n'
@@ -319,11 +319,11 @@ SECOND = '[[axis]]\nname = "y"\n[axis.feedforward]\nthresholds_v = [0.0]\nweight
 
 
 def test_delay_and_prefilter_are_in_the_loop_as_it_runs(tmp_path) -> None:
-    """The rig's latency counts although the model knows of none; half the reference leaves half of it."""
-    config = LATE.replace("# [axis.prefilter]", "[axis.prefilter]\ntaps = [0.25, 0.25]")
-    found = judged(tmp_path, MODEST, config)
-    assert found.delay_ticks == 2
-    rows = {row.name: row for row in found.rows}
+    """The rig's latency counts although the model states no delay; taps with the sum 0.5 leave an error of 50 %."""
+    config = PAPER_WITH_LATENCY.replace("# [axis.prefilter]", "[axis.prefilter]\ntaps = [0.25, 0.25]")
+    verification = verify_paper(tmp_path, MODEST, config)
+    assert verification.delay_ticks == 2
+    rows = {row.name: row for row in verification.rows}
     assert rows["static_error_percent"].running == pytest.approx(50.0, abs=0.1)
     assert rows["static_error_percent"].continuous == pytest.approx(0.166384, abs=1e-5)
     prepared = prepare(parse(config, "paper", DEPLOY, "paper.toml"))
@@ -332,20 +332,20 @@ def test_delay_and_prefilter_are_in_the_loop_as_it_runs(tmp_path) -> None:
     assert running.delay_ticks == 2
     assert running.static_error_percent == pytest.approx(rows["static_error_percent"].running)
     assert np.isnan([running.overshoot_percent, rows["overshoot_percent"].running]).all()
-    (late,) = [line for line in cautions(prepared) if "latency_ticks" in line]
-    assert late == (
+    (caution,) = [line for line in cautions(prepared) if "latency_ticks" in line]
+    assert caution == (
         "axis.x.model.delay_ticks: 0, but the simulated rig has driver.latency_ticks = 2; "
         "the margins are computed with delay_ticks = 2"
     )
 
 
 def test_a_delay_that_the_model_states_is_not_raised_to_that_of_the_rig() -> None:
-    """A model identified behind no delay holds the rig's in its dynamics: it would count twice."""
-    config = LATE.replace("[axis.model]", "[axis.model]\ndelay_ticks = 1")
+    """An identified model covers the rest of the rig's latency in its dynamics; a raised delay would count it twice."""
+    config = PAPER_WITH_LATENCY.replace("[axis.model]", "[axis.model]\ndelay_ticks = 1")
     prepared = prepare(parse(config, "paper", DEPLOY, "paper.toml"))
     assert prepared.checks[0].delay_ticks == 1
-    (late,) = [line for line in cautions(prepared) if "latency_ticks" in line]
-    assert late.endswith("the margins are computed with delay_ticks = 1")
+    (caution,) = [line for line in cautions(prepared) if "latency_ticks" in line]
+    assert caution.endswith("the margins are computed with delay_ticks = 1")
 
 
 @pytest.mark.usefixtures("few_simulated_steps")
@@ -364,7 +364,7 @@ def test_faults_of_the_user(tmp_path, monkeypatch) -> None:
 
 
 def test_delay_margin_is_phase_margin_over_crossover() -> None:
-    """75.54° at 94.53 Hz, eqs (5) and (20); as it runs, 21 samples and no more."""
+    """75.54° at 94.53 Hz, eqs (5) and (20); the discretised loop is stable with 21 samples and unstable with more."""
     assert delay_margin_us(PAPER_LOOP) == pytest.approx(1e6 * 75.54 / 360 / 94.53, rel=1e-3)
     ticks = tolerated_delay_ticks(lambda ticks: discrete_loop(RUNNING, PAPER_D, ticks))
     assert discrete_loop(RUNNING, PAPER_D, ticks).is_stable
@@ -388,15 +388,15 @@ def test_damping_changes_alone() -> None:
 
 
 def test_an_unstable_loop_tolerates_nothing_and_meets_nothing() -> None:
-    loud = change_gain(PAPER_D, 400)
-    asked = SpecificationOptions(overshoot_percent=50.0)
-    assert stability_range(loop_builder(PAPER_C), loud, robust_changes(loud)["gain"]) == (0.0, 0.0)
-    values = specified_quantities(continuous_loop(PAPER_C, loud), asked)
+    plant = change_gain(PAPER_D, 400)
+    options = SpecificationOptions(overshoot_percent=50.0)
+    assert stability_range(loop_builder(PAPER_C), plant, robust_changes(plant)["gain"]) == (0.0, 0.0)
+    values = specified_quantities(continuous_loop(PAPER_C, plant), options)
     assert all(math.isnan(value) for value in values.values())
     limit = Limit(50.0, True)
     assert not limit.accepts(values["overshoot_percent"])
-    gain = robust_changes(loud)["gain"]
-    assert range_until_missed(loop_builder(RUNNING), loud, gain, asked, {"overshoot_percent": limit}) == (0.0, 0.0)
+    gain = robust_changes(plant)["gain"]
+    assert range_until_missed(loop_builder(RUNNING), plant, gain, options, {"overshoot_percent": limit}) == (0.0, 0.0)
 
 
 def test_how_far_the_sensitivity_is_held_in_closed_form() -> None:
@@ -409,9 +409,9 @@ def test_how_far_the_sensitivity_is_held_in_closed_form() -> None:
 
 
 def test_the_sensors_lag_is_in_the_loop_that_runs() -> None:
-    seen = SensorOptions(bandwidth_hz=1000.0).add_sensor_lag(PAPER_D)
-    assert seen.order == PAPER_D.order + 1
-    assert abs(seen.response([2000j * math.pi])[0] / PAPER_D.response([2000j * math.pi])[0]) == pytest.approx(
+    with_lag = SensorOptions(bandwidth_hz=1000.0).add_sensor_lag(PAPER_D)
+    assert with_lag.order == PAPER_D.order + 1
+    assert abs(with_lag.response([2000j * math.pi])[0] / PAPER_D.response([2000j * math.pi])[0]) == pytest.approx(
         math.sqrt(0.5)
     )
 
@@ -421,6 +421,6 @@ def test_a_simulation_that_cannot_be_evaluated_is_a_warning(tmp_path, monkeypatc
         raise ValueError("the recorded reference has no step")
 
     monkeypatch.setattr(axes_module, "simulate", refuse)
-    verification = judged(tmp_path, MODEST, simulated=True)
+    verification = verify_paper(tmp_path, MODEST, simulated=True)
     assert verification.simulated is None
     assert verification.warnings[-1] == "steps are not simulated: the recorded reference has no step"
