@@ -12,7 +12,6 @@ from rtloop.signals import Flag
 from tests.engine.failing_driver import ScriptedDriver
 from tests.engine.harness import AXIS, CONTROLLER, IDEAL, TUSTIN, LoopBench, text
 
-SWINGING_UM = 1.0
 INTERLOCKS = """
 [axis.interlocks]
 position_um = 30.0

@@ -411,15 +411,6 @@ def test_the_pause_between_starts_doubles_up_to_a_limit():
     assert pauses_s[-1] == LONGEST_PAUSE_S
 
 
-def set_column(column: int, value: float):
-    """Return a change that sets a column in one of the rows."""
-
-    def change(rows: Any) -> None:
-        rows[5, column] = value
-
-    return change
-
-
 AXIS = {name: signals.axis_column(0, column) for name, column in
         (("adc", signals.ADC), ("position", signals.POSITION), ("drive", signals.DRIVE))}  # fmt: skip
 
