@@ -1,5 +1,5 @@
-"""Closed loops by scipy and numpy alone, whose noise comes back through the loop: lightly damped modes behind a hold
-and a delay, an integrator that damps the first of them, a reference that moves, and noise that is far from white.
+"""Simulated closed loops whose noise passes through the loop, by scipy and numpy alone: lightly damped modes behind a
+hold and a delay, a controller that integrates and damps the first mode, a moving reference, and coloured noise.
 
     D(s) = Σ gᵢ ωᵢ²/(s² + 2ζᵢωᵢs + ωᵢ²), Σ gᵢ = 1,     x = D z⁻ᵈ v + n,     v = C (r − x)
 """
@@ -15,12 +15,12 @@ from scipy import signal
 PERIOD_S = 1e-4
 MOTIONS = ("multisine", "sweep", "steps")
 SHORTEST, LONGEST = 50, 150
-"""Samples of a step: unequal ones leave no gaps in the spectrum."""
+"""Shortest and longest step in samples: steps of unequal length leave no gaps in the spectrum."""
 
 
 @dataclass(frozen=True)
 class TrueLoop:
-    """Modes as (Hz, ζ, share of D(0)); samples of delay beyond the hold's; C as polynomials in 1/z."""
+    """Modes as (Hz, ζ, share of D(0)); delay in samples beyond the hold's; C as (numerator, denominator) in 1/z."""
 
     modes: tuple[tuple[float, float, float], ...]
     delay_ticks: int
@@ -28,52 +28,52 @@ class TrueLoop:
 
     @property
     def plant(self) -> tuple[np.ndarray, np.ndarray]:
-        """D(z) z⁻ᵈ as polynomials in 1/z."""
-        return plant_of(self.modes, self.delay_ticks)
+        """Numerator and denominator of D(z) z⁻ᵈ as polynomials in 1/z."""
+        return plant_polynomials(self.modes, self.delay_ticks)
 
     @property
     def closed(self) -> np.ndarray:
         """The loop's characteristic polynomial in 1/z."""
         (b, a), (q, p) = self.plant, self.controller
-        return added(np.convolve(a, p), np.convolve(b, q))
+        return poly_sum(np.convolve(a, p), np.convolve(b, q))
 
     def in_loop(self, reference: np.ndarray, noise: np.ndarray) -> dict[str, np.ndarray]:
-        """v and x, from rest, filtered by the loop's own transfer functions."""
+        """Return the signals r, v and x (µm) of the closed loop from rest, by the loop's transfer functions."""
         (b, a), (q, p) = self.plant, self.controller
         command = filtered(np.convolve(q, a), self.closed, reference - noise)
         position = filtered(np.convolve(b, q), self.closed, reference) + filtered(np.convolve(a, p), self.closed, noise)
         return {"reference_um": reference, "command_um": command, "position_um": position}
 
     def open(self, command: np.ndarray, noise: np.ndarray) -> dict[str, np.ndarray]:
-        """The same plant without a loop."""
+        """Return the signals (µm) of the plant without a loop: the command is also the reference."""
         b, a = self.plant
         return {"reference_um": command, "command_um": command, "position_um": filtered(b, a, command) + noise}
 
 
-def plant_of(modes: tuple[tuple[float, float, float], ...], delay_ticks: int) -> tuple[np.ndarray, np.ndarray]:
-    """Each mode behind its hold, by scipy; the sum over a common denominator."""
+def plant_polynomials(modes: tuple[tuple[float, float, float], ...], delay_ticks: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return (numerator, denominator) in 1/z: each mode behind its hold by scipy, summed over a common denominator."""
     top, bottom = np.zeros(1), np.ones(1)
     for hz, damping, share in modes:
         omega = 2 * np.pi * hz
         held: Any = signal.cont2discrete(([share * omega**2], [1, 2 * damping * omega, omega**2]), PERIOD_S, "zoh")
         b, a = held[0], held[1]
-        top, bottom = added(np.convolve(top, a), np.convolve(b.ravel(), bottom)), np.convolve(bottom, a)
+        top, bottom = poly_sum(np.convolve(top, a), np.convolve(b.ravel(), bottom)), np.convolve(bottom, a)
     return np.concatenate([np.zeros(delay_ticks), top]), bottom
 
 
 def filtered(b: Any, a: Any, signal_: np.ndarray) -> np.ndarray:
-    """B/A applied, from rest."""
+    """Return the signal filtered by B/A (polynomials in 1/z) from rest."""
     return np.asarray(signal.lfilter(b, a, signal_))
 
 
-def added(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """The sum of two polynomials in 1/z."""
+def poly_sum(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Return the sum of two polynomials in 1/z."""
     size = max(a.size, b.size)
     return np.pad(a, (0, size - a.size)) + np.pad(b, (0, size - b.size))
 
 
 def drawn_loop(random: np.random.Generator) -> TrueLoop:
-    """Two lightly damped modes, up to three samples of delay, |L| of 1 … 4 and a phase of 0° at the first: stable."""
+    """Return a stable loop: two lightly damped modes, 0 to 3 samples of delay, L real and 1 to 4 at the first mode."""
     while True:
         hz, share = random.uniform(150, 900), random.uniform(0.05, 0.2)
         modes = (
@@ -87,38 +87,40 @@ def drawn_loop(random: np.random.Generator) -> TrueLoop:
 
 
 def damping_controller(loop: TrueLoop, gain: float, ki_per_s: float) -> tuple[np.ndarray, np.ndarray]:
-    """k_i T/(z − 1) and a broad resonance at the first mode, turned so that L there is `gain` and real."""
+    """Return C in 1/z: k_i T/(z − 1) plus a broad resonance at the first mode; its part of L there is `gain`, real."""
     hz = loop.modes[0][0]
     omega, back = 2 * np.pi * hz, np.exp(-2j * np.pi * hz * PERIOD_S)
     b, a = loop.plant
-    wanted = gain / (np.polyval(b[::-1], back) / np.polyval(a[::-1], back))
+    target = gain / (np.polyval(b[::-1], back) / np.polyval(a[::-1], back))
     bottom = np.poly(np.exp(omega * PERIOD_S * np.roots([1, 0.6, 1]))).real
-    at_mode = wanted * np.polyval(bottom[::-1], back) / back
+    at_mode = target * np.polyval(bottom[::-1], back) / back
     slope = at_mode.imag / back.imag
     resonant = np.array([0.0, at_mode.real - slope * back.real, slope])
     integral = np.array([0.0, ki_per_s * PERIOD_S]), np.array([1.0, -1.0])
-    return added(np.convolve(resonant, integral[1]), np.convolve(integral[0], bottom)), np.convolve(bottom, integral[1])
+    return poly_sum(np.convolve(resonant, integral[1]), np.convolve(integral[0], bottom)), np.convolve(
+        bottom, integral[1]
+    )
 
 
-SHAKEN, DRIFT, SENSOR_UM = 0.95, 0.3, 0.010
-"""Parts of the rms value (their squares add up to 1), and white noise beside them."""
+VIBRATION, DRIFT, SENSOR_UM = 0.95, 0.3, 0.010
+"""Vibration and drift as parts of the rms value (the sum of their squares is 0.99); rms of the white sensor noise."""
 
 
-def colours(near_hz: float) -> tuple[np.ndarray, np.ndarray]:
-    """Polynomials in 1/z behind which white noise is what shakes the plant near `near_hz`, and drift."""
+def noise_denominators(near_hz: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return two polynomials A in 1/z: 1/A makes white noise into vibration near `near_hz`, and into drift."""
     omega = 2 * np.pi * near_hz * PERIOD_S
     return np.poly(np.exp(omega * np.roots([1, 0.1, 1]))).real, np.array([1.0, -0.9995])
 
 
 def coloured(random: np.random.Generator, samples: int, near_hz: float, rms_um: float) -> np.ndarray:
-    """Broad noise near `near_hz`, drift, and a sensor's."""
-    shaken, drift = (filtered([1.0], a, random.normal(size=samples)) for a in colours(near_hz))
-    parts = SHAKEN * shaken / shaken.std() + DRIFT * drift / drift.std()
+    """Return noise (µm): vibration near `near_hz` and drift, scaled by `rms_um`, and the sensor's white noise."""
+    vibration, drift = (filtered([1.0], a, random.normal(size=samples)) for a in noise_denominators(near_hz))
+    parts = VIBRATION * vibration / vibration.std() + DRIFT * drift / drift.std()
     return rms_um * parts + random.normal(0, SENSOR_UM, samples)
 
 
 def motion(kind: str, random: np.random.Generator, samples: int, amplitude_um: float) -> np.ndarray:
-    """A multisine of 1 s up to 3 kHz with random phases, a logarithmic sweep, or steps up and down."""
+    """Return a reference (µm): a multisine of 1 s up to 3 kHz, a logarithmic sweep to 3 kHz, or steps up and down."""
     time_s = PERIOD_S * np.arange(samples)
     if kind == "multisine":
         lines = np.arange(5, 3000, 5)
@@ -128,6 +130,6 @@ def motion(kind: str, random: np.random.Generator, samples: int, amplitude_um: f
         return np.resize(amplitude_um * period / np.abs(period).max(), samples)
     if kind == "sweep":
         return amplitude_um * signal.chirp(time_s, 5.0, time_s[-1], 3000.0, "logarithmic", -90)
-    most = samples // SHORTEST + 1
-    levels = amplitude_um * random.choice([-1.0, 1.0], most)
-    return np.repeat(levels, random.integers(SHORTEST, LONGEST, most))[:samples]
+    step_count = samples // SHORTEST + 1
+    levels = amplitude_um * random.choice([-1.0, 1.0], step_count)
+    return np.repeat(levels, random.integers(SHORTEST, LONGEST, step_count))[:samples]

@@ -1,4 +1,4 @@
-"""Closed loops by scipy alone: a lightly damped mode behind a hold and a delay, an integrator, noise, a nonlinearity.
+"""Simulated closed loops, by scipy alone: a lightly damped mode, hold and delay, an integrator, noise, a nonlinearity.
 
 D(z) = (1 − z⁻¹) Z{ω²/(s² + 2ζωs + ω²)/s} z⁻ᵈ,    C(z) = k_p + k_i T/(z − 1)
 """
@@ -11,14 +11,14 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import signal
 
-from tests.design.coloured_loops import PERIOD_S, added, plant_of
+from tests.design.coloured_loops import PERIOD_S, plant_polynomials, poly_sum
 
 RATE_HZ = 1 / PERIOD_S
 
 
 @dataclass(frozen=True)
 class TrueLoop:
-    """One mode, its delay beyond the hold's sample, and the controller's gains."""
+    """Mode, delay beyond the hold's sample, controller gains and rms sensor noise of a simulated loop."""
 
     hz: float
     damping: float
@@ -29,19 +29,19 @@ class TrueLoop:
 
     @property
     def polynomials(self) -> tuple[np.ndarray, np.ndarray]:
-        """L as polynomials in 1/z, of equal length."""
-        b, a = plant_of(((self.hz, self.damping, 1.0),), self.delay_ticks)
+        """Numerator and denominator of L in 1/z, padded to equal length."""
+        b, a = plant_polynomials(((self.hz, self.damping, 1.0),), self.delay_ticks)
         top, bottom = np.convolve(b, [self.kp, self.ki_per_s / RATE_HZ - self.kp]), np.convolve(a, [1.0, -1.0])
-        return added(top, 0 * bottom), added(bottom, 0 * top)
+        return poly_sum(top, 0 * bottom), poly_sum(bottom, 0 * top)
 
     def open(self, hz: np.ndarray) -> np.ndarray:
-        """L."""
+        """Return the open loop's complex response L at the frequencies `hz`."""
         top, bottom = self.polynomials
         back = np.exp(-2j * np.pi * hz / RATE_HZ)
         return np.polyval(top[::-1], back) / np.polyval(bottom[::-1], back)
 
     def margins(self, from_hz: float = 1.0, to_hz: float = 0.45 * RATE_HZ) -> dict[str, float]:
-        """On a grid so fine that nothing lies between its points."""
+        """Return the margins of L by `margins_of`, on its grid of a million frequencies."""
         return margins_of(self.open, from_hz, to_hz)
 
     def run(
@@ -51,14 +51,14 @@ class TrueLoop:
         bend: Callable[[float], float] | None = None,
         past: np.ndarray | None = None,
     ) -> dict[str, np.ndarray]:
-        """Recorded signals for a reference; `bend` is what the actuator makes of the command, to which `past` is added.
+        """Return the recorded signals (µm); `bend` is the actuator's static nonlinearity, `past` a signal added to v.
 
-        Where neither is given the loop is linear, and quickly filtered.
+        Without `bend` and `past` the loop is linear and is computed by filters instead of sample by sample.
         """
         if bend is None and past is None:
             return self._linear(reference, seed)
         bend, past = bend or (lambda v: v), np.zeros(reference.size) if past is None else past
-        b, a = plant_of(((self.hz, self.damping, 1.0),), 0)
+        b, a = plant_polynomials(((self.hz, self.damping, 1.0),), 0)
         b1, b2 = b[1:]
         noise = np.random.default_rng(seed).normal(0, self.noise_um, reference.size)
         e, v, x, y = np.zeros((4, reference.size))
@@ -73,6 +73,7 @@ class TrueLoop:
         return {"reference_um": reference, "error_um": e, "command_um": v, "position_um": x, "true_um": y}
 
     def _linear(self, reference: np.ndarray, seed: int) -> dict[str, np.ndarray]:
+        """Return the recorded signals (µm) of the linear loop, by its transfer functions."""
         top, bottom = self.polynomials
         closed = top + bottom
         assert np.all(np.abs(np.roots(closed)) < 1), "the loop of the test is unstable"
@@ -86,13 +87,13 @@ class TrueLoop:
 def margins_of(
     open_loop: Callable[[np.ndarray], np.ndarray], from_hz: float = 1.0, to_hz: float = 4500.0
 ) -> dict[str, float]:
-    """Gain, phase and modulus margin of L, by their definitions."""
+    """Return gain margin (ratio), phase margin (degrees) and modulus margin of L, by their definitions."""
     hz = np.geomspace(from_hz, to_hz, 1_000_000)
     loop = open_loop(hz)
     real = loop.real[:-1][np.diff(np.signbit(loop.imag))]
     crossed = loop[:-1][np.diff(np.signbit(np.abs(loop) - 1))]
     return {
-        "gain_margin": float(min((-1 / one for one in real if -1 < one < 0), default=np.inf)),
-        "phase_margin_deg": float(min((180 - abs(np.degrees(np.angle(one))) for one in crossed), default=np.inf)),
+        "gain_margin": float(min((-1 / value for value in real if -1 < value < 0), default=np.inf)),
+        "phase_margin_deg": float(min((180 - abs(np.degrees(np.angle(value))) for value in crossed), default=np.inf)),
         "modulus_margin": float(np.abs(1 + loop).min()),
     }

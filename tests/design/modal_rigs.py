@@ -38,7 +38,7 @@ poles = [[-0.6, 0.0]]
 
 
 class ModalRig(NamedTuple):
-    """`hz`, `damping`, `gain` (n,) of the modes; weights like those of eq (4); the sensor's noise, or the default."""
+    """Modes (n,), delay, and weights at the thresholds of eq (4); `noise_um` None: the sensor's default noise."""
 
     seed: int
     hz: np.ndarray[Any, Any]
@@ -49,18 +49,18 @@ class ModalRig(NamedTuple):
     noise_um: float | None = None
     command_um: float = 20.0
     bouc_wen: dict[str, float] | None = None
-    """In place of the weights."""
+    """Parameters of the Bouc-Wen hysteresis that replaces the weights; None: plays with the weights."""
 
     @property
     def reach_um(self) -> float:
-        """What 10 V reach from rest."""
+        """Displacement (µm) at 10 V, driven from rest."""
         if self.bouc_wen is None:
             return float(np.sum(self.weights_um_per_v * (10.0 - np.array(THRESHOLDS_V))))
         d, rise, decay, lean = self.bouc_wen.values()
         return 10.0 * d - rise / (decay + lean) * (1.0 - math.exp(-10.0 * (decay + lean)))
 
     def configuration(self, sine: bool) -> str:
-        """For the slow sine at 1 kHz, or for the steps up and down at 10 kHz."""
+        """Return the configuration (TOML) for the slow sine at 1 kHz, or for the steps up and down at 10 kHz."""
         omega = 2 * np.pi * self.hz
         poles = np.array([complex(-z * w, w * np.sqrt(1 - z**2)) for z, w in zip(self.damping, omega, strict=True)])
         scale = float(np.exp(np.mean(np.log(omega))))
@@ -68,8 +68,8 @@ class ModalRig(NamedTuple):
         factors = [np.poly1d([1.0, 2 * z * w, w**2]) for z, w in zip(self.damping, relative, strict=True)]
         numerator = np.poly1d([0.0])
         for i, w in enumerate(relative):
-            others = [factor for k, factor in enumerate(factors) if k != i]
-            numerator += math.prod(others, start=np.poly1d([self.gain[i] * w**2]))
+            other_factors = [factor for k, factor in enumerate(factors) if k != i]
+            numerator += math.prod(other_factors, start=np.poly1d([self.gain[i] * w**2]))
         zeros = scale * np.roots(numerator.coeffs) if numerator.order else np.empty(0)
         leading = float(numerator.coeffs[0]) * scale ** (2 * omega.size - numerator.order)
         dynamics = [
@@ -97,6 +97,7 @@ class ModalRig(NamedTuple):
         ])  # fmt: skip
 
     def _hysteresis(self) -> str:
+        """Return the configuration's [driver.plant.hysteresis] section."""
         if self.bouc_wen is None:
             truth = f'truth = "custom"\nthresholds_v = {list(THRESHOLDS_V)}'
             return f"[driver.plant.hysteresis]\n{truth}\nweights_um_per_v = {self.weights_um_per_v.tolist()}"
@@ -105,34 +106,34 @@ class ModalRig(NamedTuple):
 
 
 def noisy_rig(seed: int) -> ModalRig:
-    """Slower, noisier and longer than `modal_rig`: 100 Hz to 2 kHz, 10 to 100 nm, about ±43 µm.
+    """Return a slower, noisier rig of longer stroke than `modal_rig`: 100 Hz to 2 kHz, 10 to 100 nm, about ±43 µm.
 
-    Of even seeds the weights are those of eq (4) ± 30 %; of odd ones the actuator is Bouc-Wen, A 5 to 20 % of d.
+    Even seeds take the weights of eq (4) ± 30 %; odd seeds a Bouc-Wen actuator with A 5 to 20 % of d.
     """
     random = np.random.default_rng(10_000 + seed)
-    drawn = _modes(random, 100.0, 2000.0)
+    modes = _modes(random, 100.0, 2000.0)
     weights = np.array(NOMINAL_WEIGHTS_UM_PER_V) * random.uniform(0.7, 1.3, len(THRESHOLDS_V))
     noise_um = float(np.exp(random.uniform(np.log(0.01), np.log(0.1))))
     if seed % 2 == 0:
-        return ModalRig(seed, *drawn, weights, noise_um, command_um=43.0)
+        return ModalRig(seed, *modes, weights, noise_um, command_um=43.0)
     d, decay = 4.6 * random.uniform(0.8, 1.2), random.uniform(0.1, 0.4)
     lean, part = decay * random.uniform(-0.5, 0.5), random.uniform(0.05, 0.2)
     numbers = {"um_per_v": d, "rise_um_per_v": part * d, "decay_per_v": decay, "lean_per_v": lean}
-    return ModalRig(seed, *drawn, weights, noise_um, 43.0, {name: float(value) for name, value in numbers.items()})
+    return ModalRig(seed, *modes, weights, noise_um, 43.0, {name: float(value) for name, value in numbers.items()})
 
 
 def modal_rig(seed: int) -> ModalRig:
-    """The rig of this seed."""
+    """Return a rig of 150 Hz to 3 kHz, about ±20 µm and the sensor's default noise, drawn with `seed`."""
     random = np.random.default_rng(seed)
-    drawn = _modes(random, 150.0, 3000.0)
+    modes = _modes(random, 150.0, 3000.0)
     weights = np.array(NOMINAL_WEIGHTS_UM_PER_V) * random.uniform(0.9, 1.1, len(THRESHOLDS_V)) * 20 / 43
-    return ModalRig(seed, *drawn, weights)
+    return ModalRig(seed, *modes, weights)
 
 
 def _modes(
     random: np.random.Generator, lowest_hz: float, highest_hz: float
 ) -> tuple[np.ndarray[Any, Any], np.ndarray[Any, Any], np.ndarray[Any, Any], int]:
-    """Frequencies, dampings, gains, and the delay in samples."""
+    """Return frequencies (Hz), dampings and gains (n,) of random modes, and the delay in samples."""
     count, delay_ticks = int(random.integers(1, 7)), int(random.integers(0, 4))
     hz = np.empty(0)
     while hz.size != count or np.any(np.diff(np.log(hz)) < 0.15):

@@ -1,4 +1,4 @@
-"""Random generalised plants, and norms computed without the project."""
+"""Random generalised plants, and H-infinity norms computed without rtloop."""
 
 from __future__ import annotations
 
@@ -9,15 +9,15 @@ from rtloop.design.synthesis.hinf.augment import GeneralisedPlant
 
 
 def random_plant(seed: int) -> GeneralisedPlant:
-    """Order 2 to 20, one or two commands and measurements, D11 and D22 not zero, about one mode in seven unstable."""
+    """Return a plant: order 2 to 20, 1 or 2 commands and measurements, D11, D22 not 0, about 1 mode in 7 unstable."""
     rng = np.random.default_rng(seed)
     n = int(rng.integers(2, 21))
     m2, p2 = (int(v) for v in rng.integers(1, 3, 2))
     m1, p1 = p2 + int(rng.integers(0, 3)), m2 + int(rng.integers(0, 3))
     parts = []
-    while (left := n - sum(part.shape[0] for part in parts)) > 0:
+    while (remaining_order := n - sum(part.shape[0] for part in parts)) > 0:
         w, sign = 10 ** rng.uniform(0, 3), -1 if rng.random() < 0.85 else 1
-        if left >= 2 and rng.random() < 0.6:
+        if remaining_order >= 2 and rng.random() < 0.6:
             damping = sign * 10 ** rng.uniform(-2, 0) * w
             parts.append(np.array([[damping, -w], [w, damping]]))
         else:
@@ -32,15 +32,15 @@ def random_plant(seed: int) -> GeneralisedPlant:
 
 
 def dense_norm(a, b, c, d) -> float:
-    """max σ̄ on a dense grid, refined around its highest points by finer grids; no Hamiltonian is involved."""
+    """Return max σ̄ on a dense grid, refined around its highest points by finer grids; no Hamiltonian is involved."""
     poles = np.linalg.eigvals(a)
     assert np.all(poles.real < 0)
     sizes = np.abs(poles)
-    around = [abs(p.imag) + np.abs(p.real) * np.tan(np.linspace(-1.5, 1.5, 21)) for p in poles]
-    grid = np.concatenate([[0.0], np.geomspace(1e-3 * sizes.min(), 1e3 * sizes.max(), 800), *around])
+    near_poles = [abs(p.imag) + np.abs(p.real) * np.tan(np.linspace(-1.5, 1.5, 21)) for p in poles]
+    grid = np.concatenate([[0.0], np.geomspace(1e-3 * sizes.min(), 1e3 * sizes.max(), 800), *near_poles])
     omega = np.unique(np.abs(grid))
     gains = _gains(a, b, c, d, omega)
-    best = gains.max()
+    largest = gains.max()
     for i in np.argsort(gains)[-10:]:
         low, high = omega[max(i - 1, 0)], omega[min(i + 1, omega.size - 1)]
         for _ in range(5):
@@ -48,18 +48,19 @@ def dense_norm(a, b, c, d) -> float:
             values = _gains(a, b, c, d, fine)
             j = int(np.argmax(values))
             low, high = fine[max(j - 1, 0)], fine[min(j + 1, 20)]
-            best = max(best, values[j])
-    return float(max(best, np.linalg.norm(d, 2)))
+            largest = max(largest, values[j])
+    return float(max(largest, np.linalg.norm(d, 2)))
 
 
 def _gains(a, b, c, d, omega):
+    """Return the largest singular value at each frequency `omega` (rad/s)."""
     pencil = 1j * omega[:, None, None] * np.eye(a.shape[0]) - a
     inputs = np.broadcast_to(b.astype(complex), (omega.size, *b.shape))
     return np.linalg.norm(d + c @ np.linalg.solve(pencil, inputs), 2, axis=(1, 2))
 
 
 def hamiltonian_norm(a, b, c, d) -> float:
-    """The same by bisection: γ exceeds the norm when this Hamiltonian matrix keeps off the imaginary axis."""
+    """Return the norm by bisection: γ exceeds it if the Hamiltonian matrix has no eigenvalue on the imaginary axis."""
     low, high = np.linalg.norm(d, 2) + 1e-9, 1e7
     for _ in range(60):
         gamma = np.sqrt(low * high)

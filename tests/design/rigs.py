@@ -1,6 +1,6 @@
-"""Rigs drawn at random, what they do, and how far an identified model is from the truth that was drawn.
+"""Rigs drawn at random, their recordings, and the errors of an identified model against the drawn rig.
 
-Everything that judges here is the rig's own: its play operators step by step, its poles, its D(0).
+The errors are measured against the rig itself: its play operators stepped sample by sample, its poles, its D(0).
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ COMMAND_UM = 40.0
 
 @dataclass(frozen=True)
 class Rig:
-    """A plant and the truth about it; `d0` is D(0)."""
+    """A rig's options, and its true weights, thresholds, resonance, damping and `d0` = D(0)."""
 
     options: RigOptions
     weights: np.ndarray[Any, Any]
@@ -48,23 +48,27 @@ class Rig:
     d0: float
 
     def measure(self, drive_v: np.ndarray[Any, Any], period_s: float) -> AxisRecording:
-        """The rig driven from rest."""
+        """Return a recording of the rig, driven from rest."""
         coefficients, state = build_rig(self.options, ["x"], period_s)
         adc_v = np.empty(drive_v.size)
-        _record(coefficients, state, drive_v, adc_v)
+        record_readings(coefficients, state, drive_v, adc_v)
         position = SENSOR_UM_PER_V * adc_v
         return AxisRecording("rig", period_s, drive_v, position, position, True, "", "")
 
     def static_um(self, drive_v: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
-        """Position at rest, D(0)·P[u], sample by sample from the rig's own plays."""
+        """Return the settled position D(0)·P[u] (µm) at each sample, from the rig's own plays."""
         coefficients, state = build_rig(self.options, ["x"], 1.0)
-        found = np.empty(drive_v.size)
-        _hysteresis(coefficients[0], state[0], drive_v, found)
-        return self.d0 * found
+        plays_um = np.empty(drive_v.size)
+        _step_hysteresis(coefficients[0], state[0], drive_v, plays_um)
+        return self.d0 * plays_um
 
 
-class Closeness(NamedTuple):
-    """Identified against drawn, in percent (except `order`); ξ in µm and as the part of it that was reached."""
+class ModelErrors(NamedTuple):
+    """Errors of an identified model in percent; its order; the true ξ (µm); the parts of the bounds that are reached.
+
+    `truth_…`: parts of the true ξ that a sine and the worst command reach; `identified_…`: of the identified ξ plus the
+    fit's error.
+    """
 
     loop_percent: float
     resonance_percent: float
@@ -79,7 +83,7 @@ class Closeness(NamedTuple):
 
 
 def drawn(seed: int, *, moved_thresholds: float = 0.0) -> Rig:
-    """Weights of eq (4) ± 20 % each, resonance ± 10 %, noise, resolution, offset, 16 bit; and thresholds moved."""
+    """Return a rig: weights of eq (4) ± 20 % each, resonance ± 10 %, noise, offset, 16 bit, thresholds moved."""
     random = np.random.default_rng(seed)
     weights = np.array(NOMINAL_WEIGHTS_UM_PER_V) * random.uniform(0.8, 1.2, len(NOMINAL_WEIGHTS_UM_PER_V))
     gaps = np.diff(THRESHOLDS_V, prepend=0.0) * random.uniform(1 - moved_thresholds, 1 + moved_thresholds, weights.size)
@@ -107,73 +111,79 @@ def drawn(seed: int, *, moved_thresholds: float = 0.0) -> Rig:
 
 
 def slow_sine(volts: float = 10.0, periods: float = 2.5) -> np.ndarray[Any, Any]:
-    """0.1 Hz from rest at 1 kHz."""
+    """Return a sine of 0.1 Hz (V) from rest, sampled at 1 kHz."""
     return volts * np.sin(2 * np.pi * 0.1 * SLOW_S * np.arange(round(periods * 10 / SLOW_S)))
 
 
 def step_drive(volts: float = 10.0, duration_s: float = 1.0) -> np.ndarray[Any, Any]:
-    """0.1 s of rest, then `volts`, at 10 kHz."""
+    """Return a drive (V) of 0 for 0.1 s, then `volts`, sampled at 10 kHz."""
     time_s = FAST_S * np.arange(round(duration_s / FAST_S))
     return np.where(time_s < 0.1, 0.0, volts)
 
 
 def chirp_drive(volts: float = 1.0, duration_s: float = 2.0) -> np.ndarray[Any, Any]:
-    """10 Hz to 2 kHz, logarithmic, at 10 kHz."""
+    """Return a logarithmic chirp (V) from 10 Hz to 2 kHz, sampled at 10 kHz."""
     time_s = FAST_S * np.arange(round(duration_s / FAST_S))
     rate = np.log(200.0) / duration_s
     return volts * np.sin(2 * np.pi * 10.0 * np.expm1(rate * time_s) / rate)
 
 
-def excited(model: PlayModel, run: AxisRecording) -> Excitation:
+def model_excitation(model: PlayModel, run: AxisRecording) -> Excitation:
+    """Return the hysteresis model's output (µm) for the recorded drive, beside the recorded position."""
     return Excitation(run.name, model_output(model, run.drive_v), run.position_um, run.period_s)
 
 
-def identified(rig: Rig, **options: Any) -> tuple[HysteresisFit, DynamicsFit]:
-    """From a slow sine and a step; `options` of the hysteresis."""
+def identify_rig(rig: Rig, **options: Any) -> tuple[HysteresisFit, DynamicsFit]:
+    """Return the hysteresis and dynamics identified from a slow sine and a step; `options` are of the hysteresis."""
     shape = identify_hysteresis([rig.measure(slow_sine(), SLOW_S)], **options)
-    return shape, identify_dynamics(excited(shape.model, rig.measure(step_drive(), FAST_S)))
+    return shape, identify_dynamics(model_excitation(shape.model, rig.measure(step_drive(), FAST_S)))
 
 
-def closeness(rig: Rig, shape: HysteresisFit, dynamics: DynamicsFit) -> Closeness:
-    """Largest error of the loop over its range, resonance, damping, static gain at 10 V; and ξ."""
+def model_errors(rig: Rig, shape: HysteresisFit, dynamics: DynamicsFit) -> ModelErrors:
+    """Return errors of hysteresis loop (largest, of its range), resonance, damping, static gain at the peak; and ξ."""
     drive = slow_sine()
     truth, model = rig.static_um(drive), dynamics.static_gain * model_output(shape.model, drive)
     mode = min(dynamics.modes, key=lambda mode: abs(mode.frequency_hz - rig.resonance_hz))
     top = int(np.argmax(drive))
     actuator = PlayModel(shape.model.thresholds, dynamics.static_gain * shape.model.weights)
-    return Closeness(
+    return ModelErrors(
         100 * float(np.abs(model - truth).max() / np.ptp(truth)),
         100 * (mode.frequency_hz / rig.resonance_hz - 1),
         100 * (mode.damping / rig.damping - 1),
         100 * float(model[top] / truth[top] - 1),
         dynamics.model.order,
-        *tightness(rig, actuator, shape.max_error_um),
+        *bound_tightness(rig, actuator, shape.max_error_um),
     )
 
 
-def tightness(rig: Rig, actuator: PlayModel, error_um: float) -> tuple[float, float, float, float, float]:
-    """ξ of the rig's true operator behind the inverse of eq (4), the parts of it that a sine and the worst command
-    reach on the rig itself; then the same parts of what the identified operator promises, ξ plus its fit's error."""
+def bound_tightness(rig: Rig, actuator: PlayModel, error_um: float) -> tuple[float, float, float, float, float]:
+    """Return ξ (µm) of the true operator behind the inverse of eq (4), then the parts of it that a sine and the worst
+    command reach on the rig; then the parts that they reach of the identified ξ plus the fit's error `error_um`."""
     inverse = EQ_4.remove_dead_band().inverse()
-    true = residual_operator(PlayModel(rig.thresholds, rig.d0 * rig.weights), inverse, COMMAND_UM)
-    found = residual_operator(actuator, inverse, COMMAND_UM)
-    xi = true.bound_um(true.gain)
+    true_operator = residual_operator(PlayModel(rig.thresholds, rig.d0 * rig.weights), inverse, COMMAND_UM)
+    identified_operator = residual_operator(actuator, inverse, COMMAND_UM)
+    xi = true_operator.bound_um(true_operator.gain)
     parts = []
-    for operator, allowance in ((true, 0.0), (found, error_um)):
-        for commands in (COMMAND_UM * np.sin(np.linspace(0, 5 * np.pi, 4001)), true.worst_commands_um(operator.gain)):
-            left = rig.static_um(model_output(inverse, commands)) - operator.gain * commands
-            parts.append(float(np.abs(left).max()) / (operator.bound_um(operator.gain) + allowance))
+    for operator, allowance in ((true_operator, 0.0), (identified_operator, error_um)):
+        for commands in (
+            COMMAND_UM * np.sin(np.linspace(0, 5 * np.pi, 4001)),
+            true_operator.worst_commands_um(operator.gain),
+        ):
+            errors_um = rig.static_um(model_output(inverse, commands)) - operator.gain * commands
+            parts.append(float(np.abs(errors_um).max()) / (operator.bound_um(operator.gain) + allowance))
     return xi, *parts
 
 
 @jit
-def _record(coefficients, state, drive_v, adc_v):
+def record_readings(coefficients, state, drive_v, adc_v):
+    """Write the rig's readings (V) into `adc_v`, each sampled before its drive is applied."""
     for k in range(drive_v.size):
         adc_v[k] = sample(coefficients[0], state[0])
         advance(coefficients, state, drive_v[k : k + 1])
 
 
 @jit
-def _hysteresis(coefficients, state, drive_v, found_um):
+def _step_hysteresis(coefficients, state, drive_v, plays_um):
+    """Write the output of the hysteresis (µm) at each sample into `plays_um`."""
     for k in range(drive_v.size):
-        found_um[k] = hysteresis_step(coefficients, state, drive_v[k])
+        plays_um[k] = hysteresis_step(coefficients, state, drive_v[k])

@@ -1,4 +1,4 @@
-"""Dead time against the exponential itself, and roots that are left out against what they turn within the band."""
+"""Approximated dead time against the exact exponential, and the gain that remains when fast roots are dropped."""
 
 import math
 
@@ -17,13 +17,13 @@ MODE = Transfer.from_factors(2.5e7, [], [[1.0, 200.0, 2.5e7]])
 
 @pytest.mark.parametrize(("ticks", "order"), [(0.5, 1), (1.5, 2), (2.5, 3), (3.5, 4)])
 def test_dead_time_is_that_of_the_exponential(ticks, order) -> None:
-    """As near as it matters where |C D| is not small: up to 1 kHz. Nowhere does it change a magnitude."""
-    found, tau = dead_time(ticks / RATE_HZ, order), ticks / RATE_HZ
-    assert found.order == order
-    assert np.abs(found.response(BAND)) == pytest.approx(1.0, rel=1e-9)
+    """The error stays below 1 % up to 1 kHz, where |C D| is not small; the magnitude is 1 at every frequency."""
+    approximation, delay_s = dead_time(ticks / RATE_HZ, order), ticks / RATE_HZ
+    assert approximation.order == order
+    assert np.abs(approximation.response(BAND)) == pytest.approx(1.0, rel=1e-9)
     low = BAND[np.abs(BAND) < 2000 * math.pi]
-    assert np.abs(found.response(low) - np.exp(-low * tau)).max() < 0.01
-    assert found.is_stable
+    assert np.abs(approximation.response(low) - np.exp(-low * delay_s)).max() < 0.01
+    assert approximation.is_stable
 
 
 def test_no_delay_is_one() -> None:
@@ -33,10 +33,10 @@ def test_no_delay_is_one() -> None:
 def test_roots_far_beyond_the_rate_leave_their_gain() -> None:
     near = Transfer.from_zpk([-5.0], [-1.0, -3e4], 7.0)
     far = Transfer.from_zpk([*near.zeros, 4e13], [*near.poles, -6e12], 7.0 * 6e12 / -4e13)
-    found = drop_fast_roots(far, RATE_HZ)
-    assert found.zeros.tolist() == near.zeros.tolist()
-    assert found.poles.tolist() == near.poles.tolist()
-    assert found.gain == pytest.approx(near.gain, rel=1e-12)
+    reduced = drop_fast_roots(far, RATE_HZ)
+    assert reduced.zeros.tolist() == near.zeros.tolist()
+    assert reduced.poles.tolist() == near.poles.tolist()
+    assert reduced.gain == pytest.approx(near.gain, rel=1e-12)
 
 
 def test_a_far_pole_stays_where_a_zero_would_be_left_without_one_or_it_is_unstable() -> None:
@@ -47,9 +47,9 @@ def test_a_far_pole_stays_where_a_zero_would_be_left_without_one_or_it_is_unstab
 def test_too_high_an_order_does_not_run() -> None:
     """The law has room for 24 states."""
     rates = -np.arange(1.0, 26.0)
-    for count, says in ((24, True), (25, False)):
+    for count, runs in ((24, True), (25, False)):
         controller = Transfer.from_zpk(rates[: count - 1] - 0.5, rates[:count], 1.0)
-        assert is_runnable(controller, MODE, RATE_HZ, "matched", None, 0) is says
+        assert is_runnable(controller, MODE, RATE_HZ, "matched", None, 0) is runs
 
 
 def test_where_nothing_runs_the_message_says_what_would_help() -> None:

@@ -1,4 +1,4 @@
-"""What discretisation does to the notch of eq (20): said in numbers and in words."""
+"""The shift of the notch of eq (20) by discretisation, and its warnings, against frequencies computed by hand."""
 
 import json
 
@@ -35,7 +35,7 @@ def test_methods_that_keep_the_notch_are_not(method, prewarp_hz) -> None:
 
 
 def test_deviation_is_small_where_the_sampling_is_fast() -> None:
-    """Tustin's error is of second order: a hundred times faster, ten thousand times smaller."""
+    """Tustin's error is of second order: sampling 100 times faster makes the error 10,000 times smaller."""
     smooth = Transfer.from_factors(100, [[1, 300]], [[1, 40], [1, 900]])
     slow, fast = (
         compare_controllers(smooth, discretise_controller(smooth, period_s, "tustin"), 100.0)
@@ -58,8 +58,8 @@ def test_an_undamped_notch_is_judged_by_its_frequency() -> None:
 
 
 def test_two_notches_keep_their_own_images() -> None:
-    two = Transfer.from_factors(1, [[1, 10, 1.4e7], [1, 10, 1.5e7]], [[1, 900], [1, 4000], [1, 5000], [1, 6000]])
-    shifts = compare_controllers(two, discretise_controller(two, T, "tustin")).shifts
+    notches = Transfer.from_factors(1, [[1, 10, 1.4e7], [1, 10, 1.5e7]], [[1, 900], [1, 4000], [1, 5000], [1, 6000]])
+    shifts = compare_controllers(notches, discretise_controller(notches, T, "tustin")).shifts
     assert len({shift.discrete_hz for shift in shifts}) == 2
     assert all(-0.02 < shift.relative < -0.01 for shift in shifts)
 

@@ -1,4 +1,4 @@
-"""The output of the inverse compensation: a composition of plays against the rig's plays stepped one by one."""
+"""Output and bound ξ of the inverse compensation, against compositions of plays and plays stepped one by one."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ RESIDUAL_RIG = PlayModel(np.array(THRESHOLDS_V), np.array(RESIDUAL_WEIGHTS_UM_PE
 
 @st.composite
 def models(draw) -> PlayModel:
-    """A model whose loading curve increases, with a dead band or without."""
+    """Draw a play model whose loading curve increases, with or without a dead band."""
     slopes = draw(st.lists(st.floats(0.2, 8.0), min_size=1, max_size=8))
     gaps = draw(st.lists(st.floats(0.05, 2.0), min_size=len(slopes), max_size=len(slopes)))
     first = draw(st.sampled_from([0.0, gaps[0]]))
@@ -47,8 +47,8 @@ def test_the_bound_is_reached(actuator, compensator) -> None:
     for gain in (residual.gain, residual.best_gain, 1.0):
         v = residual.worst_commands_um(gain)
         assert np.abs(v).max() <= COMMAND_UM * (1 + 1e-12)
-        left = compensated_output(actuator, inverse, v)[-1] - gain * v[-1]
-        assert abs(left) == pytest.approx(residual.bound_um(gain), rel=1e-6, abs=1e-6)
+        error_um = compensated_output(actuator, inverse, v)[-1] - gain * v[-1]
+        assert abs(error_um) == pytest.approx(residual.bound_um(gain), rel=1e-6, abs=1e-6)
 
 
 @pytest.mark.parametrize("seed", range(301, 311))
@@ -61,20 +61,20 @@ def test_the_bound_holds_on_drawn_rigs_stepped_one_by_one(seed: int) -> None:
         "random": random.uniform(-COMMAND_UM, COMMAND_UM, 4000),
         "worst": residual.worst_commands_um(residual.gain),
     }.items():
-        left = np.abs(rig.static_um(model_output(INVERSE, v)) - residual.gain * v).max()
-        print(f"seed {seed}: ξ {bound:.3f} µm, {name} reaches {100 * left / bound:.1f} %")
-        assert left <= bound * (1 + 1e-9)
+        error_um = np.abs(rig.static_um(model_output(INVERSE, v)) - residual.gain * v).max()
+        print(f"seed {seed}: ξ {bound:.3f} µm, {name} reaches {100 * error_um / bound:.1f} % of ξ")
+        assert error_um <= bound * (1 + 1e-9)
 
 
 def test_eq_3_as_printed_is_no_bound_where_weights_have_both_signs() -> None:
-    """The paper's rig: a plain sine of 40 µm leaves 1.86 µm, |∫ r p(r) dr| is 1.52 µm, ξ is 2.28 µm."""
+    """On the paper's rig a sine of 40 µm leaves 1.86 µm; |∫ r p(r) dr| is 1.52 µm and ξ is 2.28 µm."""
     residual = residual_operator(RESIDUAL_RIG, INVERSE, COMMAND_UM)
     v = COMMAND_UM * np.sin(np.linspace(0, 5 * np.pi, 5001))
-    left = np.abs(compensated_output(RESIDUAL_RIG, INVERSE, v) - residual.gain * v).max()
+    error_um = np.abs(compensated_output(RESIDUAL_RIG, INVERSE, v) - residual.gain * v).max()
     assert residual.printed_bound_um == pytest.approx(1.523, abs=2e-3)
-    assert left == pytest.approx(1.856, abs=2e-3)
+    assert error_um == pytest.approx(1.856, abs=2e-3)
     assert residual.bound_um(residual.gain) == pytest.approx(2.284, abs=2e-3)
-    assert residual.printed_bound_um < left <= residual.bound_um(residual.gain) <= residual.safe_bound_um
+    assert residual.printed_bound_um < error_um <= residual.bound_um(residual.gain) <= residual.safe_bound_um
 
 
 def test_eq_3_is_the_bound_where_all_weights_have_one_sign() -> None:
@@ -86,20 +86,20 @@ def test_eq_3_is_the_bound_where_all_weights_have_one_sign() -> None:
 
 
 def test_an_exact_inverse_leaves_nothing() -> None:
-    behind = EQ_4.remove_dead_band()
-    residual = residual_operator(behind, behind.inverse(), COMMAND_UM)
+    actuator = EQ_4.remove_dead_band()
+    residual = residual_operator(actuator, actuator.inverse(), COMMAND_UM)
     assert residual.gain == pytest.approx(1.0)
     assert residual.bound_um(1.0) < 1e-12
 
 
 def test_the_dead_band_alone_leaves_what_the_model_of_eq_4_says() -> None:
-    """0.747 µm of a 40 µm sine from rest, r_0 = 0.095 V being left out of the inverse."""
+    """A 40 µm sine from rest leaves 0.747 µm, because the inverse omits the dead band of r_0 = 0.095 V."""
     v = COMMAND_UM * np.sin(np.linspace(0, 5 * np.pi, 20_001))
     assert np.abs(compensated_output(EQ_4, INVERSE, v) - v).max() == pytest.approx(0.747, abs=1e-3)
 
 
 @pytest.mark.parametrize(
-    ("compensator", "command_um", "says"),
+    ("compensator", "command_um", "message"),
     [
         (
             PlayModel(np.array([0.0, 1.0]), np.array([1.0, -1.5])),
@@ -110,6 +110,6 @@ def test_the_dead_band_alone_leaves_what_the_model_of_eq_4_says() -> None:
         (INVERSE, -1, "command_um: -1"),
     ],
 )
-def test_refusals(compensator: PlayModel, command_um: float, says: str) -> None:
-    with pytest.raises(ValueError, match=says):
+def test_refusals(compensator: PlayModel, command_um: float, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
         residual_operator(EQ_4, compensator, command_um)

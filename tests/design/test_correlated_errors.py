@@ -1,4 +1,4 @@
-"""Standard deviations under noise that the noise model lacks, and levels that the model of the hysteresis misses."""
+"""Standard deviations under noise that the noise model lacks; correction of levels that the hysteresis model misses."""
 
 import numpy as np
 import pytest
@@ -20,7 +20,7 @@ TRUTH = Innovations(PERIOD_S, np.array([RESONANCE]), np.array([RESIDUE[0] / SCAL
 
 @pytest.mark.parametrize("pole", [0.0, -0.9])
 def test_standard_deviations_are_the_spread_of_estimates_under_coloured_noise(pole: float) -> None:
-    """Output errors of 150 recordings, whose noise is an autoregression that a model with H = 1 does not have."""
+    """150 recordings are fitted with H = 1, while their noise is white (pole 0) or an autoregression (pole -0.9)."""
     random, u = np.random.default_rng(1), held_levels(TICKS // 2, 0.0, 20.0)
     values, stated, assumed_white = [], [], []
     narrowest, widest = 0.8, 1.25
@@ -39,16 +39,17 @@ def test_standard_deviations_are_the_spread_of_estimates_under_coloured_noise(po
     spread = np.std(values, axis=0, ddof=1)
     ratios, white_ratios = (np.mean(rows, axis=0) / spread for rows in (stated, assumed_white))
     assert np.all((ratios > narrowest) & (ratios < widest)), ratios
-    wrong = np.any((white_ratios < narrowest) | (white_ratios > widest))
-    assert wrong == (pole != 0), white_ratios
+    white_deviates = np.any((white_ratios < narrowest) | (white_ratios > widest))
+    assert white_deviates == (pole != 0), white_ratios
 
 
 def held_levels(dwell_ticks: int, *values: float) -> np.ndarray:
+    """Return the values, each repeated for `dwell_ticks` samples."""
     return np.repeat(values, dwell_ticks).astype(float)
 
 
-def recorded(dwell_ticks: int, added_um: np.ndarray | float = 0.0) -> Excitation:
-    """The model of the hysteresis says 20.0 and 3.1 µm where the actuator holds 20.3 and 3.0."""
+def misjudged_levels(dwell_ticks: int, added_um: np.ndarray | float = 0.0) -> Excitation:
+    """Return a recording: the hysteresis model gives 20.0 and 3.1 µm where the actuator holds 20.3 and 3.0."""
     true_um = held_levels(dwell_ticks, 0.0, 20.3, 0.0, 3.0)
     noise_um = np.random.default_rng(2).normal(0.0, NOISE_UM, true_um.size)
     position_um = TRUTH.simulate_output(true_um) + noise_um + added_um
@@ -57,7 +58,7 @@ def recorded(dwell_ticks: int, added_um: np.ndarray | float = 0.0) -> Excitation
 
 def test_levels_that_the_hysteresis_model_misses_are_measured() -> None:
     """Corrected levels are proportional to the true ones; the factor is left to the static gain."""
-    before = recorded(LONG)
+    before = misjudged_levels(LONG)
     run, largest = correct_levels(before)
     _, high, low, end = run.input[LONG // 2 :: LONG]
     assert high / 20.3 == pytest.approx(end / 3.0, rel=1e-3)
@@ -69,7 +70,7 @@ def test_levels_that_the_hysteresis_model_misses_are_measured() -> None:
 def test_levels_are_left_alone_where_they_cannot_be_measured(reason: str) -> None:
     time_s, u = PERIOD_S * np.arange(4 * LONG), held_levels(LONG, 0.0, 20.0)
     added_um = {"drift": 0.1 * time_s, "ringing": 0.1 * np.sin(5000.0 * time_s)}.get(reason, 0.0)
-    run = recorded(80 if reason == "short holds" else LONG, added_um)
+    run = misjudged_levels(80 if reason == "short holds" else LONG, added_um)
     if reason == "two levels":
         run = Excitation("made", u, 1.01 * TRUTH.simulate_output(u), PERIOD_S)
     assert correct_levels(run) == (run, 0.0)

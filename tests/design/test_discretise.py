@@ -1,4 +1,4 @@
-"""C(z) against exact arithmetic: the state space that runs, compared at 120 digits and more."""
+"""Discretised controllers: the response of the state space against C(z) computed with 120 digits or more."""
 
 import cmath
 import math
@@ -20,8 +20,8 @@ HZ = np.array([0.1, 3.0, 107.9, 350.0, 595.5, 640.0, 2000.0, 4400.0])
 METHODS = [("matched", None), ("tustin", None), ("tustin", 595.5), ("foh", None), ("zoh", None)]
 
 
-def exact(zeros, poles, gain, method, prewarp_hz, hz):
-    """C(z) from the definitions, at hundreds of digits: repeated poles are set 1e-30 apart, and that cancels again."""
+def exact_c(zeros, poles, gain, method, prewarp_hz, hz):
+    """Return C(z) at `hz` by definition, with 120 digits or more. Holds: repeated poles are set about 1e-30 apart."""
     with mp.workdps(120 + 35 * len(poles)):
         period = mp.mpf(T)
         z = mp.exp(2j * mp.pi * mp.mpf(hz) * period)
@@ -33,7 +33,7 @@ def exact(zeros, poles, gain, method, prewarp_hz, hz):
         if method == "matched":
             zd, pd = [mp.exp(x * period) for x in zs], [mp.exp(x * period) for x in ps]
             zd += [mp.mpf(-1)] * (len(pd) - len(zd))
-            near = mp.mpf("1e-40")  # both gains a little beside 0 Hz, where an integrator has one too
+            near = mp.mpf("1e-40")  # both gains are compared just beside s = 0, where an integrator's gain is finite
             continuous = gain * mp.fprod(near - x for x in zs) / mp.fprod(near - x for x in ps)
             at = mp.exp(near * period)
             discrete = mp.fprod(at - x for x in zd) / mp.fprod(at - x for x in pd)
@@ -51,33 +51,33 @@ def exact(zeros, poles, gain, method, prewarp_hz, hz):
 
 
 def worst_error(transfer: Transfer, method, prewarp_hz, hz=HZ) -> float:
-    """Largest relative error, |C(z)| counting as no less than 1e-5 of the terms that c·x + d e adds up there.
+    """Return the largest error relative to |C(z)|, or to 1e-5 of the summed terms of c·x + d e where |C(z)| is smaller.
 
-    Ten zeros in one place leave a sum of doubles nothing but its rounding, in any realisation; and what lies nine
-    powers of ten below the largest |C(z)| passes through unseen.
+    Ten coinciding zeros leave only rounding errors of that sum, in any realisation. The divisor is at least 1e-9 of the
+    largest |C(z)|.
     """
     controller = discretise_controller(transfer, T, method, prewarp_hz)
-    wanted = np.array([exact(transfer.zeros, transfer.poles, transfer.gain, method, prewarp_hz, f) for f in hz])
+    expected = np.array([exact_c(transfer.zeros, transfer.poles, transfer.gain, method, prewarp_hz, f) for f in hz])
     states = controller.system.states(np.exp(2j * np.pi * np.asarray(hz) * T))
     terms = np.abs(states) @ np.abs(controller.c) + abs(controller.d)
-    size = np.maximum(np.maximum(np.abs(wanted), 1e-5 * terms), 1e-9 * np.abs(wanted).max())
-    return float(np.max(np.abs(controller.response(hz) - wanted) / size))
+    size = np.maximum(np.maximum(np.abs(expected), 1e-5 * terms), 1e-9 * np.abs(expected).max())
+    return float(np.max(np.abs(controller.response(hz) - expected) / size))
 
 
-def rounding(controller, hz) -> float:
-    """Relative error of C(z), counted as in `worst_error`, that rounding A brings about: ε κ(zI − A) |c||x| / |C|."""
-    found = 0.0
+def rounding_error(controller, hz) -> float:
+    """Return the relative error of C(z), as in `worst_error`, caused by rounding A: ε κ(zI − A) |c||x| / |C|."""
+    worst = 0.0
     for z in np.exp(2j * np.pi * np.asarray(hz) * T):
         terms = np.abs(controller.system.states(z)[0]) @ np.abs(controller.c) + abs(controller.d)
         size = max(abs(controller.system.response(z)[0]), 1e-5 * terms)
         pencil = z * np.eye(controller.b.size) - controller.a
-        found = max(found, np.finfo(float).eps * np.linalg.cond(pencil) * terms / size if controller.b.size else 0.0)
-    return found
+        worst = max(worst, np.finfo(float).eps * np.linalg.cond(pencil) * terms / size if controller.b.size else 0.0)
+    return worst
 
 
 @pytest.mark.parametrize(("method", "prewarp_hz"), METHODS)
 def test_paper_controller_to_1e9(method, prewarp_hz) -> None:
-    """Eq (20) at 10 kHz."""
+    """The controller is eq (20), sampled at 10 kHz."""
     assert worst_error(PAPER_C, method, prewarp_hz) < 1e-9
 
 
@@ -119,17 +119,17 @@ roots = st.tuples(st.lists(rates, max_size=3), st.lists(pairs, max_size=3)).map(
 @settings(max_examples=100, deadline=None)
 @given(poles=roots, zeros=roots, repeat=st.booleans(), integrator=st.booleans(), how=st.sampled_from(METHODS))
 def test_any_controller(poles, zeros, repeat, integrator, how) -> None:
-    """State space = C(z), anti-windup stable and exact, steady state right; whatever the poles.
+    """For any poles: state space = C(z), anti-windup stable and exact, steady state correct.
 
-    To 1e-7 here: zeros near 3 Hz among poles far away cancel inside the cascade as well, and cost digits: six of them
-    beside a pole of three gave 1.3e-8. Or
-    to what rounding A alone must cost, where eight of them cancel and zI − A is all but singular.
+    The tolerance is 1e-7: zeros near 3 Hz among distant poles also cancel inside the cascade and cost digits (six zeros
+    beside a triple pole gave 1.3e-8). Where eight zeros cancel, zI − A is nearly singular, and the tolerance is the
+    error from rounding A alone.
     """
     poles = (poles + poles if repeat and len(poles) <= 5 else poles) + ([0.0] if integrator else [])
     zeros = zeros[: len(poles)] if len(zeros) <= len(poles) else []
     transfer = Transfer.from_zpk(zeros, poles, float(np.prod([abs(p) or 1 for p in poles])))
     controller = discretise_controller(transfer, T, *how)
-    assert worst_error(transfer, *how, hz=HZ[1::3]) < max(1e-7, rounding(controller, HZ[1::3]))
+    assert worst_error(transfer, *how, hz=HZ[1::3]) < max(1e-7, rounding_error(controller, HZ[1::3]))
     a, b, c, m = controller.a, controller.b, controller.c, controller.antiwindup
     if np.abs(c).max(initial=0) > 1e-6:  # otherwise every pole has its zero
         assert c @ m == pytest.approx(1.0, rel=1e-9)
@@ -142,14 +142,14 @@ def test_any_controller(poles, zeros, repeat, integrator, how) -> None:
         assert np.all(row[end:] == 0)
 
 
-@pytest.mark.parametrize(("method", "theirs"), [("tustin", "bilinear"), ("zoh", "zoh"), ("foh", "foh")])
-def test_against_scipy(method, theirs) -> None:
-    """scipy.signal.cont2discrete on a well-conditioned system."""
+@pytest.mark.parametrize(("method", "scipy_method"), [("tustin", "bilinear"), ("zoh", "zoh"), ("foh", "foh")])
+def test_against_scipy(method, scipy_method) -> None:
+    """The system is well conditioned; the oracle is scipy.signal.cont2discrete."""
     numerator, denominator = [2.0, 300.0, 5e4], np.polymul([1, 100], [1, 150, 9e4])
-    num, den, _ = signal.cont2discrete((numerator, denominator), 1e-3, theirs)
+    num, den, _ = signal.cont2discrete((numerator, denominator), 1e-3, scipy_method)
     controller = discretise_controller(Transfer.from_transfer_function(numerator, denominator), 1e-3, method)
-    _, wanted = signal.freqz(np.ravel(num), den, np.pi * np.array([0.01, 0.1, 0.5, 0.9]))
-    assert controller.response([5, 50, 250, 450]) == pytest.approx(wanted, rel=1e-9)
+    _, expected = signal.freqz(np.ravel(num), den, np.pi * np.array([0.01, 0.1, 0.5, 0.9]))
+    assert controller.response([5, 50, 250, 450]) == pytest.approx(expected, rel=1e-9)
 
 
 def test_modal_blocks_and_bands_of_the_paper() -> None:
@@ -225,7 +225,7 @@ def test_refusals(controller, arguments, message) -> None:
 
 
 def test_a_zero_too_far_to_the_right_to_be_seen_leaves_its_gain() -> None:
-    """exp(800) has no digits beside 1; what is left is k/(z − p) with C(1) = C(0)."""
-    found = discretise_controller(Transfer.from_zpk([8e6], [-100.0], -1e-5), T, "matched")
-    assert found.zeros.size == 0
-    assert found.gain / (1 - math.exp(-100.0 * T)) == pytest.approx(0.8, rel=1e-12)
+    """Beside exp(800), z rounds away: the controller becomes k/(z − p) with C(1) = C(0)."""
+    discrete = discretise_controller(Transfer.from_zpk([8e6], [-100.0], -1e-5), T, "matched")
+    assert discrete.zeros.size == 0
+    assert discrete.gain / (1 - math.exp(-100.0 * T)) == pytest.approx(0.8, rel=1e-12)

@@ -1,4 +1,4 @@
-"""Peaks of the excitation: the first one's, and the motion that a fitted one makes of a loop of known response."""
+"""Peak of the first excitation period, and motion, command and reference of a period fitted to a known response."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def test_a_fitted_period_moves_a_plain_gain_by_three_quarters_of_the_amplitude()
 
 
 def test_a_fitted_period_keeps_command_and_reference_within_their_limits() -> None:
-    """A plant that answers a hundredth would need a reference of 75 times the amplitude, and as much command."""
+    """At a gain of 0.01 the full motion would need a reference of 75 times the amplitude; the limits are 10 and 3."""
     gain = np.full(GRID.excited.size, 0.01 + 0j)
     assert np.abs(fit_period(GRID, gain, 0.1 * gain, 1.0)).max() == pytest.approx(10.0, rel=1e-6)
     command = np.full(GRID.excited.size, 1.0 + 0j)

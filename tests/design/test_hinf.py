@@ -1,4 +1,4 @@
-"""The Glover-Doyle solver: the paper's γ, textbook answers, SLICOT where it is installed, or why there is none."""
+"""The Glover-Doyle solver against the paper's γ, closed forms and, if installed, SLICOT; errors name their cause."""
 
 import math
 import warnings
@@ -25,23 +25,23 @@ NORMALISED_D = Transfer(PAPER_D.zeros, PAPER_D.poles, PAPER_D.gain / PAPER_D.dc_
 def test_the_papers_problem(plant, gamma_opt) -> None:
     """γ_opt of eqs (5), (15), (17), (19), recomputed independently; the controller has order 11, as the paper says."""
     standard = augment(plant, PAPER_WEIGHTS)
-    found = synthesise_hinf(standard)
-    assert found.gamma_opt == pytest.approx(gamma_opt, abs=2e-3)
-    assert found.gamma == pytest.approx(1.004 * found.gamma_opt)
-    assert found.controller.a.shape == (11, 11)
-    assert found.limiting.startswith("coupling")
-    loop = standard.close_loop(found.controller)
+    solution = synthesise_hinf(standard)
+    assert solution.gamma_opt == pytest.approx(gamma_opt, abs=2e-3)
+    assert solution.gamma == pytest.approx(1.004 * solution.gamma_opt)
+    assert solution.controller.a.shape == (11, 11)
+    assert solution.limiting.startswith("coupling")
+    loop = standard.close_loop(solution.controller)
     for norm in (dense_norm(*loop), hamiltonian_norm(*loop)):
-        assert norm <= 1.002 * found.gamma
-        assert norm == pytest.approx(found.achieved, rel=1e-4)
+        assert norm <= 1.002 * solution.gamma
+        assert norm == pytest.approx(solution.achieved, rel=1e-4)
 
 
 def scalar_plant(a: float) -> GeneralisedPlant:
     """x' = a x + w1 + u, z = (x, u), y = x + w2 (Doyle, Glover, Khargonekar & Francis 1989, one state)."""
-    one = np.ones((1, 1))
+    unit = np.ones((1, 1))
     return GeneralisedPlant(
-        a * one, np.array([[1.0, 0.0]]), one, np.array([[1.0], [0.0]]), one,
-        np.zeros((2, 2)), np.array([[0.0], [1.0]]), np.array([[0.0, 1.0]]), 0 * one,
+        a * unit, np.array([[1.0, 0.0]]), unit, np.array([[1.0], [0.0]]), unit,
+        np.zeros((2, 2)), np.array([[0.0], [1.0]]), np.array([[0.0, 1.0]]), 0 * unit,
     )  # fmt: skip
 
 
@@ -54,14 +54,14 @@ def test_a_scalar_plant_in_closed_form(a) -> None:
         return (a + math.sqrt(a * a + slope)) / slope / gamma - 1
 
     expected = math.sqrt(2) if a == 0 else brentq(gap, 1 + 1e-9, 100, xtol=1e-12) if gap(1 + 1e-9) > 0 else None
-    found = synthesise_hinf(scalar_plant(a))
+    solution = synthesise_hinf(scalar_plant(a))
     if expected is not None:
-        assert found.gamma_opt == pytest.approx(expected, rel=1e-6)
-    assert dense_norm(*scalar_plant(a).close_loop(found.controller)) <= 1.002 * found.gamma
+        assert solution.gamma_opt == pytest.approx(expected, rel=1e-6)
+    assert dense_norm(*scalar_plant(a).close_loop(solution.controller)) <= 1.002 * solution.gamma
 
 
 def test_the_zero_on_the_right_bounds_the_sensitivity() -> None:
-    """With free commands, min ‖W1 S‖∞ = |W1(z)| for a zero z on the right (Zames & Francis 1983)."""
+    """Where commands cost nothing, min ‖W1 S‖∞ = |W1(z)| for a zero z on the right (Zames & Francis 1983)."""
     plant = Transfer.from_zpk([20.0], [-5.0, -40.0], -1.0)
     w1 = Transfer.from_zpk([-9.0], [-0.01], 0.5)
     free = augment(plant, PAPER_WEIGHTS._replace(
@@ -74,13 +74,14 @@ def test_the_zero_on_the_right_bounds_the_sensitivity() -> None:
 def test_random_plants_keep_their_promise(seed) -> None:
     """Two independent norms of the loop stay below γ, with D11 and D22 not zero and unstable modes."""
     plant = random_plant(seed)
-    found = synthesise_hinf(plant)
-    loop = plant.close_loop(found.controller)
-    assert dense_norm(*loop) <= 1.002 * found.gamma
-    assert hamiltonian_norm(*loop) <= 1.002 * found.gamma
+    solution = synthesise_hinf(plant)
+    loop = plant.close_loop(solution.controller)
+    assert dense_norm(*loop) <= 1.002 * solution.gamma
+    assert hamiltonian_norm(*loop) <= 1.002 * solution.gamma
 
 
-def slicot(plant: GeneralisedPlant, start: float) -> tuple[float, Matrices]:
+def run_slicot(plant: GeneralisedPlant, start: float) -> tuple[float, Matrices]:
+    """Return γ and the controller by SLICOT's SB10AD; skip the test where slycot is not installed."""
     slycot = pytest.importorskip("slycot")
     m2, p2 = plant.b2.shape[1], plant.c2.shape[0]
     b, c = np.hstack([plant.b1, plant.b2]), np.vstack([plant.c1, plant.c2])
@@ -97,32 +98,33 @@ def slicot(plant: GeneralisedPlant, start: float) -> tuple[float, Matrices]:
 def test_random_plants_as_slicot(seed) -> None:
     """γ_opt of SLICOT's SB10AD, for orders 2 to 20."""
     plant = random_plant(seed)
-    found = synthesise_hinf(plant)
-    gamma, controller = slicot(plant, 2 * found.gamma_opt)
+    solution = synthesise_hinf(plant)
+    gamma, controller = run_slicot(plant, 2 * solution.gamma_opt)
     bare = plant._replace(d22=0 * plant.d22)
-    assert dense_norm(*bare.close_loop(controller)) <= 1.001 * gamma  # SLICOT's own promise, kept here
-    assert found.gamma_opt == pytest.approx(gamma, rel=1e-4)
+    assert dense_norm(*bare.close_loop(controller)) <= 1.001 * gamma  # SLICOT keeps its own γ for these plants
+    assert solution.gamma_opt == pytest.approx(gamma, rel=1e-4)
 
 
 @pytest.mark.parametrize("seed", [5, 8, 13, 28])
 def test_where_slicot_promises_too_much(seed) -> None:
-    """Where bisection steps over a limit that a Riccati equation sets, SB10AD's controller misses SB10AD's γ."""
+    """SB10AD's controller misses SB10AD's γ, because its bisection steps over a limit set by a Riccati equation."""
     plant = random_plant(seed)
-    found = synthesise_hinf(plant)
-    gamma, controller = slicot(plant, 2 * found.gamma_opt)
-    reached = dense_norm(*plant._replace(d22=0 * plant.d22).close_loop(controller))
-    assert reached > 1.1 * gamma
-    assert gamma < found.gamma_opt <= reached * (1 + 1e-4)
+    solution = synthesise_hinf(plant)
+    gamma, controller = run_slicot(plant, 2 * solution.gamma_opt)
+    slicot_norm = dense_norm(*plant._replace(d22=0 * plant.d22).close_loop(controller))
+    assert slicot_norm > 1.1 * gamma
+    assert gamma < solution.gamma_opt <= slicot_norm * (1 + 1e-4)
 
 
 @pytest.mark.parametrize("plant", [PAPER_D, NORMALISED_D])
 def test_the_papers_problem_as_slicot(plant) -> None:
     standard = augment(plant, PAPER_WEIGHTS)
-    found = synthesise_hinf(standard)
-    assert found.gamma_opt == pytest.approx(slicot(standard, 2 * found.gamma_opt)[0], rel=1e-4)
+    solution = synthesise_hinf(standard)
+    assert solution.gamma_opt == pytest.approx(run_slicot(standard, 2 * solution.gamma_opt)[0], rel=1e-4)
 
 
-def changed(**parts) -> GeneralisedPlant:
+def altered(**parts) -> GeneralisedPlant:
+    """Return the scalar plant with a = 1 and the given matrices replaced."""
     return scalar_plant(1.0)._replace(**{name: np.array(value, dtype=float) for name, value in parts.items()})
 
 
@@ -130,17 +132,17 @@ INTEGRATING = PAPER_WEIGHTS._replace(tracking=Transfer.from_zpk([-1000.0], [0.0]
 
 
 @pytest.mark.parametrize(
-    ("plant", "gamma", "says"),
+    ("plant", "gamma", "message"),
     [
-        (changed(b2=[[0]]), None, r"stabilisability: the command u does not move the mode at s = 1 rad/s"),
-        (changed(c2=[[0]]), None, r"detectability: the measurement y does not show the mode at s = 1 rad/s"),
-        (changed(d12=[[0], [0]]), None, r"rank: D12 has rank 0 of 1.*full column rank. Give every command u a weight"),
+        (altered(b2=[[0]]), None, r"stabilisability: the command u does not move the mode at s = 1 rad/s"),
+        (altered(c2=[[0]]), None, r"detectability: the measurement y does not show the mode at s = 1 rad/s"),
+        (altered(d12=[[0], [0]]), None, r"rank: D12 has rank 0 of 1.*full column rank. Give every command u a weight"),
         (
-            changed(d21=[[0, 0]]),
+            altered(d21=[[0, 0]]),
             None,
             r"rank: D21 has rank 0 of 1.*full row rank. Give every measurement y a disturbance",
         ),
-        (changed(b2=[[0]], c2=[[0]]), None, r"stabilisability.*; detectability"),
+        (altered(b2=[[0]], c2=[[0]]), None, r"stabilisability.*; detectability"),
         (scalar_plant(0.0)._replace(c1=np.zeros((2, 1))), None, r"zero: the path from u to z .* ω = 0 rad/s"),
         (scalar_plant(0.0)._replace(b1=np.zeros((1, 2))), None, r"zero: the path from w to y .* ω = 0 rad/s"),
         (scalar_plant(0.0), 1.2, "coupling"),
@@ -158,14 +160,14 @@ INTEGRATING = PAPER_WEIGHTS._replace(tracking=Transfer.from_zpk([-1000.0], [0.0]
         (augment(PAPER_D, INTEGRATING), None, "detectability: the measurement y does not show the mode at s = 0 rad/s"),
     ],
 )
-def test_the_condition_that_fails_is_named(plant, gamma, says) -> None:
-    """At the least γ without one; the last weight integrates the error, a mode that y does not show."""
-    with pytest.raises(NoController, match=says):
+def test_the_condition_that_fails_is_named(plant, gamma, message) -> None:
+    """γ None searches for the least γ. In the last case a weight integrates the error, a mode that y does not show."""
+    with pytest.raises(NoController, match=message):
         synthesise_hinf(plant, gamma=gamma)
 
 
 def test_an_error_that_the_command_can_cancel_directly_has_a_controller() -> None:
-    plant = changed(c1=[[1], [1]], d12=[[1], [1]], d11=[[0, 0], [0, 0]])
+    plant = altered(c1=[[1], [1]], d12=[[1], [1]], d11=[[0, 0], [0, 0]])
     assert synthesise_hinf(plant).achieved < math.inf
 
 

@@ -1,4 +1,7 @@
-"""From another program's rows to a controller's file: gain of the drive, convention of the delay, verdict."""
+"""Imported data of another program, up to the controller's file: drive gain, delay convention, verdict of the design.
+
+The rows come from scipy's discretised plant, whose gain, delay, resonance and damping are known.
+"""
 
 from __future__ import annotations
 
@@ -29,8 +32,8 @@ disturbance_rule = "none"
 """
 
 
-def rows(count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Drive in V and position in µm, (count,) each: by scipy, the position of a row was sampled before its drive."""
+def simulate_rows(count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return drive (V) and position (µm), (count,) each, by scipy; each position is sampled before its row's drive."""
     random = np.random.default_rng(3)
     omega = 2 * np.pi * RESONANCE_HZ
     plant = signal.cont2discrete(([omega**2], [1.0, 2 * DAMPING * omega, omega**2]), 1 / RATE_HZ, "zoh")
@@ -41,26 +44,27 @@ def rows(count: int) -> tuple[np.ndarray, np.ndarray]:
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with the rows as text, imported with either convention, and their models."""
+    """Folder with the rows (npz), a specification, and per delay convention a recording, a model and printed text."""
     folder = tmp_path_factory.mktemp("rows")
-    drive_v, position_um = rows(6000)
+    drive_v, position_um = simulate_rows(6000)
     time_s = np.arange(drive_v.size) / RATE_HZ
     np.savez(folder / "rows.npz", t=time_s, drive_v=drive_v, position_um=position_um)
     maps = ["--map", "x_drive_v=drive_v [V]", "--map", "x_position_um=position_um [µm]"]
     for name, options in (("together", []), ("first", ["--position-first"])):
-        made = run("import", folder / "rows.npz", *maps, *options, "--out", folder / f"{name}.mcap")
-        assert made.exit_code == 0, made.output
-        made = run(
+        result = run("import", folder / "rows.npz", *maps, *options, "--out", folder / f"{name}.mcap")
+        assert result.exit_code == 0, result.output
+        result = run(
             "identify", "dynamics", folder / f"{name}.mcap", "--input", "drive", "--order", "2", "--out",
             folder / f"{name}.toml",
         )  # fmt: skip
-        assert made.exit_code == 0, made.output
-        (folder / f"{name}.txt").write_text(" ".join(made.stdout.split()), encoding="utf-8")
+        assert result.exit_code == 0, result.output
+        (folder / f"{name}.txt").write_text(" ".join(result.stdout.split()), encoding="utf-8")
     (folder / "spec.toml").write_text(SPEC, encoding="utf-8")
     return folder
 
 
 def sections(path: Path) -> dict:
+    """Return the [axis] table of a TOML file."""
     return tomllib.loads(path.read_text(encoding="utf-8"))["axis"]
 
 
@@ -68,13 +72,13 @@ def test_the_gain_of_a_drive_without_hysteresis_is_written_as_the_feedforward(fo
     feedforward = sections(folder / "first.toml")["feedforward"]
     assert feedforward["thresholds_v"] == [0.0]
     assert feedforward["weights_um_per_v"] == pytest.approx([GAIN_UM_PER_V], rel=1e-3)
-    said = (folder / "first.txt").read_text(encoding="utf-8")
-    assert "µm/V is the only weight of [axis.feedforward], which then has no hysteresis" in said
-    assert "hysteresis model" not in said
+    output = (folder / "first.txt").read_text(encoding="utf-8")
+    assert "µm/V is the only weight of [axis.feedforward], which then has no hysteresis" in output
+    assert "hysteresis model" not in output
 
 
 def test_the_delay_of_an_import_follows_the_stated_order_of_position_and_drive(folder: Path) -> None:
-    """The rows were made without any delay; sampled together they would have had one sample."""
+    """The rows have no delay. If position and drive counted as sampled together, the delay would be one sample."""
     together, first = (sections(folder / f"{name}.toml")["model"]["delay_ticks"] for name in ("together", "first"))
     assert (together, first) == (1, 0)
     for ending, verb in (("toml", "count as"), ("txt", "were")):
@@ -89,44 +93,44 @@ def test_a_mapping_file_states_the_order_too(folder: Path) -> None:
         'position_first = true\n[signals]\nx_drive_v = "drive_v [V]"\nx_position_um = "position_um [µm]"\n',
         encoding="utf-8",
     )
-    made = run("import", folder / "rows.npz", "--mapping", folder / "order.map.toml", "--out", folder / "order.mcap")
-    assert made.exit_code == 0, made.output
+    result = run("import", folder / "rows.npz", "--mapping", folder / "order.map.toml", "--out", folder / "order.mcap")
+    assert result.exit_code == 0, result.output
     assert rtloop.load(folder / "order.mcap").header["imported"]["position_first"] is True
 
 
 def test_the_identified_gain_reaches_the_controllers_file_by_itself(folder: Path) -> None:
-    made = run(
+    result = run(
         "design", "synthesise", folder / "spec.toml", "--model", folder / "first.toml", "--out", folder / "made.toml"
     )
-    assert made.exit_code == 0, made.output
+    assert result.exit_code == 0, result.output
     table = tomllib.loads((folder / "made.toml").read_text(encoding="utf-8"))
     (axis,) = table["axis"]
     for plays in (axis["feedforward"], table["driver"]["plant"]["hysteresis"]):
         assert plays["thresholds_v"] == [0.0]
         assert plays["weights_um_per_v"] == pytest.approx([GAIN_UM_PER_V], rel=1e-3)
     assert axis["model"] == sections(folder / "first.toml")["model"]
-    assert "placeholder" not in made.stderr
-    again = run(
+    assert "placeholder" not in result.stderr
+    repeated = run(
         "design", "synthesise", folder / "spec.toml", "--model", folder / "made.toml", "--out", folder / "again.toml"
     )
-    assert (folder / "again.toml").read_text() == (folder / "made.toml").read_text(), again.output
+    assert (folder / "again.toml").read_text() == (folder / "made.toml").read_text(), repeated.output
 
 
 def test_synthesis_prints_the_verdict_of_check_and_explains_gamma(folder: Path) -> None:
-    """This specification is missed by the factor γ; one that asks for no settling time below it is met."""
+    """The default weight misses this specification by the factor γ; a lenient tracking weight meets it."""
     strict = "the loop misses static error, settling (5 %)"
     lenient = SPEC + '[weights.tracking]\nform = "zpk"\ngain = 0.99\nzeros = [[-600.0, 0.0]]\npoles = [[-0.1, 0.0]]\n'
-    for name, text, says in (("strict", SPEC, strict), ("lenient", lenient, "the loop meets its specification")):
+    for name, text, words in (("strict", SPEC, strict), ("lenient", lenient, "the loop meets its specification")):
         spec, out = folder / f"{name}.toml", folder / f"{name}-made.toml"
         spec.write_text(text, encoding="utf-8")
-        made = run("design", "synthesise", spec, "--model", folder / "first.toml", "--out", out)
-        assert made.exit_code == 0, made.output
-        (verdict,) = [line for line in made.stdout.splitlines() if line.startswith(f"{spec}: ")]
-        assert says in verdict
+        result = run("design", "synthesise", spec, "--model", folder / "first.toml", "--out", out)
+        assert result.exit_code == 0, result.output
+        (verdict,) = [line for line in result.stdout.splitlines() if line.startswith(f"{spec}: ")]
+        assert words in verdict
         assert verdict.removeprefix(f"{spec}: ") in " ".join(run("check", out).stdout.split())
-        assert "fails" not in made.stderr
-        assert "is the smallest γ that a controller reaches" in made.stderr
-        assert says in answer("design", "synthesise", spec, "--model", folder / "first.toml")["verdict"]
+        assert "fails" not in result.stderr
+        assert "is the smallest γ that a controller reaches" in result.stderr
+        assert words in answer("design", "synthesise", spec, "--model", folder / "first.toml")["verdict"]
 
 
 def test_a_file_without_a_model_is_refused(folder: Path) -> None:
@@ -138,16 +142,16 @@ def test_a_file_without_a_model_is_refused(folder: Path) -> None:
 
 
 def test_a_short_recording_gives_a_response_of_lower_resolution() -> None:
-    """1 s: half of it a segment, 2 Hz; beside the response by scipy. 399 samples are too few."""
-    drive_v, position_um = rows(RATE_HZ)
-    found = recording_response(Excitation("short", drive_v, position_um, 1 / RATE_HZ))
-    assert found.resolution_hz == pytest.approx(2.0)
-    assert np.diff(found.hz) == pytest.approx(2.0)
+    """1 s gives segments of 0.5 s, a resolution of 2 Hz; the oracle is scipy's response. 399 samples are too few."""
+    drive_v, position_um = simulate_rows(RATE_HZ)
+    estimate = recording_response(Excitation("short", drive_v, position_um, 1 / RATE_HZ))
+    assert estimate.resolution_hz == pytest.approx(2.0)
+    assert np.diff(estimate.hz) == pytest.approx(2.0)
     omega = 2 * np.pi * RESONANCE_HZ
     plant = signal.cont2discrete(([omega**2], [1.0, 2 * DAMPING * omega, omega**2]), 1 / RATE_HZ, "zoh")
-    part = found.is_trusted & (found.hz > 20.0) & (found.hz < 500.0)
-    _, expected = signal.freqz(plant[0].ravel(), plant[1], found.hz[part], fs=RATE_HZ)
-    assert np.median(np.abs(found.response[part] / expected / GAIN_UM_PER_V - 1)) < 0.02
+    compared = estimate.is_trusted & (estimate.hz > 20.0) & (estimate.hz < 500.0)
+    _, expected = signal.freqz(plant[0].ravel(), plant[1], estimate.hz[compared], fs=RATE_HZ)
+    assert np.median(np.abs(estimate.response[compared] / expected / GAIN_UM_PER_V - 1)) < 0.02
     with pytest.raises(RtloopError, match=r"needs at least 0\.02 s"):
         recording_response(Excitation("too short", drive_v[:399], position_um[:399], 1 / RATE_HZ))
 
@@ -162,7 +166,7 @@ def test_a_comparison_with_a_short_recording_states_its_resolution(folder: Path)
 
 
 def test_the_advice_after_a_trip_fits_its_cause() -> None:
-    """A sensor at its end is not helped by wider interlocks, and a late tick not by a smaller drive."""
+    """Wider interlocks do not help a saturated sensor, and a smaller drive does not prevent a late tick."""
     assert "help only inside the converter's range" in trip_remedy(["sensor_range"])
     assert "interlocks.position_um" in trip_remedy(["position"])
     assert "A smaller drive does not prevent this trip" in trip_remedy(["late"])

@@ -1,4 +1,4 @@
-"""Whole samples of delay, told from recordings: a mode and nothing else, seen late."""
+"""Delay in whole samples, identified from recordings of simulated rigs of one mode with a known delay."""
 
 from dataclasses import replace
 
@@ -14,7 +14,7 @@ from rtloop.design.identification.dynamics.innovations import Innovations
 from rtloop.design.identification.dynamics.prediction_error import Excitation
 from rtloop.hil.options import DynamicsOptions, HysteresisOptions, PlantOptions, RigOptions, SensorOptions
 from rtloop.hil.rig import build_rig
-from tests.design.rigs import _record
+from tests.design.rigs import record_readings
 
 PERIOD_S, GAIN_UM_PER_V = 1e-4, 2.0
 
@@ -22,7 +22,7 @@ PERIOD_S, GAIN_UM_PER_V = 1e-4, 2.0
 def excitation(
     hz: float, damping: float, delay_ticks: int, drive_v: np.ndarray, lag_hz: float | None = None
 ) -> Excitation:
-    """A linear rig of one mode and perhaps a lag, 10 nm of noise and resolution, behind its converters."""
+    """Return the input (µm) and position of a linear rig: one mode, a lag if `lag_hz`, 10 nm of noise, converters."""
     omega = 2 * np.pi * hz
     lag_rad_s = () if lag_hz is None else (2 * np.pi * lag_hz,)
     rig = RigOptions(
@@ -40,11 +40,12 @@ def excitation(
     )
     coefficients, state = build_rig(rig, ["x"], PERIOD_S)
     adc_v = np.empty(drive_v.size)
-    _record(coefficients, state, drive_v, adc_v)
+    record_readings(coefficients, state, drive_v, adc_v)
     return Excitation("rig", GAIN_UM_PER_V * drive_v, 10.0 * adc_v, PERIOD_S)
 
 
 def up_and_down(duration_s: float = 0.6) -> np.ndarray:
+    """Return a drive (V): 0, then 10 from 0.05 s to 55 % of the duration, then 0."""
     time_s = PERIOD_S * np.arange(round(duration_s / PERIOD_S))
     return np.where((time_s >= 0.05) & (time_s < 0.55 * duration_s), 10.0, 0.0)
 
@@ -54,7 +55,7 @@ def up_and_down(duration_s: float = 0.6) -> np.ndarray:
     [("up and down", 0), ("up and down", 5), ("one step", 1), ("one step", 4)],
 )
 def test_the_delay_is_found_and_no_pole_stands_in_for_it(drive, delay_ticks) -> None:
-    """Up and down leaves the second half to judge by; one step leaves only the fit itself."""
+    """Up and down leaves the second half for a test of the fit; one step leaves only the fit itself."""
     drive_v = up_and_down() if drive == "up and down" else np.where(np.arange(3000) < 500, 0.0, 10.0)
     fit = identify_dynamics(excitation(800.0, 0.02, delay_ticks, drive_v))
     assert fit.delay_ticks == delay_ticks
@@ -78,7 +79,7 @@ def test_a_fast_lag_does_not_stand_in_for_a_sample_of_delay() -> None:
 
 
 def candidate(ticks: int, poles: int, rms_um: float, independent: bool = True) -> Candidate:
-    """A model of real poles behind `ticks` samples of delay."""
+    """Return a candidate of `poles` real poles behind `ticks` samples of delay."""
     numbers = np.zeros(poles, dtype=complex)
     return Candidate(ticks, Innovations(PERIOD_S, numbers - 1.0, numbers, numbers), rms_um, independent)
 
@@ -94,12 +95,12 @@ def candidate(ticks: int, poles: int, rms_um: float, independent: bool = True) -
 )
 def test_fewest_poles_win_among_equally_good_predictions(candidates: list[Candidate], delays: list[int]) -> None:
     """A candidate whose errors follow from the input counts only where there is no other."""
-    assert [one.ticks for one in simplest_candidates(candidates)] == delays
+    assert [simplest.ticks for simplest in simplest_candidates(candidates)] == delays
 
 
 @pytest.mark.parametrize("criterion", ["aic", "held-out"])
 def test_creep_is_not_taken_for_a_mode(criterion) -> None:
-    """Creep of 0.08 µm per factor e of time, which a mode slower than the run would follow, and take D(0) with it."""
+    """Creep is 0.08 µm per factor e of time; a mode slower than the recording would fit it and falsify D(0)."""
     drive_v = up_and_down()
     run = excitation(800.0, 0.02, 1, drive_v)
     creep_um = 0.08 * np.log1p(np.maximum(PERIOD_S * np.arange(drive_v.size) - 0.05, 0.0) / 0.01)
@@ -111,7 +112,7 @@ def test_creep_is_not_taken_for_a_mode(criterion) -> None:
 
 
 def test_a_stage_that_has_not_settled_by_the_end_is_refused() -> None:
-    """A lag of 2 s in a recording of 0.6 s: where it would come to rest cannot be told."""
+    """With a lag of 2 s, a recording of 0.6 s does not determine the final position."""
     run = Excitation("rig", up_and_down(), np.zeros(6000), PERIOD_S)
     lag = 1 - np.exp(-PERIOD_S / 2.0)
     position_um = lfilter([0.0, lag], [1.0, lag - 1.0], run.input) + np.random.default_rng(1).normal(
@@ -125,7 +126,7 @@ def test_a_stage_that_has_not_settled_by_the_end_is_refused() -> None:
 
 
 def test_a_mode_that_is_over_within_a_sample_has_no_spread() -> None:
-    """Poles at z = 1e-9, and at 0.01, of a model that was written down."""
+    """The model has poles at z = 1e-9 and 0.01; the first decays within a sample, so its deviations are infinite."""
     rates = np.log([1e-9, 0.01]) / PERIOD_S
     model = Innovations(PERIOD_S, rates + 0j, np.array([0.5, 0.5]) + 0j, np.zeros(2, complex), 1.0)
     slow, fast = estimate_modes(model, np.eye(4), noise=False)

@@ -1,4 +1,4 @@
-"""Dynamics from steps and chirps: against the rig's poles, against mpmath, and what is refused."""
+"""Dynamics identified from steps and chirps, against the rig's poles and mpmath; unsuitable recordings are refused."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from rtloop.design.identification.dynamics.residuals import residual_tests
 from rtloop.design.identification.frequency_response import compare_responses, estimate_response
 from rtloop.design.paper import PAPER_D
 from rtloop.foundation.modal import ModalSystem, modal_sum
-from tests.design.rigs import EQ_4, FAST_S, chirp_drive, closeness, drawn, excited, identified, step_drive
+from tests.design.rigs import EQ_4, FAST_S, chirp_drive, drawn, identify_rig, model_errors, model_excitation, step_drive
 
 PAIR_AND_REAL = Innovations(
     FAST_S,
@@ -33,18 +33,18 @@ PAIR_AND_REAL = Innovations(
 @pytest.mark.parametrize("seed", [201, 202])
 def test_a_drawn_rig_comes_out_of_a_slow_sine_and_a_step(seed: int) -> None:
     rig = drawn(seed)
-    found = closeness(rig, *identified(rig))
-    print(f"seed {seed}: {found}")
-    assert found.loop_percent <= 1.0
-    assert abs(found.resonance_percent) <= 0.5
-    assert abs(found.damping_percent) <= 20.0
-    assert abs(found.gain_percent) <= 1.0
+    errors = model_errors(rig, *identify_rig(rig))
+    print(f"seed {seed}: {errors}")
+    assert errors.loop_percent <= 1.0
+    assert abs(errors.resonance_percent) <= 0.5
+    assert abs(errors.damping_percent) <= 20.0
+    assert abs(errors.gain_percent) <= 1.0
 
 
 def test_a_chirp_serves_as_well_and_so_does_validation_on_a_step() -> None:
     rig = drawn(204)
     model = type(EQ_4)(rig.thresholds, rig.weights)
-    chirp, step = (excited(model, rig.measure(drive, FAST_S)) for drive in (chirp_drive(), step_drive()))
+    chirp, step = (model_excitation(model, rig.measure(drive, FAST_S)) for drive in (chirp_drive(), step_drive()))
     fit = identify_dynamics(chirp, largest_order=4, criterion="validation", validation=[step])
     light = min(fit.modes, key=lambda mode: mode.damping)
     assert light.frequency_hz == pytest.approx(rig.resonance_hz, rel=0.005)
@@ -57,29 +57,29 @@ def test_a_chirp_serves_as_well_and_so_does_validation_on_a_step() -> None:
 
 @pytest.mark.parametrize("signs", [(-1.0, 1.0), (1.0, -1.0)])
 def test_a_stage_that_moves_against_its_drive_is_named(signs: tuple[float, float]) -> None:
-    """The sensor, or the drive, is wired the wrong way round."""
+    """The sensor or the drive has the wrong sign."""
     rig = drawn(204)
-    run = excited(type(EQ_4)(rig.thresholds, rig.weights), rig.measure(step_drive(), FAST_S))
-    wrong = Excitation(run.name, signs[0] * run.input, signs[1] * run.position_um, run.period_s)
+    run = model_excitation(type(EQ_4)(rig.thresholds, rig.weights), rig.measure(step_drive(), FAST_S))
+    inverted = Excitation(run.name, signs[0] * run.input, signs[1] * run.position_um, run.period_s)
     with pytest.raises(
         UnsuitableData, match=r"the sign of drive or position is wrong: .* falls where the drive rises\. .* um_per_v"
     ):
-        identify_dynamics(wrong, largest_order=4)
+        identify_dynamics(inverted, largest_order=4)
 
 
 def test_the_measured_frequency_response_agrees_where_it_is_coherent() -> None:
     rig = drawn(205)
     model = type(EQ_4)(rig.thresholds, rig.weights)
-    fit = identify_dynamics(excited(model, rig.measure(step_drive(), FAST_S)), order=4)
-    chirp = excited(model, rig.measure(chirp_drive(duration_s=4.0), FAST_S))
-    found = compare_responses(fit.model, estimate_response(chirp.input, chirp.position_um, FAST_S))
-    assert found.median_deviation < 0.02
-    assert found.from_hz < 20
-    assert found.to_hz > 900
+    fit = identify_dynamics(model_excitation(model, rig.measure(step_drive(), FAST_S)), order=4)
+    chirp = model_excitation(model, rig.measure(chirp_drive(duration_s=4.0), FAST_S))
+    comparison = compare_responses(fit.model, estimate_response(chirp.input, chirp.position_um, FAST_S))
+    assert comparison.median_deviation < 0.02
+    assert comparison.from_hz < 20
+    assert comparison.to_hz > 900
 
 
 def test_standard_deviations_are_those_of_repeated_experiments() -> None:
-    """12 recordings with other noise: the spread of the estimates is the deviation that each of them reports."""
+    """Over 12 recordings with independent noise, the estimates spread as their reported deviations state."""
     drive, random = step_drive(duration_s=0.4), np.random.default_rng(3)
     clean = Innovations(FAST_S, PAIR_AND_REAL.rates, PAIR_AND_REAL.residues, np.zeros(2, complex)).simulate_output(
         drive
@@ -87,10 +87,10 @@ def test_standard_deviations_are_those_of_repeated_experiments() -> None:
     runs = [Excitation("made", drive, clean + random.normal(0, 0.02, drive.size), FAST_S) for _ in range(12)]
     fits = [identify_dynamics(run, order=3) for run in runs]
     pairs = [min(fit.modes, key=lambda mode: mode.damping) for fit in fits]
-    size, damping = abs(PAIR_AND_REAL.rates[0]) / (2 * np.pi), 200 / abs(PAIR_AND_REAL.rates[0])
+    size_hz, damping = abs(PAIR_AND_REAL.rates[0]) / (2 * np.pi), 200 / abs(PAIR_AND_REAL.rates[0])
     for values, deviations, true in (
-        ([one.frequency_hz for one in pairs], [one.frequency_std_hz for one in pairs], size),
-        ([one.damping for one in pairs], [one.damping_std for one in pairs], damping),
+        ([mode.frequency_hz for mode in pairs], [mode.frequency_std_hz for mode in pairs], size_hz),
+        ([mode.damping for mode in pairs], [mode.damping_std for mode in pairs], damping),
     ):
         assert np.std(values) == pytest.approx(np.mean(deviations), rel=0.6)
         assert abs(np.mean(values) - true) < 4 * np.mean(deviations) / np.sqrt(12)
@@ -112,7 +112,7 @@ def test_sensitivities_are_the_derivatives_of_the_errors() -> None:
 
 
 def test_residues_are_fitted_under_the_noise_model() -> None:
-    """A start of other residues; against scipy's search for the least squared errors, which differentiates these."""
+    """From zero residues the fit reaches the least squares found by scipy with numerical derivatives of the errors."""
     random = np.random.default_rng(3)
     u, noise = random.normal(size=400), 0.01 * random.normal(size=400)
     y = PAIR_AND_REAL.simulate_output(u) + noise
@@ -121,22 +121,22 @@ def test_residues_are_fitted_under_the_noise_model() -> None:
         residues = np.array([values[0] + 1j * values[1], values[2]])
         return dataclasses.replace(PAIR_AND_REAL, residues=residues, offset=float(values[3]))
 
-    best = least_squares(lambda values: model(values).errors(u, y), np.zeros(4), jac="3-point", xtol=1e-14)
+    optimum = least_squares(lambda values: model(values).errors(u, y), np.zeros(4), jac="3-point", xtol=1e-14)
     fitted = fit_residues(model(np.zeros(4)), u, y)
-    assert np.allclose(fitted.residues, model(best.x).residues, atol=1e-8)
-    assert fitted.offset == pytest.approx(best.x[3], abs=1e-8)
+    assert np.allclose(fitted.residues, model(optimum.x).residues, atol=1e-8)
+    assert fitted.offset == pytest.approx(optimum.x[3], abs=1e-8)
 
 
 def test_errors_are_those_of_the_armax_polynomials() -> None:
-    """ε from A y − B u = C ε with the polynomials multiplied out, which is fine for three poles."""
+    """The oracle is ε from A y − B u = C ε with multiplied-out polynomials, which is accurate for three poles."""
     random = np.random.default_rng(2)
     u, y = random.normal(size=50), random.normal(size=50)
     images, pair = PAIR_AND_REAL.z_poles, PAIR_AND_REAL.discrete()
     a = np.poly([images[0], images[0].conj(), images[1]]).real
 
     def numerator(residues: np.ndarray) -> np.ndarray:
-        rest = [np.poly(np.delete(pair.poles, i)) * r for i, r in enumerate(residues)]
-        return np.sum(rest, axis=0).real
+        terms = [np.poly(np.delete(pair.poles, i)) * r for i, r in enumerate(residues)]
+        return np.sum(terms, axis=0).real
 
     gains = PAIR_AND_REAL.noise_gains
     b = numerator(pair.residues[0])
@@ -150,44 +150,44 @@ def test_errors_are_those_of_the_armax_polynomials() -> None:
     assert np.allclose(PAIR_AND_REAL.errors(u, y), expected, atol=1e-10)
 
 
-def exactly_held(modal: ModalSystem, period_s: float) -> list[tuple[mpmath.mpc, mpmath.mpc]]:
-    """Poles and residues of the zero-order hold at 50 digits."""
-    found = []
+def hold_exactly(modal: ModalSystem, period_s: float) -> list[tuple[mpmath.mpc, mpmath.mpc]]:
+    """Return (pole, residue) in z of each mode behind a zero-order hold, at mpmath's working precision."""
+    modes = []
     for pole, residue in zip(modal.poles, modal.residues[0], strict=True):
         p, r = mpmath.mpc(pole), mpmath.mpc(residue)
         image = mpmath.exp(p * mpmath.mpf(period_s))
-        found.append((image, r * (image - 1) / p))
-    return found
+        modes.append((image, r * (image - 1) / p))
+    return modes
 
 
 @pytest.mark.parametrize("case", ["eq 5 below 5 kHz", "order 20", "-1 beside -1e5 rad/s"])
 def test_the_inverse_hold_keeps_its_digits(case: str) -> None:
-    """Discrete modes computed by mpmath at 50 digits, rounded to double, come back to the continuous ones."""
+    """Discrete modes computed by mpmath at 50 digits, rounded to double, are converted back to the continuous ones."""
     random = np.random.default_rng(5)
     if case == "order 20":
         upper = -random.uniform(1, 500, 10) + 1j * np.geomspace(10, 2e4, 10)
         modal = ModalSystem(np.concatenate([upper, upper.conj()]), np.ones((1, 20), complex), np.zeros(1))
     elif case == "eq 5 below 5 kHz":
         full = modal_sum(PAPER_D.zeros, PAPER_D.poles, PAPER_D.gain)
-        kept = np.abs(full.poles.imag) < np.pi / FAST_S
-        modal = ModalSystem(full.poles[kept], full.residues[:, kept], np.zeros(1))
+        below_nyquist = np.abs(full.poles.imag) < np.pi / FAST_S
+        modal = ModalSystem(full.poles[below_nyquist], full.residues[:, below_nyquist], np.zeros(1))
     else:
         modal = ModalSystem(np.array([-1.0 + 0j, -1e5 + 0j]), np.array([[2.0 + 0j, -3e4 + 0j]]), np.zeros(1))
     with mpmath.workdps(50):
-        held = exactly_held(modal, FAST_S)
+        held = hold_exactly(modal, FAST_S)
     discrete = ModalSystem(
         np.array([complex(image) for image, _ in held]), np.array([[complex(r) for _, r in held]]), np.zeros(1)
     )
     rates = np.log(discrete.poles) / FAST_S
-    back = continuous_modal(rates, discrete.residues, discrete.direct, FAST_S)
-    # a pole in z near 1 holds −1 rad/s at 1e-4 s to 1e-16/1e-4 only: that is the recording's own limit
-    lost = 1e-15 / np.abs(modal.poles * FAST_S) + 1e-14
-    assert np.all(np.abs(back.poles / modal.poles - 1) < lost)
-    assert np.all(np.abs(back.residues[0] / modal.residues[0] - 1) < 4 * lost)
+    recovered = continuous_modal(rates, discrete.residues, discrete.direct, FAST_S)
+    # In double precision, a pole in z near 1 determines −1 rad/s at 1e-4 s only to 1e-16/1e-4.
+    tolerance = 1e-15 / np.abs(modal.poles * FAST_S) + 1e-14
+    assert np.all(np.abs(recovered.poles / modal.poles - 1) < tolerance)
+    assert np.all(np.abs(recovered.residues[0] / modal.residues[0] - 1) < 4 * tolerance)
 
 
 def test_twenty_modes_and_slow_beside_fast_are_predicted_exactly() -> None:
-    """The output of a sum of 20 modes, slowest −1 and fastest −1e5 rad/s, against mpmath's own recursion."""
+    """The output of order 20, with real poles at −1 and −1e5 rad/s, agrees with a recursion by mpmath at 50 digits."""
     rates = np.concatenate([[-1.0 + 0j, -1e5 + 0j], -np.geomspace(5, 900, 9) + 1j * np.geomspace(20, 25e3, 9)])
     residues = np.concatenate([[1e-4 + 0j, 0.5 + 0j], (0.01 + 0.02j) * np.ones(9)])
     model = Innovations(FAST_S, rates, residues, np.zeros(11, complex))
@@ -233,6 +233,6 @@ def test_validation_without_a_recording_to_validate_on_is_a_contradiction() -> N
 
 
 def test_a_model_of_no_numbers_predicts_nothing() -> None:
-    """A descent may try one; it is told that this leads nowhere."""
+    """The optimiser may try a model with infinite gains; `errors` returns None for it."""
     model = Innovations(1e-4, np.array([-100.0 + 0j]), np.array([1.0 + 0j]), np.array([np.inf + 0j]), 0.0)
     assert model.errors(np.ones(10), np.ones(10)) is None
