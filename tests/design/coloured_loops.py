@@ -73,7 +73,7 @@ def poly_sum(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 def drawn_loop(random: np.random.Generator) -> TrueLoop:
-    """Return a stable loop: two lightly damped modes, 0 to 3 samples of delay, L real and 1 to 4 at the first mode."""
+    """Return a stable loop: two light modes, 0 to 3 samples of delay, damping part of L real, 1 to 4 at the first."""
     while True:
         hz, share = random.uniform(150, 900), random.uniform(0.05, 0.2)
         modes = (

@@ -60,8 +60,8 @@ def step_plays(drive_v: Array, thresholds_v: Array, weights_um_per_v: Array) -> 
 
 
 def random_drive(random: np.random.Generator, samples: int, turns: int = 3) -> tuple[Array, Array]:
-    """Return a past and a drive (V): straight strokes between random turning points. The drive reaches ±9 V, then turns
-    `turns` times."""
+    """Return a past and a drive (V): straight strokes between random turning points. The drive reaches −9 V and 9 V,
+    then `turns` random points."""
     past = _strokes(np.append(0.0, random.uniform(-9, 9, 4)), samples // 2)
     corners = np.concatenate([past[-1:], random.uniform(-9, 9, 1), [-9.0, 9.0], random.uniform(-9, 9, turns)])
     return past, _strokes(corners, samples)

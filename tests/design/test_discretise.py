@@ -66,13 +66,15 @@ def worst_error(transfer: Transfer, method, prewarp_hz, hz=HZ) -> float:
 
 def rounding_error(controller, hz) -> float:
     """Return the relative error of C(z), as in `worst_error`, caused by rounding A: ε κ(zI − A) |c||x| / |C|."""
-    worst = 0.0
+    max_error = 0.0
     for z in np.exp(2j * np.pi * np.asarray(hz) * T):
         terms = np.abs(controller.system.states(z)[0]) @ np.abs(controller.c) + abs(controller.d)
         size = max(abs(controller.system.response(z)[0]), 1e-5 * terms)
         pencil = z * np.eye(controller.b.size) - controller.a
-        worst = max(worst, np.finfo(float).eps * np.linalg.cond(pencil) * terms / size if controller.b.size else 0.0)
-    return worst
+        max_error = max(
+            max_error, np.finfo(float).eps * np.linalg.cond(pencil) * terms / size if controller.b.size else 0.0
+        )
+    return max_error
 
 
 @pytest.mark.parametrize(("method", "prewarp_hz"), METHODS)

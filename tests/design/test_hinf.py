@@ -37,7 +37,7 @@ def test_the_papers_problem(plant, gamma_opt) -> None:
 
 
 def scalar_plant(a: float) -> GeneralisedPlant:
-    """x' = a x + w1 + u, z = (x, u), y = x + w2 (Doyle, Glover, Khargonekar & Francis 1989, one state)."""
+    """Return x' = a x + w1 + u, z = (x, u), y = x + w2 (Doyle, Glover, Khargonekar & Francis 1989, one state)."""
     unit = np.ones((1, 1))
     return GeneralisedPlant(
         a * unit, np.array([[1.0, 0.0]]), unit, np.array([[1.0], [0.0]]), unit,
@@ -61,7 +61,7 @@ def test_a_scalar_plant_in_closed_form(a) -> None:
 
 
 def test_the_zero_on_the_right_bounds_the_sensitivity() -> None:
-    """Where commands cost nothing, min ‖W1 S‖∞ = |W1(z)| for a zero z on the right (Zames & Francis 1983)."""
+    """With commands at no cost, min ‖W1 S‖∞ = |W1(z)| for a zero z on the right (Zames & Francis 1983)."""
     plant = Transfer.from_zpk([20.0], [-5.0, -40.0], -1.0)
     w1 = Transfer.from_zpk([-9.0], [-0.01], 0.5)
     free = augment(plant, PAPER_WEIGHTS._replace(
