@@ -40,7 +40,7 @@ from tests.campaigns.campaign_files import rtloop
 from tests.command_line import run
 from tests.recording import rewriting
 from tests.recording.forging import pack_file, record_bases
-from tests.recording.real_loop import record, scheduled
+from tests.recording.real_loop import eventful_configuration, record
 from tests.recording.tamper import flip_byte
 from tests.recording.test_verdict import drop_chunks, drop_snapshots
 from tests.users import ROOT_ONLY, VICTIM, as_user
@@ -213,7 +213,7 @@ def test_a_changed_recording_is_replayed_again_and_a_torn_line_does_not_count(go
 
 
 def test_the_files_of_a_rotated_run_are_one_recording(tmp_path):
-    record(tmp_path / "run.mcap", scheduled(), 25_000, rotate_s=1.0)
+    record(tmp_path / "run.mcap", eventful_configuration(), 25_000, rotate_s=1.0)
     (complete,) = find_recordings([tmp_path])
     assert [Path(path).name for path in complete.paths] == [f"run-000{number}.mcap" for number in (1, 2, 3)]
     assert replay_verdict(*map(Path, complete.paths)) == {"verdict": "identical", "reason": ""}

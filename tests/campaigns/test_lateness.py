@@ -26,7 +26,7 @@ from rtloop.errors import ConfigError
 from rtloop.recording.errors import RecordingError
 from rtloop.recording.replay.replay import replay
 from tests.campaigns.campaign_files import PAPER, STEPS, write_campaign
-from tests.engine.harness import AXIS, CONTROLLER, IDEAL, plan_of, text
+from tests.engine.harness import AXIS, CONTROLLER, IDEAL, make_plan, text
 from tests.engine.test_late_clock import simulate
 from tests.paper_dynamics import paper_dynamics
 
@@ -40,7 +40,7 @@ def late_run(ticks: int, driver_keys: str = "") -> tuple[dict[str, np.ndarray], 
     """Return the columns of a run with missed periods, and the positions at and between ticks computed from them."""
     configuration = text(IDEAL, driver_keys, AXIS, CONTROLLER, SINE)
     configuration = configuration.replace("[driver]", f"simulated_lateness_us = {[*LATE_US]}\n[driver]", 1)
-    plan = plan_of(configuration)
+    plan = make_plan(configuration)
     driver = cast("SimDriver", plan.driver())
     coefficients, state = driver.rig
     at_rest = coefficients, state.copy()

@@ -72,7 +72,7 @@ def poly_sum(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return np.pad(a, (0, size - a.size)) + np.pad(b, (0, size - b.size))
 
 
-def drawn_loop(random: np.random.Generator) -> TrueLoop:
+def draw_loop(random: np.random.Generator) -> TrueLoop:
     """Return a stable loop: two light modes, 0 to 3 samples of delay, damping part of L real, 1 to 4 at the first."""
     while True:
         hz, share = random.uniform(150, 900), random.uniform(0.05, 0.2)
@@ -112,14 +112,14 @@ def noise_denominators(near_hz: float) -> tuple[np.ndarray, np.ndarray]:
     return np.poly(np.exp(omega * np.roots([1, 0.1, 1]))).real, np.array([1.0, -0.9995])
 
 
-def coloured(random: np.random.Generator, samples: int, near_hz: float, rms_um: float) -> np.ndarray:
+def coloured_noise(random: np.random.Generator, samples: int, near_hz: float, rms_um: float) -> np.ndarray:
     """Return noise (µm): vibration near `near_hz` and drift, scaled by `rms_um`, and the sensor's white noise."""
     vibration, drift = (filtered([1.0], a, random.normal(size=samples)) for a in noise_denominators(near_hz))
     parts = VIBRATION * vibration / vibration.std() + DRIFT * drift / drift.std()
     return rms_um * parts + random.normal(0, SENSOR_UM, samples)
 
 
-def motion(kind: str, random: np.random.Generator, samples: int, amplitude_um: float) -> np.ndarray:
+def reference_motion(kind: str, random: np.random.Generator, samples: int, amplitude_um: float) -> np.ndarray:
     """Return a reference (µm): a multisine of 1 s up to 3 kHz, a logarithmic sweep to 3 kHz, or steps up and down."""
     time_s = PERIOD_S * np.arange(samples)
     if kind == "multisine":

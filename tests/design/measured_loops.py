@@ -41,8 +41,8 @@ class TrueLoop:
         return np.polyval(top[::-1], back) / np.polyval(bottom[::-1], back)
 
     def margins(self, from_hz: float = 1.0, to_hz: float = 0.45 * RATE_HZ) -> dict[str, float]:
-        """Return the margins of L by `margins_of`, on its grid of a million frequencies."""
-        return margins_of(self.open, from_hz, to_hz)
+        """Return the margins of L by `compute_margins`, on its grid of a million frequencies."""
+        return compute_margins(self.open, from_hz, to_hz)
 
     def run(
         self,
@@ -84,7 +84,7 @@ class TrueLoop:
         return {"reference_um": reference, "error_um": e, "command_um": v, "position_um": true + noise, "true_um": true}
 
 
-def margins_of(
+def compute_margins(
     open_loop: Callable[[np.ndarray], np.ndarray], from_hz: float = 1.0, to_hz: float = 4500.0
 ) -> dict[str, float]:
     """Return gain margin (ratio), phase margin (degrees) and modulus margin of L, by their definitions."""

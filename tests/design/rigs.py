@@ -82,7 +82,7 @@ class ModelErrors(NamedTuple):
     identified_worst: float
 
 
-def drawn(seed: int, *, moved_thresholds: float = 0.0) -> Rig:
+def draw_rig(seed: int, *, moved_thresholds: float = 0.0) -> Rig:
     """Return a rig: weights of eq (4) ± 20 % each, resonance ± 10 %, noise, offset, 16 bit, thresholds moved."""
     random = np.random.default_rng(seed)
     weights = np.array(NOMINAL_WEIGHTS_UM_PER_V) * random.uniform(0.8, 1.2, len(NOMINAL_WEIGHTS_UM_PER_V))

@@ -11,7 +11,7 @@ from rtloop.hil.stages.hysteresis import RESIDUAL_WEIGHTS_UM_PER_V, THRESHOLDS_V
 from rtloop.hysteresis.compensation import compensated_output, residual_operator
 from rtloop.hysteresis.play_model import PlayModel
 from rtloop.hysteresis.plays import model_output
-from tests.design.rigs import COMMAND_UM, EQ_4, drawn
+from tests.design.rigs import COMMAND_UM, EQ_4, draw_rig
 
 INVERSE = EQ_4.remove_dead_band().inverse()
 RESIDUAL_RIG = PlayModel(np.array(THRESHOLDS_V), np.array(RESIDUAL_WEIGHTS_UM_PER_V))
@@ -53,7 +53,7 @@ def test_the_bound_is_reached(actuator, compensator) -> None:
 
 @pytest.mark.parametrize("seed", range(301, 311))
 def test_the_bound_holds_on_drawn_rigs_stepped_one_by_one(seed: int) -> None:
-    rig, random = drawn(seed), np.random.default_rng(seed)
+    rig, random = draw_rig(seed), np.random.default_rng(seed)
     residual = residual_operator(PlayModel(rig.thresholds, rig.d0 * rig.weights), INVERSE, COMMAND_UM)
     bound = residual.bound_um(residual.gain)
     for name, v in {

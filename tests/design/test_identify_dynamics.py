@@ -19,7 +19,16 @@ from rtloop.design.identification.dynamics.residuals import residual_tests
 from rtloop.design.identification.frequency_response import compare_responses, estimate_response
 from rtloop.design.paper import PAPER_D
 from rtloop.foundation.modal import ModalSystem, modal_sum
-from tests.design.rigs import EQ_4, FAST_S, chirp_drive, drawn, identify_rig, model_errors, model_excitation, step_drive
+from tests.design.rigs import (
+    EQ_4,
+    FAST_S,
+    chirp_drive,
+    draw_rig,
+    identify_rig,
+    model_errors,
+    model_excitation,
+    step_drive,
+)
 
 PAIR_AND_REAL = Innovations(
     FAST_S,
@@ -32,7 +41,7 @@ PAIR_AND_REAL = Innovations(
 
 @pytest.mark.parametrize("seed", [201, 202])
 def test_a_drawn_rig_comes_out_of_a_slow_sine_and_a_step(seed: int) -> None:
-    rig = drawn(seed)
+    rig = draw_rig(seed)
     errors = model_errors(rig, *identify_rig(rig))
     print(f"seed {seed}: {errors}")
     assert errors.loop_percent <= 1.0
@@ -42,7 +51,7 @@ def test_a_drawn_rig_comes_out_of_a_slow_sine_and_a_step(seed: int) -> None:
 
 
 def test_a_chirp_serves_as_well_and_so_does_validation_on_a_step() -> None:
-    rig = drawn(204)
+    rig = draw_rig(204)
     model = type(EQ_4)(rig.thresholds, rig.weights)
     chirp, step = (model_excitation(model, rig.measure(drive, FAST_S)) for drive in (chirp_drive(), step_drive()))
     fit = identify_dynamics(chirp, largest_order=4, criterion="validation", validation=[step])
@@ -58,7 +67,7 @@ def test_a_chirp_serves_as_well_and_so_does_validation_on_a_step() -> None:
 @pytest.mark.parametrize("signs", [(-1.0, 1.0), (1.0, -1.0)])
 def test_a_stage_that_moves_against_its_drive_is_named(signs: tuple[float, float]) -> None:
     """The sensor or the drive has the wrong sign."""
-    rig = drawn(204)
+    rig = draw_rig(204)
     run = model_excitation(type(EQ_4)(rig.thresholds, rig.weights), rig.measure(step_drive(), FAST_S))
     inverted = Excitation(run.name, signs[0] * run.input, signs[1] * run.position_um, run.period_s)
     with pytest.raises(
@@ -68,7 +77,7 @@ def test_a_stage_that_moves_against_its_drive_is_named(signs: tuple[float, float
 
 
 def test_the_measured_frequency_response_agrees_where_it_is_coherent() -> None:
-    rig = drawn(205)
+    rig = draw_rig(205)
     model = type(EQ_4)(rig.thresholds, rig.weights)
     fit = identify_dynamics(model_excitation(model, rig.measure(step_drive(), FAST_S)), order=4)
     chirp = model_excitation(model, rig.measure(chirp_drive(duration_s=4.0), FAST_S))

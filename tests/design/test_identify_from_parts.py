@@ -15,7 +15,7 @@ from tests.design.other_truths import (
     WEIGHTS_UM_PER_V,
     sum_of_plays,
 )
-from tests.soak.parts import ALLOWED_RATIO, both, drawn, reported_um, stepped, true_um
+from tests.soak.parts import ALLOWED_RATIO, fit_unknown_and_known_memory, play_states, random_rig, reported_um, true_um
 
 Array = np.ndarray[Any, Any]
 SAMPLES = 300
@@ -46,7 +46,7 @@ def test_within_what_was_covered_a_past_is_a_constant(seed: int) -> None:
     drive = np.interp(np.linspace(0, 5, SAMPLES), range(6), [1.0, 5.0, -2.0, 7.0, -8.0, random.uniform(-7, 9)])
     pasts = [np.append(random.uniform(-10, 10, 5), drive[0]) for _ in range(2)]
     first_um, second_um = (
-        stepped(np.append(past, drive), THRESHOLDS_V)[past.size :] @ WEIGHTS_UM_PER_V for past in pasts
+        play_states(np.append(past, drive), THRESHOLDS_V)[past.size :] @ WEIGHTS_UM_PER_V for past in pasts
     )
     intervals = covered_intervals(drive)
     assert intervals.max() == 3
@@ -58,8 +58,8 @@ def test_within_what_was_covered_a_past_is_a_constant(seed: int) -> None:
 @pytest.mark.parametrize("seed", [0, 1, 2, 103])
 def test_not_knowing_the_memory_costs_little(seed: int) -> None:
     """The rigs are the first three of the soak, and one with a recording that the others cover less than it seems."""
-    rig = drawn(seed)
-    fit, known_fit = both(rig)
+    rig = random_rig(seed)
+    fit, known_fit = fit_unknown_and_known_memory(rig)
     assert reported_um(fit, fit) <= ALLOWED_RATIO * reported_um(known_fit, fit)
     assert true_um(fit, rig, fit.stroke_v) <= ALLOWED_RATIO * true_um(known_fit, rig, fit.stroke_v)
 

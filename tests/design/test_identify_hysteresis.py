@@ -20,7 +20,7 @@ from rtloop.hysteresis.loop_shape import loop_shape
 from rtloop.hysteresis.play_model import PlayModel
 from rtloop.hysteresis.plays import loading_curve, model_output, play_outputs, turning_points
 from tests.design.other_truths import creeping_plays, preisach
-from tests.design.rigs import EQ_4, SLOW_S, drawn, slow_sine
+from tests.design.rigs import EQ_4, SLOW_S, draw_rig, slow_sine
 
 DRIVES = st.lists(st.floats(-10, 10), min_size=1, max_size=60)
 
@@ -80,7 +80,7 @@ def test_without_noise_the_weights_come_back(slopes: list[float], offset: float)
 @pytest.mark.parametrize("seed", [101, 102])
 @pytest.mark.parametrize("placement", ["chebyshev", "uniform"])
 def test_a_drawn_rig_is_found_within_one_percent_of_its_range(seed: int, placement) -> None:
-    rig, drive = drawn(seed), slow_sine()
+    rig, drive = draw_rig(seed), slow_sine()
     fit = identify_hysteresis([rig.measure(drive, SLOW_S)], placement=placement)
     truth = rig.static_um(drive)
     error = np.abs(model_output(fit.model, drive) - truth).max() / np.ptp(truth)
@@ -150,7 +150,7 @@ def test_a_whole_recording_is_not_taken_for_clipped() -> None:
     drive = slow_sine()
     exact = record_model(EQ_4, drive).position_um
     require_usable("made", drive, exact, exact / 10)
-    measured = drawn(7).measure(drive, SLOW_S).position_um
+    measured = draw_rig(7).measure(drive, SLOW_S).position_um
     require_usable("made", drive, measured, measured / 10)
 
 

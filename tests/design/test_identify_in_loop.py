@@ -14,7 +14,14 @@ from rtloop.design.identification.dynamics.identify_in_loop import identify_in_l
 from rtloop.design.identification.dynamics.instrumental import InstrumentedRecording, fit_whitening
 from rtloop.design.identification.dynamics.nested_models import ModelSearch
 from rtloop.design.identification.frequency_response import recording_response
-from tests.design.coloured_loops import PERIOD_S, TrueLoop, coloured, damping_controller, drawn_loop, motion
+from tests.design.coloured_loops import (
+    PERIOD_S,
+    TrueLoop,
+    coloured_noise,
+    damping_controller,
+    draw_loop,
+    reference_motion,
+)
 from tests.design.loop_bound import bounds_percent
 
 SAMPLES = 12_000
@@ -38,9 +45,11 @@ def record_loop(loop: TrueLoop, reference: np.ndarray, noise: np.ndarray, start:
 
 def test_order_delay_and_modes_of_a_drawn_loop_are_found() -> None:
     random = np.random.default_rng(5)
-    loop = drawn_loop(random)
-    noise = coloured(random, SAMPLES, loop.modes[0][0], 0.05)
-    fit = identify_recorded_dynamics(record_loop(loop, motion("sweep", random, SAMPLES, 6.0), noise), largest_order=6)
+    loop = draw_loop(random)
+    noise = coloured_noise(random, SAMPLES, loop.modes[0][0], 0.05)
+    fit = identify_recorded_dynamics(
+        record_loop(loop, reference_motion("sweep", random, SAMPLES, 6.0), noise), largest_order=6
+    )
     assert (fit.model.order, fit.delay_ticks) == (4, loop.delay_ticks)
     assert fit.method.startswith("refined instrumental variables")
     for mode, (hz, damping, _) in zip(fit.modes, loop.modes, strict=True):
@@ -54,8 +63,8 @@ def test_order_delay_and_modes_of_a_drawn_loop_are_found() -> None:
 
 def test_a_loop_that_moved_before_the_recording_began_is_as_good() -> None:
     loop, random = one_mode(), np.random.default_rng(4)
-    reference = 7.0 + motion("steps", random, 9000, 10.0)
-    run = record_loop(loop, reference, coloured(random, 9000, 640.0, 0.02), start=1037)
+    reference = 7.0 + reference_motion("steps", random, 9000, 10.0)
+    run = record_loop(loop, reference, coloured_noise(random, 9000, 640.0, 0.02), start=1037)
     (mode,) = identify_in_loop(run, order=2, delay_ticks=1).modes
     assert abs(mode.frequency_hz - HZ) < 4 * mode.frequency_std_hz
     assert mode.frequency_hz == pytest.approx(HZ, rel=0.002)
@@ -65,9 +74,9 @@ def test_a_loop_that_moved_before_the_recording_began_is_as_good() -> None:
 @pytest.mark.parametrize("seed", [20, 44])
 def test_standard_deviations_are_the_least_that_any_method_can_have(seed: int) -> None:
     random = np.random.default_rng(seed)
-    loop = drawn_loop(random)
+    loop = draw_loop(random)
     near_hz = 1.05 * loop.modes[0][0]
-    reference, noise = motion("steps", random, SAMPLES, 20.0), coloured(random, SAMPLES, near_hz, 0.05)
+    reference, noise = reference_motion("steps", random, SAMPLES, 20.0), coloured_noise(random, SAMPLES, near_hz, 0.05)
     modes = identify_in_loop(record_loop(loop, reference, noise), order=4, delay_ticks=loop.delay_ticks).modes
     bounds = bounds_percent(loop, loop.in_loop(reference, 0 * noise)["command_um"], near_hz, 0.05)
     for mode, (hz, damping, _), (hz_bound, damping_bound) in zip(modes, loop.modes, bounds, strict=True):
@@ -79,9 +88,9 @@ def test_standard_deviations_are_the_least_that_any_method_can_have(seed: int) -
 
 def test_a_light_mode_is_found_first_beside_all_that_is_slow() -> None:
     random, samples = np.random.default_rng(23), 60_000
-    loop = drawn_loop(random)
-    noise = coloured(random, samples, loop.modes[0][0] * random.uniform(0.9, 1.1), 0.05)
-    command = loop.in_loop(motion("steps", random, samples, 20.0), 0 * noise)["command_um"]
+    loop = draw_loop(random)
+    noise = coloured_noise(random, samples, loop.modes[0][0] * random.uniform(0.9, 1.1), 0.05)
+    command = loop.in_loop(reference_motion("steps", random, samples, 20.0), 0 * noise)["command_um"]
     position = loop.open(command, noise)["position_um"]
     run = shift_to_zero(LoopExcitation("drawn", command, position, PERIOD_S, command[np.newaxis]))
     residual_um = run.position_um - driven_input(replace(run, input=run.position_um))
@@ -100,8 +109,8 @@ def test_noise_is_whitened_by_the_autoregression_that_made_it() -> None:
 
 def test_what_follows_from_outside_is_the_input_without_its_noise() -> None:
     loop, random = one_mode(), np.random.default_rng(6)
-    reference = motion("multisine", random, SAMPLES, 3.0)
-    noise = coloured(random, SAMPLES, 640.0, 0.1)
+    reference = reference_motion("multisine", random, SAMPLES, 3.0)
+    noise = coloured_noise(random, SAMPLES, 640.0, 0.1)
     run = record_loop(loop, reference, noise)
     clean = loop.in_loop(reference, np.zeros(SAMPLES))["command_um"]
     driven = driven_input(run)
@@ -122,7 +131,7 @@ def test_what_follows_from_outside_is_the_input_without_its_noise() -> None:
     ],
 )
 def test_what_is_not_enough_is_refused(reference, samples: int, message: str) -> None:
-    noise = coloured(np.random.default_rng(8), samples, 640.0, 0.05)
+    noise = coloured_noise(np.random.default_rng(8), samples, 640.0, 0.05)
     with pytest.raises(UnsuitableData, match=message):
         identify_in_loop(record_loop(one_mode(), reference(samples), noise))
 
@@ -137,7 +146,7 @@ def test_what_is_not_enough_is_refused(reference, samples: int, message: str) ->
 def test_a_frequency_response_needs_a_reference_that_moves_for_long_enough(
     reference, samples: int, message: str
 ) -> None:
-    noise = coloured(np.random.default_rng(8), samples, 640.0, 0.05)
+    noise = coloured_noise(np.random.default_rng(8), samples, 640.0, 0.05)
     with pytest.raises(UnsuitableData, match=message):
         recording_response(record_loop(one_mode(), 1.0 * reference(samples), noise))
 

@@ -19,7 +19,7 @@ from rtloop.experiments.report import load_runs, make_report
 from rtloop.experiments.setting import Setting
 from tests.design.modal_rigs import modal_rig
 from tests.recording.real_loop import record
-from tests.soak.chain import LIMITS, designed_for, run, verdict
+from tests.soak.chain import LIMITS, design_rig, run, verdict
 
 DEPLOY = Path(__file__).resolve().parents[2] / "deploy"
 ONE_MODE_LATE_BY_3, TWO_MODES_LATE_BY_1 = 14, 38
@@ -29,7 +29,7 @@ ONE_MODE_LATE_BY_3, TWO_MODES_LATE_BY_1 = 14, 38
 def test_a_rig_drawn_at_random_gets_a_loop_that_runs(tmp_path, seed) -> None:
     """The rig's modes and delay are identified; the loop meets its specification on the model, and runs on the rig."""
     rig = modal_rig(seed)
-    chain, written = designed_for(rig, tmp_path)
+    chain, written = design_rig(rig, tmp_path)
     assert chain.stage.dynamics.delay_ticks == rig.delay_ticks > 0
     light = sorted(mode.frequency_hz for mode in chain.stage.dynamics.modes if mode.damping < 0.1)
     assert light == pytest.approx(rig.hz, rel=1e-3)
@@ -118,4 +118,4 @@ def test_no_loop_is_designed_on_a_model_that_explains_nothing(tmp_path) -> None:
     with pytest.raises(
         UnsuitableData, match=r"no model explains the step. The best model has order 1, .* Use a step up and down"
     ):
-        designed_for(modal_rig(TWO_MODES_LATE_BY_1), tmp_path, order=1)
+        design_rig(modal_rig(TWO_MODES_LATE_BY_1), tmp_path, order=1)

@@ -24,7 +24,7 @@ from rtloop.foundation.options import Options
 from rtloop.hysteresis.play_model import PlayModel
 from rtloop.hysteresis.residual_hysteresis import add_residual_hysteresis
 from rtloop.signals import axis_column, column_names
-from tests.recording.real_loop import ROOT, RealLoop, changed
+from tests.recording.real_loop import ROOT, RealLoop, changed_configuration
 
 PAPER = load(ROOT / "deploy" / "paper.toml")
 OMEGA, ZETA, KI, RATE_HZ = 2 * np.pi * 400.0, 0.1, 200.0, 10_000.0
@@ -82,7 +82,9 @@ def linear_rig(more: str = "") -> Configuration:
 
 def test_a_simulation_is_the_run_itself() -> None:
     """The paper's loop, steps of 20 µm, recorded and simulated: every column of every tick, to the last bit."""
-    text = changed(("levels = [20.0, 0.0, -20.0, 0.0]\ndwell_s = 0.2", "levels = [0.0, 20.0, -20.0]\ndwell_s = 0.05"))
+    text = changed_configuration(
+        ("levels = [20.0, 0.0, -20.0, 0.0]\ndwell_s = 0.2", "levels = [0.0, 20.0, -20.0]\ndwell_s = 0.05")
+    )
     recorded = RealLoop(text)
     recorded.run(1500)
     rows = recorded.block.ring("ticks").slots[:1500]
@@ -188,7 +190,7 @@ def test_what_is_not_linear_is_seen(paper) -> None:
 
 def test_noise_at_rest_is_that_of_a_run(paper) -> None:
     """The oracle is the recorded loop at rest at 5 µm, at another time and with another seed."""
-    text = changed(("seed = 1 ", "seed = 8 "), ("levels = [20.0, 0.0, -20.0, 0.0]", "levels = [5.0]"))
+    text = changed_configuration(("seed = 1 ", "seed = 8 "), ("levels = [20.0, 0.0, -20.0, 0.0]", "levels = [5.0]"))
     recorded = RealLoop(text)
     recorded.run(15_000)
     rows = recorded.block.ring("ticks").slots[5_000:15_000]

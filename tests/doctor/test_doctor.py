@@ -25,7 +25,7 @@ from rtloop.engine.plan import Pacing
 from rtloop.errors import RtloopError
 from rtloop.linear.transfer import Transfer
 from tests.doctor.hosts import host
-from tests.recording.real_loop import ROOT, changed
+from tests.recording.real_loop import ROOT, changed_configuration
 
 CAP_IPC_LOCK, CAP_SYS_NICE, PR_CAPBSET_DROP = 14, 23, 24
 
@@ -139,7 +139,7 @@ def test_a_delay_beyond_the_margin_of_a_loop_is_a_reason():
 
 def test_the_papers_loop_bears_two_milliseconds():
     """The paper's C(z) has a phase margin of 73.05° at 95.09 Hz, without a sample of delay."""
-    prepared = prepare(parse(changed(), "paper", ROOT, "paper"))
+    prepared = prepare(parse(changed_configuration(), "paper", ROOT, "paper"))
     (delay,) = axis_delays(prepared, latency(np.linspace(0, 100, 10_001)))
     assert delay.crossover_hz == pytest.approx(95.09, abs=0.01)
     assert delay.tolerated_us == pytest.approx(73.05 / 360 / 95.09 * 1e6, rel=1e-3)

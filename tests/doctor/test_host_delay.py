@@ -15,7 +15,7 @@ from rtloop.configuration.prepare import prepare
 from rtloop.errors import ConfigError, HostRefusal
 from rtloop.supervision import host_delay
 from rtloop.supervision.host_delay import HostDelay, load_host_delay, require_margins, spent_margin, store_host_delay
-from tests.recording.real_loop import ROOT, changed
+from tests.recording.real_loop import ROOT, changed_configuration
 
 MARGIN_US = 73.05 / 360 / 95.09 * 1e6
 """Phase margin over crossover of the paper's loop at 10 kHz."""
@@ -31,7 +31,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 def make_configuration(*changes: tuple[str, str]) -> Configuration:
     """Return the paper's configuration after replacements of texts."""
-    return parse(changed(*changes), "host-delay-test", ROOT / "deploy", "paper.toml")
+    return parse(changed_configuration(*changes), "host-delay-test", ROOT / "deploy", "paper.toml")
 
 
 @pytest.fixture
@@ -149,7 +149,7 @@ def test_the_page_of_a_verification_shows_the_delay_of_this_host(folder: Path) -
 
 
 def test_a_run_without_a_known_delay_is_refused(tmp_path: Path) -> None:
-    (tmp_path / "asking.toml").write_text(changed(REQUIRED, ('specification = "paper-spec.toml"', "")))
+    (tmp_path / "asking.toml").write_text(changed_configuration(REQUIRED, ('specification = "paper-spec.toml"', "")))
     result = CliRunner().invoke(main, ["run", str(tmp_path / "asking.toml"), "--duration", "1", "--out", str(tmp_path)])
     assert result.exit_code == 78
     assert "axis.x.margins.require_margin: the delay of this host is unknown" in result.stderr

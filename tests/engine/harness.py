@@ -84,7 +84,7 @@ def prepare_text(configuration: str, folder: Path = Path()) -> Prepared:
     return prepare(parse(configuration, "test", folder, "test"), paced=False)
 
 
-def plan_of(configuration: str, folder: Path = Path()) -> Plan:
+def make_plan(configuration: str, folder: Path = Path()) -> Plan:
     """Return the plan of an unpaced run without end."""
     return prepare_text(configuration, folder).plan
 
@@ -93,7 +93,7 @@ class LoopBench:
     """Control loop that a test runs in virtual time or by a scripted `clock`; methods return its records and events."""
 
     def __init__(self, plan: str | Plan, driver: Driver | None = None, clock: ScriptedClock | None = None) -> None:
-        self.plan = plan_of(plan) if isinstance(plan, str) else plan
+        self.plan = make_plan(plan) if isinstance(plan, str) else plan
         self.driver = driver or self.plan.driver()
         self.block = SharedBlock.create(self.plan.sizes)
         self._context = clock_context(self.plan.pacing.rate_hz)
@@ -143,7 +143,7 @@ class LoopBench:
 
     def load_law(self, configuration: str) -> None:
         """Send the command that replaces the running law by the law of another configuration."""
-        law = plan_of(configuration).coefficients.tobytes()
+        law = make_plan(configuration).coefficients.tobytes()
         self.block["staged"][: len(law)] = np.frombuffer(law, np.uint8)
         self.send(Kind.LOAD_LAW, 1.0, axis=0)
 

@@ -22,7 +22,7 @@ from rtloop.errors import ConfigError
 from rtloop.signals import Flag, Mode
 from tests.drivers.bench_driver import LoopBack
 from tests.engine.failing_driver import ScriptedDriver
-from tests.engine.harness import AXIS, CONTROLLER, FOR_EVER, IDEAL, LoopBench, ScriptedClock, plan_of, text
+from tests.engine.harness import AXIS, CONTROLLER, FOR_EVER, IDEAL, LoopBench, ScriptedClock, make_plan, text
 
 RAW = text(IDEAL, AXIS, '[axis.reference]\nkind = "hold"\nvalue = 3.0\n', mode="raw")
 RAMP = 3.0 - 0.1 * np.arange(1, 31)
@@ -228,7 +228,7 @@ def test_a_fault_of_the_plan_begins_with_its_own_key(driver: Callable[[], LoopBa
 
 def test_a_loop_in_process_that_ends_early_gives_its_ticks_once(monkeypatch: pytest.MonkeyPatch):
     """The ring has room for 4096 ticks; the loop ends after 5000 of 20,000."""
-    plan = plan_of(text(AXIS, CONTROLLER, IDEAL))
+    plan = make_plan(text(AXIS, CONTROLLER, IDEAL))
     blocks: list[tuple[int, int]] = []
 
     class EarlyEndingAssembly(in_process.Assembly):

@@ -36,10 +36,10 @@ from rtloop.hil.stages.noise import seed_word
 from rtloop.recording.load import Recording
 from rtloop.recording.replay.replay import replay
 from rtloop.signals import Flag, trip_causes
-from tests.engine.harness import AXIS, CONTROLLER, EXACT, IDEAL, plan_of, text
+from tests.engine.harness import AXIS, CONTROLLER, EXACT, IDEAL, make_plan, text
 from tests.hil.xorshift import xorshift64
 from tests.paper_dynamics import paper_dynamics
-from tests.recording.real_loop import rows_of
+from tests.recording.real_loop import read_rows
 
 Columns = dict[str, np.ndarray]
 FUNCTION = ctypes.CFUNCTYPE(ctypes.c_int32, ctypes.c_void_p, ctypes.POINTER(ctypes.c_double))
@@ -59,7 +59,7 @@ def late_text(table_us: object, *parts: str, rate_hz: float = 10_000, seed: int 
 
 def run_late(table_us: Sequence[float], ticks: int, *parts: str, **options: Any) -> tuple[Columns, np.ndarray]:
     """Run a late loop in this process; return its columns by name, and all records."""
-    plan = plan_of(late_text(list(table_us), *parts, **options))
+    plan = make_plan(late_text(list(table_us), *parts, **options))
     rows = run_in_process(plan, plan.driver(), ticks)
     return dict(zip(plan.columns, rows.T, strict=True)), rows
 
@@ -102,7 +102,7 @@ def test_deadlines_stay_on_the_grid(rate_hz):
     """Tick k is due after k and the missed periods; its lateness is below a period, its wake is as drawn."""
     period_us = 1e6 / rate_hz
     table_us = np.rint(np.array([0.0, 0.3, 0.999, 1.5, 2.2, 7.25]) * period_us * 1e3) / 1e3
-    plan = plan_of(late_text(table_us.tolist(), rate_hz=10_000))
+    plan = make_plan(late_text(table_us.tolist(), rate_hz=10_000))
     plan = replace(plan, mode=0, pacing=replace(plan.pacing, rate_hz=rate_hz))
     rows = run_in_process(plan, plan.driver(), 3000)
     columns = dict(zip(plan.columns, rows.T, strict=True))
@@ -141,7 +141,7 @@ def test_the_rig_advances_by_the_missed_periods_with_its_outputs_held():
 
 def test_a_tick_that_misses_nothing_leaves_the_rig_as_it_is():
     """Numbers below a period change only the column of lateness; zeros record 0 in place of NaN."""
-    plan = plan_of(late_text([]))
+    plan = make_plan(late_text([]))
     rows_without_table = run_in_process(plan, plan.driver(), 2000)
     lateness_column = plan.columns.index("lateness_us")
     assert np.all(np.isnan(rows_without_table[:, lateness_column]))
@@ -158,7 +158,7 @@ def test_loopback_and_delayed_drives_are_held_through_missed_periods():
     options = RigOptions.model_validate(
         {"loopback": 2, "latency_ticks": 2, "plant": {"dac": {"bits": 0}, "sensor": {"noise_um": 0.0}}}
     )
-    driver, plan = SimDriver(options, wiring, 10_000.0), plan_of(late_text([450.0]))
+    driver, plan = SimDriver(options, wiring, 10_000.0), make_plan(late_text([450.0]))
     facts, pointers, block = driver.facts, driver.open(), SharedBlock.create(plan.sizes)
     virtual = virtual_clock(plan, facts, block, pointers, 1 << 62)
     timing, inputs = (ctypes.c_double * 4)(), (ctypes.c_double * 6)()
@@ -222,7 +222,7 @@ def test_numbers_that_are_not_allowed(table_us, fault):
 
 
 def test_4096_numbers_are_allowed():
-    assert len(plan_of(late_text([1.0] * 4096)).pacing.simulated_lateness_us) == 4096
+    assert len(make_plan(late_text([1.0] * 4096)).pacing.simulated_lateness_us) == 4096
 
 
 def test_other_drivers_than_the_simulated_rig_are_refused():
@@ -233,7 +233,7 @@ def test_other_drivers_than_the_simulated_rig_are_refused():
         "loop.simulated_lateness_us: set with driver.kind = 'shm'; allowed with the simulated rig only; "
         "set driver.kind = 'sim', or remove the key"
     ]
-    plan: Plan = plan_of(late_text([1.0]))
+    plan: Plan = make_plan(late_text([1.0]))
     driver, block = plan.driver(), SharedBlock.create(plan.sizes)
     with pytest.raises(
         ValueError, match="simulated_lateness_us: set, but the driver is 'shm'; allowed: only with the driver 'sim'"
@@ -273,7 +273,7 @@ def record_late(folder: Path, table_us: tuple[float, ...], *parts: str, code: in
 def test_recordings_are_equal_in_bytes_and_replay_identical(tmp_path):
     """The loop's own process and a loop in this process give the same records."""
     first, second = (record_late(tmp_path, MOSTLY_EARLY_US) for _ in range(2))
-    rows, rows_again = (rows_of([*recording.paths]) for recording in (first, second))
+    rows, rows_again = (read_rows([*recording.paths]) for recording in (first, second))
     assert rows.tobytes() == rows_again.tobytes() == run_late(MOSTLY_EARLY_US, 10_000)[1].tobytes()
     # The time of an event that the recorder reads before its tick's record is extrapolated.
     assert len({str([{**event, "time_ns": 0} for event in recording.events]) for recording in (first, second)}) == 1

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from rtloop.engine.memory import RING_SECONDS, SharedBlock, Sizes, Word, ring_ticks
-from tests.engine.harness import AXIS, CONTROLLER, IDEAL, MATCHED, LoopBench, plan_of, text
+from tests.engine.harness import AXIS, CONTROLLER, IDEAL, MATCHED, LoopBench, make_plan, text
 
 SIZES = Sizes(columns=21, axes=1, rate_hz=10_000, snapshot_bytes=1000, table_samples=7)
 
@@ -54,7 +54,7 @@ def test_the_ring_holds_its_seconds(rate_hz):
 
 
 def test_a_plan_survives_pickling():
-    plan = plan_of(text(IDEAL, AXIS, CONTROLLER, MATCHED))
+    plan = make_plan(text(IDEAL, AXIS, CONTROLLER, MATCHED))
     unpickled = pickle.loads(pickle.dumps(plan))
     assert unpickled.columns == plan.columns
     first, second = LoopBench(plan).run(500), LoopBench(unpickled).run(500)

@@ -15,7 +15,7 @@ from rtloop.recording.capture.session import Options, Session
 from rtloop.recording.load import load
 from rtloop.recording.replay.replay import replay
 from rtloop.signals import TRIP_MASK, Mode
-from tests.recording.real_loop import ROOT, RealLoop, changed
+from tests.recording.real_loop import ROOT, RealLoop, changed_configuration
 
 SWAPS, SETTLE_TICKS, SPACING = 1000, 4000, 97
 SINE = ('kind = "steps"\nlevels = [20.0, 0.0, -20.0, 0.0]\ndwell_s = 0.2',
@@ -32,8 +32,11 @@ MODES = (Mode.FEEDFORWARD, Mode.CLOSED_LOOP)
 
 def record_swaps(path: Path, swaps: int) -> tuple[Path, list[int]]:
     """Record a run with `swaps` swaps, equally long for any number; return its file and the ticks of the swaps."""
-    loop = RealLoop(changed(SINE))
-    laws = [prepare(parse(changed(SINE, *law), "law", ROOT, "law"), paced=False).plan.coefficients for law in LAWS]
+    loop = RealLoop(changed_configuration(SINE))
+    laws = [
+        prepare(parse(changed_configuration(SINE, *law), "law", ROOT, "law"), paced=False).plan.coefficients
+        for law in LAWS
+    ]
     session = Session(loop.block, path, loop.header, Options(min_free_bytes=0))
     ticks = []
 

@@ -14,7 +14,7 @@ import pytest
 from tests.faults.configuration import Bounds, on_a_board
 from tests.faults.host import overlapping_ns
 from tests.faults.plain_card import MEMORY, CardOptions, PlainCard
-from tests.hil.test_witness import by_all_pairs
+from tests.hil.test_witness import compare_all_pairs
 
 
 def test_a_card_in_plain_python_sees_steps_and_windows(tmp_path, monkeypatch):
@@ -29,7 +29,7 @@ def test_a_card_in_plain_python_sees_steps_and_windows(tmp_path, monkeypatch):
         card.write([float(value)])
     monkeypatch.undo()
     names = ("largest_step_v", "largest_window_v", "lowest_v", "highest_v")
-    assert tuple(card.memory[name] for name in names) == by_all_pairs(volts, true_ns)
+    assert tuple(card.memory[name] for name in names) == compare_all_pairs(volts, true_ns)
 
 
 def test_spans_that_overlap_count_once_and_only_between_two_times():

@@ -62,7 +62,7 @@ class Card:
         return record.largest_step_v, record.largest_window_v, record.lowest_v, record.highest_v
 
 
-def by_all_pairs(written_v: np.ndarray, true_ns: np.ndarray) -> tuple[float, float, float, float]:
+def compare_all_pairs(written_v: np.ndarray, true_ns: np.ndarray) -> tuple[float, float, float, float]:
     """Return the evidence by definition: 0 V, then each voltage until the next; all pairs at most a window apart."""
     changes = np.flatnonzero(np.diff(written_v, prepend=0.0) != 0)  # equal voltages in a row are one voltage
     volts = np.concatenate([[0.0], written_v[changes]])
@@ -94,7 +94,7 @@ def test_steps_and_windows_are_right_however_rarely_the_board_looks(seed, look_p
     look_ns = np.arange(BEGIN_NS, true_ns[-1] + 2 * look_period_ns, look_period_ns)
     card = Card()
     card.run(codes, true_ns, look_ns, true_ns)
-    assert card.evidence == by_all_pairs(codes * LSB_V, true_ns)
+    assert card.evidence == compare_all_pairs(codes * LSB_V, true_ns)
     assert card.words[MISSED_WRITES] == 0
     assert card.words[EXAMINED] == len(codes)
     assert card.records[0].moved_ns == true_ns[np.flatnonzero(np.diff(codes))[-1] + 1]

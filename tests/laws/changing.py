@@ -229,7 +229,7 @@ class Steps(NamedTuple):
     limited: int
 
 
-def steps_of(recording: rtloop.Recording) -> Steps:
+def drive_steps(recording: rtloop.Recording) -> Steps:
     """Return the largest steps of any axis in a recording of changes, after the loop has settled."""
     steps = [_steps_of_axis(recording, axis) for axis in recording.header["axes"]]
     return Steps(*(max(values) for values in zip(*steps, strict=True)))

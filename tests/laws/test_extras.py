@@ -15,7 +15,7 @@ from rtloop.recording.capture.session import Session
 from rtloop.recording.replay.laws import TrustedLaws
 from rtloop.recording.replay.replay import replay
 from rtloop.signals import Mode
-from tests.engine.harness import LoopBench, plan_of, prepare_text
+from tests.engine.harness import LoopBench, make_plan, prepare_text
 from tests.laws.test_coupled import EXAMPLE as COUPLED
 from tests.recording.real_loop import PAPER, Options, RealLoop
 
@@ -113,7 +113,7 @@ def test_a_law_reads_and_sets_them(folder):
 
 def test_where_the_loop_is_not_closed_they_are_safe(folder):
     text = configuration(("max_v = 0.75", "min_v = -1.0"))
-    bench = LoopBench(plan_of(text, folder))
+    bench = LoopBench(make_plan(text, folder))
     closed_rows = bench.run(500)
     assert bench.column(closed_rows, "count_v")[-1] > 0
     for mode in (Mode.FEEDFORWARD, Mode.OFF):
@@ -125,7 +125,7 @@ def test_where_the_loop_is_not_closed_they_are_safe(folder):
 
 def test_an_output_that_is_no_number_trips(folder):
     (folder / "mine.py").write_text(MINE.replace("= 0.1 * s.seen", "= 1e308 * 1e308"))
-    bench = LoopBench(plan_of(configuration(), folder))
+    bench = LoopBench(make_plan(configuration(), folder))
     rows = bench.run(50)
     assert set(bench.column(rows, "mode")[1:]) == {float(Mode.OFF)}
     assert set(bench.column(rows, "count_v")) == {0.0}
@@ -158,7 +158,7 @@ def test_references_stand_still_while_they_are_held(folder):
     )
     start = text.index("[axis.reference]")
     text = text[:start] + '[axis.reference]\nkind = "triangle"\namplitude = 10.0\nfrequency_hz = 5.0\n'
-    bench = LoopBench(plan_of(text, folder))
+    bench = LoopBench(make_plan(text, folder))
     rows = bench.run(4000)
     held = bench.column(rows, "back_v") >= 2.5
     reference_um = bench.column(rows, "x_reference_um")
@@ -196,7 +196,7 @@ class Mine(CoupledController):
     text = COUPLED[:start] + '[axis.controller]\nfile = "mine.py"\naxes = ["x", "y"]\n' + COUPLED[end:]
     text = text.replace('kind = "sim"\n', LOOPBACK, 1)
     text = text.replace("\n[[axis]]", '\n[outputs.sum]\nchannel = "dac3"\naxis = "y"\n\n[[axis]]', 1)
-    bench = LoopBench(plan_of(text, tmp_path))
+    bench = LoopBench(make_plan(text, tmp_path))
     rows = bench.run(300)
     expected = 0.1 * (bench.column(rows, "x_reference_um") + bench.column(rows, "y_reference_um"))
     np.testing.assert_allclose(bench.column(rows, "sum_v")[200:], expected[200:], atol=0.01)

@@ -15,7 +15,7 @@ from rtloop.recording.file.topics.events import law_label
 from rtloop.recording.replay.laws import TrustedLaws
 from rtloop.recording.replay.replay import replay
 from rtloop.signals import Mode
-from tests.engine.harness import AXIS, LoopBench, plan_of, text
+from tests.engine.harness import AXIS, LoopBench, make_plan, text
 from tests.laws.changing import HOLD as HOLD_5_UM
 from tests.laws.changing import configuration
 from tests.laws.failing import ENDLESS, ENDLESS_UM, FAILING, REFUSED
@@ -29,7 +29,7 @@ CANARY = 0xA5
 def user_law_plan(folder: Path, law: str):
     """Return the plan of a loop with a law from a file."""
     (folder / "mine.py").write_text(law)
-    return plan_of(text(AXIS, HOLD), folder)
+    return make_plan(text(AXIS, HOLD), folder)
 
 
 @pytest.mark.parametrize("name", FAILING)

@@ -12,7 +12,7 @@ from rtloop.configuration.prepare import prepare
 from rtloop.recording.capture.session import Options
 from rtloop.recording.replay.laws import TrustedLaws
 from rtloop.recording.replay.replay import replay
-from tests.laws.changing import AT_CHANGE_V, CONTROLLERS, MORE, change_at_random, configuration, steps_of
+from tests.laws.changing import AT_CHANGE_V, CONTROLLERS, MORE, change_at_random, configuration, drive_steps
 from tests.laws.failing import text as law_text
 
 MINE = {"mine": '[axis.controller]\nfile = "mine.py"\n'}
@@ -40,9 +40,9 @@ def record_changes(folder: Path, sections: dict[str, str], path: Path) -> rtloop
 
 def test_any_law_follows_any_other(folder: Path, tmp_path: Path):
     """The demand continues from the drive in force, and its steps are not much larger than with C(z) alone."""
-    one_law = steps_of(record_changes(folder, {"transfer": CONTROLLERS["transfer"]}, tmp_path / "alone.mcap"))
+    one_law = drive_steps(record_changes(folder, {"transfer": CONTROLLERS["transfer"]}, tmp_path / "alone.mcap"))
     recording = record_changes(folder, CONTROLLERS | MINE, tmp_path / "together.mcap")
-    all_laws = steps_of(recording)
+    all_laws = drive_steps(recording)
     assert all_laws.at_change_v <= AT_CHANGE_V
     assert all_laws.largest_v <= MORE * one_law.largest_v
     assert all_laws.limited == 0

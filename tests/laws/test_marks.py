@@ -13,7 +13,7 @@ from rtloop.errors import ConfigError
 from rtloop.recording.file.topics.validation import header_extras
 from rtloop.recording.replay.replay import replay
 from rtloop.signals import Mode
-from tests.engine.harness import LoopBench, plan_of, prepare_text
+from tests.engine.harness import LoopBench, make_plan, prepare_text
 from tests.recording.real_loop import PAPER, record
 
 CHANNELS = """
@@ -55,7 +55,7 @@ def configuration(reference: str, *changes: tuple[str, str]) -> str:
 
 
 def test_marks_follow_reference_and_position(tmp_path: Path):
-    bench = LoopBench(plan_of(configuration(TRIANGLE), tmp_path))
+    bench = LoopBench(make_plan(configuration(TRIANGLE), tmp_path))
     rows = bench.run(4000)
     reference_um = bench.column(rows, "x_reference_um")
     rising = np.diff(reference_um, prepend=0.0) > 0
@@ -70,7 +70,7 @@ def test_marks_follow_reference_and_position(tmp_path: Path):
 
 
 def test_a_step_is_marked_in_its_tick(tmp_path: Path):
-    bench = LoopBench(plan_of(configuration(STAIRCASE), tmp_path))
+    bench = LoopBench(make_plan(configuration(STAIRCASE), tmp_path))
     rows = bench.run(4000)
     steps_um = np.diff(bench.column(rows, "x_reference_um"), prepend=0.0)
     assert np.count_nonzero(steps_um) == 7
@@ -79,7 +79,7 @@ def test_a_step_is_marked_in_its_tick(tmp_path: Path):
 
 
 def test_marks_are_low_where_outputs_are_off_and_with_a_voltage_as_reference(tmp_path: Path):
-    bench = LoopBench(plan_of(configuration(TRIANGLE), tmp_path))
+    bench = LoopBench(make_plan(configuration(TRIANGLE), tmp_path))
     bench.run(100)
     for mode, is_marked in ((Mode.FEEDFORWARD, True), (Mode.RAW, False), (Mode.OFF, False)):
         bench.send(Kind.SET_MODE, mode)
@@ -111,7 +111,7 @@ def test_a_gate_starts_and_holds_the_reference(tmp_path: Path, state: str):
         ("level_um = 6.0", "level_um = 0.5"),
     )
     levels = STAIRCASE.replace("[0.0, 4.0, 12.0, 8.0]", "[4.0, 12.0, 8.0]" if state == "low" else "[0.0, 4.0]")
-    bench = LoopBench(plan_of(configuration(levels, *changes), tmp_path))
+    bench = LoopBench(make_plan(configuration(levels, *changes), tmp_path))
     rows = bench.run(4000)
     gate, reference_um = bench.column(rows, "gate_v") >= 2.0, bench.column(rows, "x_reference_um")
     held = gate if state == "high" else ~gate

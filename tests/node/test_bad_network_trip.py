@@ -17,7 +17,7 @@ from rtloop.signals import Flag
 from tests.drivers.lossy_relay import relayed
 from tests.drivers.network_plan import Script
 from tests.drivers.relayed_nodes import PythonNode
-from tests.engine.harness import AXIS, LoopBench, plan_of, text
+from tests.engine.harness import AXIS, LoopBench, make_plan, text
 
 TICKS, FIRST_LOST = 20, 5
 RAW = text(AXIS, "[axis.interlocks]\nsample_age_us = 1e9\n", mode="raw", rate_hz=1000)
@@ -42,7 +42,7 @@ def test_the_loop_trips_where_more_answers_are_missing_than_it_may_hold(hold_tic
             host="127.0.0.1", port=relay.port, hold_ticks=hold_ticks, error_limit=1000, watchdog_ms=5000, wait_s=60.0
         )
         driver = StartedDriver(options, {"x": Wiring("adc0", "dac0")}, 1000.0)
-        bench = LoopBench(replace(plan_of(RAW), observed=OBSERVED), driver)
+        bench = LoopBench(replace(make_plan(RAW), observed=OBSERVED), driver)
         relay.begin(Script(lost))
         handled, rows = relay.handled, []
         for tick in range(TICKS):

@@ -11,7 +11,7 @@ import pytest
 
 import rtloop
 from tests.packaging.distribution import ROOT
-from tests.recording.real_loop import record, scheduled
+from tests.recording.real_loop import eventful_configuration, record
 
 TICKS = 300
 
@@ -19,7 +19,7 @@ TICKS = 300
 @pytest.mark.soak
 def test_a_recording_is_read_exported_and_plotted_without_the_calls_of_linux(tmp_path: Path):
     pytest.importorskip("matplotlib", reason="matplotlib is missing: the extra 'plot' installs it")
-    (recording,) = record(tmp_path / "run.mcap", scheduled(), TICKS)
+    (recording,) = record(tmp_path / "run.mcap", eventful_configuration(), TICKS)
     program = Path(__file__).with_name("foreign_system.py")
     completed = subprocess.run(
         [sys.executable, str(program), str(recording), str(tmp_path)], capture_output=True, text=True,

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from tests.service.test_response import CONFIGURATION, HELD_UM, LOOP
+from tests.service.test_response import CONFIGURATION, LOOP, SETPOINT_UM
 
 MODEL_HZ = LOOP.hz / 1.05
 """Resonance of the model; the resonance of the rig lies 5 % above it."""
@@ -29,7 +29,7 @@ settling_ms = 1.5
 points_per_tick = 2
 """
 TICKS = 100
-SCAN_UM = HELD_UM + 4.0 * np.sin(2 * np.pi * np.arange(TICKS) / TICKS)
+SCAN_UM = SETPOINT_UM + 4.0 * np.sin(2 * np.pi * np.arange(TICKS) / TICKS)
 """One period of a scan: the reference of each tick, (TICKS,)."""
 
 

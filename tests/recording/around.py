@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from rtloop.recording.capture.selective import SelectiveSession
-from tests.recording.real_loop import RecordedRun, record, rows_of, schedule, scheduled
+from tests.recording.real_loop import RecordedRun, eventful_configuration, read_rows, record, schedule
 
 SECOND = 10_000
 """Ticks between two snapshots."""
@@ -21,7 +21,7 @@ TRIP, STEP = 9_027, 113_456
 
 def configuration_text() -> str:
     """Return the configuration of a run: the trip of `scheduled`, a reference that saturates for 0.4 s, a new mode."""
-    return scheduled() + schedule(
+    return eventful_configuration() + schedule(
         (STEP, 'reference = { kind = "sine", amplitude = 27.0, frequency_hz = 3.0 }'),
         (STEP + 4_000, 'reference = { kind = "sine", amplitude = 5.0, frequency_hz = 3.0 }'),
         (17 * SECOND + 5, 'mode = "feedforward"'),
@@ -44,7 +44,7 @@ class SelectiveRun(RecordedRun):
 
 def recorded_rows(folder: Path) -> np.ndarray[Any, Any]:
     """Record every tick of the same run. Returns its rows (TICKS, columns)."""
-    return rows_of(record(folder / "whole.mcap", configuration_text(), TICKS))
+    return read_rows(record(folder / "whole.mcap", configuration_text(), TICKS))
 
 
 def retained_seconds(

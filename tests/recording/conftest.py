@@ -10,7 +10,7 @@ import pytest
 from tests.recording.disk import Disk
 from tests.recording.forging import Base, record_bases
 from tests.recording.hand_made_loop import HandMadeLoop, RecorderProcess
-from tests.recording.real_loop import record, scheduled
+from tests.recording.real_loop import eventful_configuration, record
 
 EVENTFUL_TICKS = 25_000
 
@@ -24,7 +24,7 @@ def base(tmp_path_factory: pytest.TempPathFactory) -> Base:
 @pytest.fixture(scope="session")
 def eventful(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A recording of EVENTFUL_TICKS ticks with saturation, limits, modes, a trip and references; tests only read it."""
-    return record(tmp_path_factory.mktemp("eventful") / "run.mcap", scheduled(), EVENTFUL_TICKS)[0]
+    return record(tmp_path_factory.mktemp("eventful") / "run.mcap", eventful_configuration(), EVENTFUL_TICKS)[0]
 
 
 @pytest.fixture

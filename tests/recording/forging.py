@@ -25,7 +25,7 @@ from rtloop.recording.file.reader import Reader
 from rtloop.recording.file.topics import format
 from rtloop.recording.file.topics.contents import Message, split_messages
 from tests.recording.law_fields import INTEGERS, snapshot_fields
-from tests.recording.real_loop import TWO_AXES, RecordedRun, changed, schedule
+from tests.recording.real_loop import TWO_AXES, RecordedRun, changed_configuration, schedule
 
 Random = np.random.Generator
 DEPTH = 100_000
@@ -112,7 +112,7 @@ class Base(NamedTuple):
 
 def record_bases(folder: Path) -> list[Base]:
     """Record two good runs and return their parts: one axis with a pre-filter, commands and a trip; two axes."""
-    one_axis = changed(("# taps = [", "taps = ["), ("# [axis.prefilter]", "[axis.prefilter]"))
+    one_axis = changed_configuration(("# taps = [", "taps = ["), ("# [axis.prefilter]", "[axis.prefilter]"))
     entries = ((100, 'mode = "feedforward"'), (180, 'mode = "closed_loop"'),
                (300, 'reference = { kind = "sine", amplitude = 20.0, frequency_hz = 50.0 }'),
                (400, 'mode = "off"'), (450, "reset_trip = true"), (500, 'mode = "raw"'))  # fmt: skip

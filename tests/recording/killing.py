@@ -23,7 +23,7 @@ class KilledRun(NamedTuple):
     taken: int
 
 
-def kill_a_run(folder: Path, after_s: float, *options: str) -> KilledRun:
+def kill_run(folder: Path, after_s: float, *options: str) -> KilledRun:
     """Run the paper's loop, and kill supervisor, recorder and loop `after_s` after the file was opened."""
     process = start("run", PAPER, "--out", folder, *options)
     pids = process_ids(process)

@@ -31,7 +31,7 @@ def schedule(*entries: tuple[int, str]) -> str:
     return "".join(f"\n[[schedule]]\nat_tick = {tick}\n{change}\n" for tick, change in entries)
 
 
-def scheduled() -> str:
+def eventful_configuration() -> str:
     """Return the paper's configuration with limits that act, changes of mode, a trip, its reset, a new reference."""
     entries = [
         (3_000, 'mode = "feedforward"'),
@@ -43,7 +43,7 @@ def scheduled() -> str:
         (14_001, 'reference = { kind = "sine", amplitude = 20.0, frequency_hz = 5.0 }'),
         (14_001, 'mode = "closed_loop"'),
     ]
-    text = changed(
+    text = changed_configuration(
         ("# slew_v_per_s = 20000.0 ", "slew_v_per_s = 20000.0 "),
         ("command_um = 42.0", "command_um = 30.0"),
         ("position_um = 60.0", "position_um = 28.0"),
@@ -51,7 +51,7 @@ def scheduled() -> str:
     return text + schedule(*entries)
 
 
-def changed(*changes: tuple[str, str]) -> str:
+def changed_configuration(*changes: tuple[str, str]) -> str:
     """Return the paper's configuration with some text replaced; each old text must occur once."""
     text = PAPER
     for old, new in changes:
@@ -104,7 +104,7 @@ class RecordedRun:
         self, path: Path, text: str | None = None, header: Mapping[str, Any] = NO_CHANGES, *, paced: bool = True,
         **options: Any,
     ) -> None:  # fmt: skip
-        self.path, self.loop = path, RealLoop(scheduled() if text is None else text)
+        self.path, self.loop = path, RealLoop(eventful_configuration() if text is None else text)
         self.header = {**self.loop.header, **header, "paced": paced}
         self.begin(**options)
 
@@ -144,7 +144,7 @@ def record(path: Path, text: str, ticks: int, **options: float) -> list[Path]:
     return [Path(name) for name in totals["paths"]]
 
 
-def rows_of(paths: list[Path]) -> np.ndarray:
+def read_rows(paths: list[Path]) -> np.ndarray:
     """Return all rows (ticks, columns) of a recording's files."""
     from rtloop.recording.load import load
 

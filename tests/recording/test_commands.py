@@ -21,7 +21,7 @@ from rtloop.workbench.replay_text import print_replay
 from tests.command_line import answer, run
 from tests.recording.conftest import EVENTFUL_TICKS
 from tests.recording.hand_made_loop import make_rows, write_recording
-from tests.recording.real_loop import PAPER, changed, record
+from tests.recording.real_loop import PAPER, changed_configuration, record
 from tests.recording.tamper import rewrite
 from tests.recording.test_damage import INVALID_FILES
 
@@ -94,7 +94,7 @@ def test_a_difference_without_values_prints_no_values(
 
 def test_replay_with_another_law_ends_with_0(eventful: Path, tmp_path: Path):
     configuration = tmp_path / "other.toml"
-    configuration.write_text(changed(("gain = 0.016", "gain = 0.012")))
+    configuration.write_text(changed_configuration(("gain = 0.016", "gain = 0.012")))
     assert answer("replay", eventful, "--config", configuration)["signals"]["x_drive_v"]["max"] > 0.0
     assert "x_drive_v" in run("replay", eventful, "--config", configuration).stdout
     report = answer("replay", eventful, "--config", configuration, "--resimulate")

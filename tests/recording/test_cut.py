@@ -27,11 +27,11 @@ from rtloop.recording.replay.replay import replay
 from tests.command_line import answer
 from tests.command_line import run as command
 from tests.recording.hand_made_loop import make_rows, write_recording
-from tests.recording.real_loop import ROOT, RecordedRun, scheduled
+from tests.recording.real_loop import ROOT, RecordedRun, eventful_configuration
 from tests.recording.tamper import flip_byte
 
 TICKS, BURST = 16_000, 500
-TEXT = scheduled().replace("rate_hz = 10000\n", 'rate_hz = 10000\nlaws = ["pid"]\n', 1)
+TEXT = eventful_configuration().replace("rate_hz = 10000\n", 'rate_hz = 10000\nlaws = ["pid"]\n', 1)
 PID = '[axis.controller]\nkind = "pid"\nki_per_s = 150.0\nkd_s = 1e-5\nfilter_s = 2e-4\n'
 CONTROLLER = TEXT[TEXT.index("[axis.controller]") : TEXT.index("# Eq (5)")]
 LAWS_AT = {4_000: ("gain = 0.016", "gain = 0.011"), 8_000: (CONTROLLER, PID), 14_500: ("gain = 0.016", "gain = 0.013")}

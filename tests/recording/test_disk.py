@@ -26,7 +26,7 @@ from rtloop.signals import Mode
 from rtloop.supervision.recording_state import recording_state
 from tests.recording.disk import PLENTY_BYTES, Disk, find_gaps
 from tests.recording.hand_made_loop import START_UNIX_NS, HandMadeLoop, RecorderProcess, make_header, make_rows
-from tests.recording.real_loop import RecordedRun, rows_of
+from tests.recording.real_loop import RecordedRun, read_rows
 
 SECOND = 10_000
 """Ticks between two snapshots."""
@@ -307,7 +307,7 @@ def test_rotation_is_at_the_right_tick_however_far_the_loop_is_ahead(loop: HandM
         with Reader(path) as reader:
             assert next(reader.blocks())[0, 0] == reader.header["first_tick"] == next(reader.snapshots()).tick
             assert (reader.totals["complete"], reader.totals["ticks_lost"]) == (True, 0)
-    assert rows_of(totals["paths"]).tobytes() == rows.tobytes()
+    assert read_rows(totals["paths"]).tobytes() == rows.tobytes()
 
 
 def test_the_recorder_process_resumes_on_a_disk_that_was_enlarged(loop: HandMadeLoop, tmp_path: Path):
@@ -328,7 +328,7 @@ def test_the_recorder_process_resumes_on_a_disk_that_was_enlarged(loop: HandMade
             code, totals = recorder.end()
         assert (code, "No space left" in totals["error"]) == (1, True)
         require_every_tick_accounted(totals, len(rows), replayed=False)
-        logged = rows_of(totals["paths"])
+        logged = read_rows(totals["paths"])
         assert logged.tobytes() == rows[logged[:, 0].astype(int)].tobytes()
     finally:
         subprocess.run(["umount", small], check=True)

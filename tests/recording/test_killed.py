@@ -16,18 +16,18 @@ from rtloop.recording.file.topics.format import chunk_rows
 from rtloop.recording.load import load
 from rtloop.recording.replay.replay import replay
 from tests.recording.hand_made_loop import COLUMNS
-from tests.recording.killing import kill_a_run, open_shared_block, recovered_ticks
+from tests.recording.killing import kill_run, open_shared_block, recovered_ticks
 from tests.service.test_run import PAPER, finish, process_ids, run, start, wait_for_ticks
 
 
 @pytest.mark.parametrize("after_s", [0.05, 0.5])
 def test_a_killed_unpaced_run_lacks_no_more_than_the_chunks_that_wait_for_each_other(after_s: float, tmp_path: Path):
-    killed = kill_a_run(tmp_path, after_s, "--unpaced")
+    killed = kill_run(tmp_path, after_s, "--unpaced")
     assert 0 <= killed.taken - recovered_ticks(killed) <= UNPACED_CHUNKS * chunk_rows(COLUMNS)
 
 
 def test_the_next_run_recovers_the_file_of_a_killed_one(tmp_path: Path):
-    killed = kill_a_run(tmp_path, 1.5)
+    killed = kill_run(tmp_path, 1.5)
     broken = tmp_path / "broken.mcap.part"
     broken.write_bytes(b"")
     code, summary, err = run(PAPER, "--duration", "0.5", "--out", tmp_path)

@@ -14,7 +14,7 @@ from rtloop.recording.replay.replay import ReplayReport, replay
 from rtloop.signals import Flag
 from tests.recording.conftest import EVENTFUL_TICKS
 from tests.recording.hand_made_loop import RecorderProcess
-from tests.recording.real_loop import TWO_AXES, RealLoop, record, scheduled
+from tests.recording.real_loop import TWO_AXES, RealLoop, eventful_configuration, record
 from tests.service.test_run import eight_axis_text
 
 ROTATED_TICKS = 45_000
@@ -23,7 +23,7 @@ ROTATED_TICKS = 45_000
 @pytest.fixture(scope="module")
 def parts(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
     """Files of the eventful run of ROTATED_TICKS ticks, one second each."""
-    return record(tmp_path_factory.mktemp("parts") / "run.mcap", scheduled(), ROTATED_TICKS, rotate_s=1.0)
+    return record(tmp_path_factory.mktemp("parts") / "run.mcap", eventful_configuration(), ROTATED_TICKS, rotate_s=1.0)
 
 
 def replay_without_difference(paths: Path | list[Path]) -> ReplayReport:
@@ -77,7 +77,7 @@ def test_a_recovered_file_replays(eventful: Path, tmp_path: Path):
 
 def test_the_replay_continues_after_a_gap_at_the_next_snapshot(tmp_path: Path):
     """The recorder is stopped for longer than the ring holds."""
-    loop = RealLoop(scheduled())
+    loop = RealLoop(eventful_configuration())
     with RecorderProcess(loop) as recorder:  # type: ignore[arg-type]
         recorder.start(tmp_path / "run.mcap", loop.header)
         loop.run(13_500)

@@ -18,7 +18,7 @@ from rtloop.recording.replay.replay import Replay, replay
 from rtloop.recording.replay.snapshots import first_difference
 from rtloop.signals import DEADLINE, PERIODS_MISSED
 from tests.recording.conftest import EVENTFUL_TICKS
-from tests.recording.real_loop import PAPER, TWO_AXES, RealLoop, RecordedRun, rows_of
+from tests.recording.real_loop import PAPER, TWO_AXES, RealLoop, RecordedRun, read_rows
 from tests.recording.tamper import Rows, rewrite
 
 
@@ -115,7 +115,7 @@ def test_a_command_shifted_by_one_tick_is_found_at_the_right_one(shift: int, fou
 
 def test_a_rewritten_recording_without_a_change_is_identical(eventful: Path, path: Path):
     rewrite(eventful, path)
-    assert rows_of([path]).tobytes() == rows_of([eventful]).tobytes()
+    assert read_rows([path]).tobytes() == read_rows([eventful]).tobytes()
     report = replay(load(path))
     assert (report.identical, report.ticks) == (True, EVENTFUL_TICKS)
 

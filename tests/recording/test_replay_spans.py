@@ -17,7 +17,7 @@ from rtloop.recording.replay.replay import replay
 from tests.command_line import answer
 from tests.laws.test_shipped import DEPLOY
 from tests.recording.forging import TICKS, Base, pack_changed_snapshot, pack_file, take_apart
-from tests.recording.real_loop import record, scheduled
+from tests.recording.real_loop import eventful_configuration, record
 from tests.recording.tamper import flip_byte
 from tests.recording.test_verdict import change_ticks, drop_chunks, drop_snapshots, pack_with_gap, tick_chunks
 
@@ -66,7 +66,7 @@ def test_a_run_of_whole_seconds_is_replayed_in_spans(tmp_path: Path):
 @pytest.fixture(scope="module")
 def rotated(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
     """Four files of one run, each of which begins at a snapshot."""
-    return record(tmp_path_factory.mktemp("rotated") / "run.mcap", scheduled(), 35_000, rotate_s=1.0)
+    return record(tmp_path_factory.mktemp("rotated") / "run.mcap", eventful_configuration(), 35_000, rotate_s=1.0)
 
 
 @pytest.mark.parametrize("jobs", [2, 3, 7])

@@ -16,7 +16,7 @@ from rtloop.recording.file.topics.format import LAW, TICKS
 from rtloop.recording.file.writer import Writer
 from rtloop.signals import DEADLINE
 from tests.recording.hand_made_loop import COLUMNS, START_UNIX_NS, make_header, make_rows
-from tests.recording.real_loop import record, scheduled
+from tests.recording.real_loop import eventful_configuration, record
 
 CHUNKS = 7
 
@@ -43,14 +43,14 @@ def test_a_run_in_virtual_time_has_the_same_bytes_for_any_threads_chunks_that_wa
         monkeypatch.setattr(tick_packer, "_default_workers", lambda count=workers: count)
         monkeypatch.setattr(session, "UNPACED_CHUNKS", chunks)
         monkeypatch.setattr(session, "FLUSH_S", flush_s)
-        (path,) = record(tmp_path / f"{workers}-{chunks}.mcap", scheduled(), 60_000)
+        (path,) = record(tmp_path / f"{workers}-{chunks}.mcap", eventful_configuration(), 60_000)
         files.append(tick_chunk_records(path))
     assert len(files[0]) == 15
     assert all(file == files[0] for file in files)
 
 
 def test_a_snapshot_stands_before_the_chunk_of_its_tick_and_behind_the_chunk_before(tmp_path: Path):
-    (path,) = record(tmp_path / "run.mcap", scheduled(), 60_000)
+    (path,) = record(tmp_path / "run.mcap", eventful_configuration(), 60_000)
     end_ns, snapshots_ns, pending_ns = -1.0, [], []
     with Reader(path) as reader:
         for rows, messages in reader.chunks():

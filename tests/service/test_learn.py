@@ -15,11 +15,11 @@ import pytest
 from click.testing import CliRunner
 
 from rtloop.cli import main
-from tests.design.measured_loops import margins_of
+from tests.design.measured_loops import compute_margins
 from tests.faults.bench import Bench
 from tests.faults.evidence import wait_for
 from tests.service.http import answer
-from tests.service.test_response import CONFIGURATION, HELD_UM, LOOP, OMEGA, QUICK
+from tests.service.test_response import CONFIGURATION, LOOP, OMEGA, QUICK_REQUEST, SETPOINT_UM
 
 MODEL = f"""
 [axis.model]
@@ -29,7 +29,7 @@ denominator = [[1.0, {2 * LOOP.damping * OMEGA!r}, {OMEGA**2!r}]]
 """
 """Model of the plant without a delay; the loop's promise includes the delay of the rig's driver."""
 TICKS = 100
-SCAN_UM = HELD_UM + 4.0 * np.sin(2 * np.pi * np.arange(TICKS) / TICKS)
+SCAN_UM = SETPOINT_UM + 4.0 * np.sin(2 * np.pi * np.arange(TICKS) / TICKS)
 LONG_CYCLES = 50
 JUDGED_TICKS = 5000
 """Ticks of learning after which the first table has been evaluated, and further tables are tried."""
@@ -48,8 +48,8 @@ def running(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
 
 
 def hold_setpoint(bench: Bench) -> None:
-    """Set the reference to the constant HELD_UM."""
-    bench.client.post("/setpoint", {"axis": "x", "value": HELD_UM})
+    """Set the reference to the constant SETPOINT_UM."""
+    bench.client.post("/setpoint", {"axis": "x", "value": SETPOINT_UM})
 
 
 def test_a_scan_is_learned_and_goes_on(running: Bench, tmp_path: Path):
@@ -85,13 +85,13 @@ def test_what_cannot_be_learned_is_refused_with_the_reason(running: Bench, chang
     code, response = answer(running, "POST", "/learn", REQUEST | change)
     assert code == 422
     assert message in json.dumps(response, ensure_ascii=False)
-    assert running.client.get("/status")["axes"]["x"]["reference_um"] == pytest.approx(HELD_UM)
+    assert running.client.get("/status")["axes"]["x"]["reference_um"] == pytest.approx(SETPOINT_UM)
 
 
 def test_the_rigs_delay_is_in_the_loop_that_is_promised(running: Bench):
     hold_setpoint(running)
-    measurement = running.client.post("/response", QUICK, 60.0)
-    true = margins_of(LOOP.open, measurement["from_hz"], measurement["to_hz"])
+    measurement = running.client.post("/response", QUICK_REQUEST, 60.0)
+    true = compute_margins(LOOP.open, measurement["from_hz"], measurement["to_hz"])
     promised = measurement["model"]["margins"]
     assert promised["gain_margin"] == pytest.approx(true["gain_margin"], rel=1e-3)
     assert promised["phase_margin_deg"] == pytest.approx(true["phase_margin_deg"], abs=0.05)
@@ -103,12 +103,12 @@ def reference_um(bench: Bench) -> float:
 
 
 def assert_reference_returns(bench: Bench) -> None:
-    """Check that the reference returns to HELD_UM within RETURN_S and stays, and that the measurement has ended."""
-    wait_for(lambda: reference_um(bench) == HELD_UM, "the held reference", RETURN_S)
+    """Check that the reference returns to SETPOINT_UM within RETURN_S and stays, and that the measurement has ended."""
+    wait_for(lambda: reference_um(bench) == SETPOINT_UM, "the held reference", RETURN_S)
     references_um, end = set[float](), bench.ticks + 4 * TICKS
     while bench.ticks < end:
         references_um.add(reference_um(bench))
-    assert references_um == {HELD_UM}
+    assert references_um == {SETPOINT_UM}
     too_long = REQUEST | {"samples": [5.0] * 100_000, "cycles": 50}
     wait_for(lambda: answer(bench, "POST", "/learn", too_long)[0] == 422, "the end of the measurement", RETURN_S)
 
@@ -139,7 +139,7 @@ def cut_connection(bench: Bench) -> None:
 
 def await_tables(bench: Bench) -> None:
     """Wait until a table is played, and then until JUDGED_TICKS ticks have passed."""
-    wait_for(lambda: reference_um(bench) != HELD_UM, "a table that is played")
+    wait_for(lambda: reference_um(bench) != SETPOINT_UM, "a table that is played")
     tick = bench.ticks
     wait_for(lambda: bench.ticks > tick + JUDGED_TICKS, "tables that were judged")
 

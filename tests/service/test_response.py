@@ -20,7 +20,7 @@ from prometheus_client.parser import text_string_to_metric_families
 
 import rtloop
 from rtloop.cli import main
-from tests.design.measured_loops import RATE_HZ, TrueLoop, margins_of
+from tests.design.measured_loops import RATE_HZ, TrueLoop, compute_margins
 from tests.faults.bench import Bench
 from tests.faults.configuration import ROOT
 from tests.faults.evidence import wait_for
@@ -30,8 +30,8 @@ DASHBOARD = ROOT / "deploy" / "grafana" / "rtloop.json"
 METRIC = re.compile(r"\brtloop_\w+")
 LOOP = TrueLoop(800.0, 0.02, 1, 100.0, kp=0.01)
 OMEGA = 2 * np.pi * LOOP.hz
-HELD_UM = 5.0
-QUICK = {"axis": "x", "duration_s": 1.0, "period_s": 0.25, "near_hz": 800.0}
+SETPOINT_UM = 5.0
+QUICK_REQUEST = {"axis": "x", "duration_s": 1.0, "period_s": 0.25, "near_hz": 800.0}
 CONFIGURATION = f"""
 [loop]
 rate_hz = {RATE_HZ:g}
@@ -64,7 +64,7 @@ ki_per_s = {LOOP.ki_per_s}
 position_um = 30.0
 [axis.reference]
 kind = "hold"
-value = {HELD_UM}
+value = {SETPOINT_UM}
 [recording]
 folder = "FOLDER/recordings"
 """
@@ -123,7 +123,7 @@ def command_result(bench: Bench) -> CommandResult:
 
 def test_margins_and_motion_are_those_of_the_rig(bench: Bench, command_result: CommandResult) -> None:
     measurement = command_result.measurement
-    true = margins_of(LOOP.open, measurement["from_hz"], measurement["to_hz"])
+    true = compute_margins(LOOP.open, measurement["from_hz"], measurement["to_hz"])
     for name in ("gain_margin", "phase_margin_deg", "modulus_margin"):
         margin = measurement["margins"][name]
         assert 0.0 < margin["std"] < 0.02 * true[name], margin
@@ -132,9 +132,9 @@ def test_margins_and_motion_are_those_of_the_rig(bench: Bench, command_result: C
         assert error < 8.0 * margin["std"], margin  # from four periods: Student's t exceeds 5 too often
     assert measurement["resonance"]["hz"] == pytest.approx(LOOP.hz, rel=0.002)
     assert measurement["model"] is None
-    assert reference_um(bench) == HELD_UM
+    assert reference_um(bench) == SETPOINT_UM
     position_um = await_recording(bench, bench.status()["tick"])["x_true_position_um"]
-    assert 0.1 < np.abs(position_um[round(0.5 * RATE_HZ) :] - HELD_UM).max() <= 0.6
+    assert 0.1 < np.abs(position_um[round(0.5 * RATE_HZ) :] - SETPOINT_UM).max() <= 0.6
 
 
 def test_figures_are_told_and_the_recording_gives_the_same(bench: Bench, command_result: CommandResult) -> None:
@@ -238,12 +238,12 @@ def test_the_gain_at_rest_is_measured_and_told(bench: Bench) -> None:
     """The rig's gain at rest is 1: the inverse fits the actuator, and D(0) = 1."""
     request = {"axis": "x", "duration_s": 1.0, "resonance_only": True, "near_hz": 800.0, "gain_um": 4.0}
     gain = bench.client.post("/response", request, 60.0)["gain"]
-    assert (gain["from_um"], gain["to_um"]) == (HELD_UM, HELD_UM - 4.0)
+    assert (gain["from_um"], gain["to_um"]) == (SETPOINT_UM, SETPOINT_UM - 4.0)
     assert 0.0 < gain["std"] < 0.002
     assert abs(gain["value"] - 1.0) < 4.0 * gain["std"]
     assert bench.status()["measured"]["x"]["gain"] == gain
     assert f'rtloop_gain{{axis="x"}} {gain["value"]!r}' in bench.client.get("/metrics")
-    assert reference_um(bench) == HELD_UM
+    assert reference_um(bench) == SETPOINT_UM
 
 
 def test_a_resonance_alone_is_measured_as_well(bench: Bench) -> None:
@@ -272,23 +272,23 @@ def test_a_resonance_alone_is_measured_as_well(bench: Bench) -> None:
     ],
 )
 def test_what_makes_no_sense_is_refused(bench: Bench, change: dict[str, Any], expected_code: int, message: str) -> None:
-    code, text = answer(bench, "POST", "/response", {**QUICK, **change})
+    code, text = answer(bench, "POST", "/response", {**QUICK_REQUEST, **change})
     assert (code, message in text["error"]) == (expected_code, True), text
-    assert reference_um(bench) == HELD_UM
+    assert reference_um(bench) == SETPOINT_UM
 
 
 def test_only_a_held_reference_in_closed_loop_is_measured(bench: Bench) -> None:
     wave = {"kind": "sine", "amplitude": 1.0, "frequency_hz": 1.0}
     bench.client.post("/reference", {"axis": "x", "reference": wave})
-    code, text = answer(bench, "POST", "/response", QUICK)
+    code, text = answer(bench, "POST", "/response", QUICK_REQUEST)
     assert (code, "kind is sine; allowed: hold" in text["error"]) == (409, True), text
-    bench.client.post("/setpoint", {"axis": "x", "value": HELD_UM})
+    bench.client.post("/setpoint", {"axis": "x", "value": SETPOINT_UM})
     bench.client.post("/mode", {"mode": "feedforward"})
-    code, text = answer(bench, "POST", "/response", QUICK)
+    code, text = answer(bench, "POST", "/response", QUICK_REQUEST)
     assert (code, "the mode is not closed_loop" in text["error"]) == (409, True), text
     bench.client.post("/mode", {"mode": "closed_loop"})
     bench.client.post("/stop")
-    code, text = answer(bench, "POST", "/response", QUICK)
+    code, text = answer(bench, "POST", "/response", QUICK_REQUEST)
     assert (code, "needs a running loop" in text["error"]) == (409, True), text
     bench.client.post("/start")
     bench.await_state("running")
@@ -297,7 +297,7 @@ def test_only_a_held_reference_in_closed_loop_is_measured(bench: Bench) -> None:
 def test_out_of_raw_mode_the_measurement_is_about_the_position_that_is_held(bench: Bench) -> None:
     """The setpoint of 1 V has become the held position of 4.3 µm."""
     bench.client.post("/mode", {"mode": "raw"})
-    code, text = answer(bench, "POST", "/response", QUICK)
+    code, text = answer(bench, "POST", "/response", QUICK_REQUEST)
     assert (code, "the mode is not closed_loop" in text["error"]) == (409, True), text
     bench.client.post("/setpoint", {"axis": "x", "value": 1.0})
     tick = bench.ticks
@@ -305,25 +305,25 @@ def test_out_of_raw_mode_the_measurement_is_about_the_position_that_is_held(benc
     bench.client.post("/mode", {"mode": "closed_loop"})
     held_um = reference_um(bench)
     assert held_um == pytest.approx(4.3, abs=0.5)
-    code, measurement = answer(bench, "POST", "/response", QUICK)
+    code, measurement = answer(bench, "POST", "/response", QUICK_REQUEST)
     assert code == 200, measurement
     assert reference_um(bench) == held_um
-    bench.client.post("/setpoint", {"axis": "x", "value": HELD_UM})
+    bench.client.post("/setpoint", {"axis": "x", "value": SETPOINT_UM})
 
 
 def test_whoever_sets_a_reference_meanwhile_ends_the_measurement(bench: Bench) -> None:
     """The measurement ends with an error, and leaves the reference of the other client as it is."""
     answers: list[tuple[int, Any]] = []
-    measurement = threading.Thread(target=lambda: answers.append(answer(bench, "POST", "/response", QUICK)))
+    measurement = threading.Thread(target=lambda: answers.append(answer(bench, "POST", "/response", QUICK_REQUEST)))
     measurement.start()
-    wait_for(lambda: reference_um(bench) != HELD_UM, "an excitation")
-    assert answer(bench, "POST", "/response", QUICK)[0] == 503
+    wait_for(lambda: reference_um(bench) != SETPOINT_UM, "an excitation")
+    assert answer(bench, "POST", "/response", QUICK_REQUEST)[0] == 503
     bench.client.post("/setpoint", {"axis": "x", "value": 4.0})
     measurement.join()
     ((code, text),) = answers
     assert (code, "another client has set a reference" in text["error"]) == (409, True), text
     assert reference_um(bench) == 4.0
-    bench.client.post("/setpoint", {"axis": "x", "value": HELD_UM})
+    bench.client.post("/setpoint", {"axis": "x", "value": SETPOINT_UM})
 
 
 def test_after_ctrl_c_what_was_held_is_held_again(bench: Bench) -> None:
@@ -340,18 +340,18 @@ def test_after_ctrl_c_what_was_held_is_held_again(bench: Bench) -> None:
         "30",
     ]
     client = subprocess.Popen(command, env=bench.environment, stderr=subprocess.PIPE, text=True)
-    wait_for(lambda: reference_um(bench) != HELD_UM, "an excitation")
+    wait_for(lambda: reference_um(bench) != SETPOINT_UM, "an excitation")
     client.send_signal(signal.SIGINT)
     _, message = client.communicate(timeout=60)
     assert (client.returncode, "holds 5 µm as before" in message) == (1, True), message
-    assert reference_um(bench) == HELD_UM
+    assert reference_um(bench) == SETPOINT_UM
 
 
 def test_a_loop_that_trips_is_left_to_its_interlocks(bench: Bench) -> None:
     answers: list[tuple[int, Any]] = []
-    thread = threading.Thread(target=lambda: answers.append(answer(bench, "POST", "/response", QUICK)))
+    thread = threading.Thread(target=lambda: answers.append(answer(bench, "POST", "/response", QUICK_REQUEST)))
     thread.start()
-    wait_for(lambda: reference_um(bench) != HELD_UM, "an excitation")
+    wait_for(lambda: reference_um(bench) != SETPOINT_UM, "an excitation")
     bench.client.post("/tune", {"axis": "x", "section": "interlocks", "values": {"position_um": 3.0}})
     thread.join()
     ((code, text),) = answers
@@ -365,9 +365,9 @@ def test_a_loop_that_trips_is_left_to_its_interlocks(bench: Bench) -> None:
 def test_a_service_that_ends_says_so_to_who_still_measures(bench: Bench) -> None:
     """End the shared service. This test must be the last of the file."""
     answers: list[tuple[int, Any]] = []
-    thread = threading.Thread(target=lambda: answers.append(answer(bench, "POST", "/response", QUICK)))
+    thread = threading.Thread(target=lambda: answers.append(answer(bench, "POST", "/response", QUICK_REQUEST)))
     thread.start()
-    wait_for(lambda: reference_um(bench) != HELD_UM, "an excitation")
+    wait_for(lambda: reference_um(bench) != SETPOINT_UM, "an excitation")
     assert bench.stop() == 0
     thread.join()
     assert answers == [(503, {"error": "response: the service is ending and takes no more requests"})]

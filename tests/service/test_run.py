@@ -17,7 +17,7 @@ import rtloop
 from rtloop.errors import UnavailableError
 from rtloop.recording.replay.replay import replay
 from rtloop.supervision import supervisor
-from tests.recording.real_loop import record, rows_of
+from tests.recording.real_loop import read_rows, record
 
 ROOT = Path(__file__).resolve().parents[2]
 PAPER = ROOT / "deploy" / "paper.toml"
@@ -90,11 +90,11 @@ def test_two_unpaced_runs_are_equal_in_bytes_and_another_seed_is_not(tmp_path: P
         code, summary, _ = run(PAPER, "--duration", "1", "--unpaced", "--out", tmp_path)
         assert code == 0
         assert summary["lateness_us"] is None
-        records.append(rows_of([Path(summary["recording"])]).tobytes())
+        records.append(read_rows([Path(summary["recording"])]).tobytes())
     text = PAPER.read_text()
     for seed in (1, 2):
         files = record(tmp_path / f"{seed}.mcap", text.replace("seed = 1 ", f"seed = {seed} "), 10_000)
-        records.append(rows_of(files).tobytes())
+        records.append(read_rows(files).tobytes())
     assert records[0] == records[1] == records[2]
     assert records[0] != records[3]
 

@@ -25,7 +25,7 @@ from rtloop.foundation.native import cache
 from rtloop.recording.capture.session import Options, Session
 from rtloop.supervision import supervisor as supervisor_module
 from rtloop.supervision.supervisor import Supervisor
-from tests.recording.real_loop import PAPER, RealLoop, changed
+from tests.recording.real_loop import PAPER, RealLoop, changed_configuration
 from tests.service.test_python_driver import DRIVER, install
 from tests.service.test_run import ROOT, start
 
@@ -57,7 +57,7 @@ def command_exit_codes(path: Path) -> dict[str, int]:
 
 
 @pytest.mark.parametrize("finished", [True, False], ids=["finished", "left by a killed recorder"])
-@pytest.mark.parametrize("text", [PAPER, changed(TRIPPING)], ids=["driving", "tripped"])
+@pytest.mark.parametrize("text", [PAPER, changed_configuration(TRIPPING)], ids=["driving", "tripped"])
 @pytest.mark.parametrize("ticks", [0, 1, 2])
 def test_a_recording_of_hardly_any_ticks(tmp_path: Path, ticks: int, text: str, finished: bool) -> None:
     loop, path = RealLoop(text), tmp_path / "short.mcap"

@@ -50,7 +50,7 @@ def design_and_run(rig: ModalRig, folder: Path) -> tuple[bool, str]:
     """Return whether the design ran as promised or was refused with code 1, and a line of text."""
     rig_text = f"{rig.hz.size} modes from {rig.hz[0]:4.0f} Hz, ζ ≥ {rig.damping.min():.4f}, delay {rig.delay_ticks}:"
     try:
-        chain, designed = designed_for(rig, folder)
+        chain, designed = design_rig(rig, folder)
     except RtloopError as error:
         return error.exit_code == 1, f"{rig_text} refused, {error.exit_code}: {error}"
     running = prepare(load(designed)).checks[0].running
@@ -65,7 +65,7 @@ def design_and_run(rig: ModalRig, folder: Path) -> tuple[bool, str]:
     return not trips and not missed, text + (f"; tripped: {', '.join(trips)}" if trips else "")
 
 
-def designed_for(rig: ModalRig, folder: Path, order: int | None = None) -> tuple[Chain, Path]:
+def design_rig(rig: ModalRig, folder: Path, order: int | None = None) -> tuple[Chain, Path]:
     """Record a rig twice and design for it as `design auto` does. Return the chain and the path of the configuration.
 
     Raises RtloopError.

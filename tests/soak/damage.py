@@ -20,7 +20,7 @@ from rtloop.recording.file.topics.format import TICKS
 from rtloop.recording.load import load
 from rtloop.recording.replay.replay import replay
 from rtloop.recording.views.summary import summarise
-from tests.recording.real_loop import record, scheduled
+from tests.recording.real_loop import eventful_configuration, record
 
 CHUNK_HEAD_BYTES = 49
 EXPORT_EVERY = 20
@@ -125,7 +125,7 @@ def sensitive_offsets(path: Path) -> np.ndarray[Any, Any]:
 def judge_damaged_files(count: int, random: np.random.Generator, show_progress: Callable[[str], None]) -> None:
     """Judge `count` truncated copies and `count` copies with a changed byte, half of these outside tick data."""
     with tempfile.TemporaryDirectory() as folder:
-        path = record(Path(folder) / "whole.mcap", scheduled(), 25_000)[0]
+        path = record(Path(folder) / "whole.mcap", eventful_configuration(), 25_000)[0]
         judge, intact, offsets = Judge(path), path.read_bytes(), sensitive_offsets(path)
         copy = Path(folder) / "run.mcap"
         for kind, damage in (

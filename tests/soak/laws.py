@@ -27,7 +27,7 @@ from tests.laws.changing import (
     LawChanges,
     Steps,
     change_at_random,
-    steps_of,
+    drive_steps,
 )
 from tests.soak.guarded_process import guard_records, guarded_count, overwritten_bytes
 
@@ -48,7 +48,7 @@ def steps_alone(seed: int) -> Steps:
     """Return the largest steps of the demand under C(z) alone, changed as often, without another law."""
     with tempfile.TemporaryDirectory(prefix="rtloop-laws-") as name:
         _, path, _ = record_changes(Path(name), {"transfer": CONTROLLERS["transfer"]}, seed)
-        return steps_of(rtloop.load(path))
+        return drive_steps(rtloop.load(path))
 
 
 def cut_and_recover(path: Path, random: Random) -> Path:
@@ -66,7 +66,7 @@ def check_law(first: str, seed: int, alone: Steps) -> None:
         (Path(name) / "pair.py").write_text(PAIR, encoding="utf-8")
         changes, path, part_paths = record_changes(Path(name), sections, seed)
         recording = rtloop.load(path)
-        steps = steps_of(recording)
+        steps = drive_steps(recording)
         trips = [event["what"] for event in recording.events if event["kind"] == "tripped"]
         kinds = {
             "one file": path,

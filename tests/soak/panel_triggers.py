@@ -73,7 +73,7 @@ class SweepCollector:
         """Do nothing: the service has only one run."""
 
 
-def caught(folder: Path, pulses: int, seed: int = 1) -> dict[str, TriggerCounts]:
+def play_pulses(folder: Path, pulses: int, seed: int = 1) -> dict[str, TriggerCounts]:
     """Play `pulses` pulses; return the counts by kind of trigger."""
     random = np.random.default_rng(seed)
     change = ('kind = "sine"\namplitude = 8.0\noffset = 20.0\nfrequency_hz = 5.0', f'kind = "hold"\nvalue = {BASE_UM}')
@@ -132,7 +132,7 @@ def main() -> int:
     parser.add_argument("--pulses", type=int, default=PULSES)
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
-        counts = caught(Path(folder), options.pulses)
+        counts = play_pulses(Path(folder), options.pulses)
     for name, count in counts.items():
         print(f"{name}: {count.pulses} pulses of one tick, {count.missed} missed, {count.made_up} triggers "
               f"without a pulse, placed within {count.furthest_ticks} ticks; "

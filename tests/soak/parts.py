@@ -55,9 +55,9 @@ def main() -> None:
     print(" rig  files  noise nm  reported µm  known µm  ratio  true ratio  terms")
     ratios, true_ratios, refused = [], [], 0
     for seed in range(options.first, options.first + options.draws):
-        rig = drawn(seed)
+        rig = random_rig(seed)
         try:
-            fit, known_fit = both(rig)
+            fit, known_fit = fit_unknown_and_known_memory(rig)
         except UnsuitableData as reason:
             refused += 1
             print(f"{seed:4}{len(rig.drives_v):7}{1e3 * rig.noise_um:10.0f}  refused: {reason}", flush=True)
@@ -79,7 +79,7 @@ def main() -> None:
     sys.exit(1 if excess_count else 0)
 
 
-def drawn(seed: int) -> Rig:
+def random_rig(seed: int) -> Rig:
     """Return a random rig: weights of eq (4) ± 20 %, parts of a loop, 10 to 100 nm of noise, ±0.5 µm of drift."""
     random = np.random.default_rng(seed)
     weights = np.array(NOMINAL_WEIGHTS_UM_PER_V) * random.uniform(0.8, 1.2, len(NOMINAL_WEIGHTS_UM_PER_V))
@@ -90,7 +90,7 @@ def drawn(seed: int) -> Rig:
         angle = random.uniform(0, 2 * np.pi) + random.uniform(0.7, 1.0) * np.linspace(0, 2 * np.pi, SAMPLES)
         drive_v = centre_v + amplitude_v * np.sin(angle)
         past_v = np.array([0.0, *random.uniform(-10, 10, random.integers(0, 6))])
-        motion_um = np.array([state @ weights for state in stepped(np.append(past_v, drive_v))[past_v.size :]])
+        motion_um = np.array([state @ weights for state in play_states(np.append(past_v, drive_v))[past_v.size :]])
         drift_um = random.uniform(-0.5, 0.5) * np.linspace(0, 1, SAMPLES)
         rig.past_v.append(past_v)
         rig.drives_v.append(drive_v)
@@ -98,7 +98,7 @@ def drawn(seed: int) -> Rig:
     return rig
 
 
-def both(rig: Rig) -> tuple[PartsFit, PartsFit]:
+def fit_unknown_and_known_memory(rig: Rig) -> tuple[PartsFit, PartsFit]:
     """Return the fit with unknown memory, and the fit with known memory.
 
     The latter has the same plays, and further ones as dense, up to the largest play that can move.
@@ -123,13 +123,13 @@ def true_um(fit: PartsFit, rig: Rig, stroke_v: float) -> float:
     middle_v = 0.5 * (max(u.max() for u in rig.drives_v) + min(u.min() for u in rig.drives_v))
     sizes = np.interp(np.arange(1200), [0, 600, 1200], [1, 1, 0.3])
     loops_v = middle_v + 0.5 * stroke_v * sizes * np.sin(2 * np.pi * np.arange(1200) / 300)
-    truth_um = stepped(loops_v, PLAYS_V, middle_v - PLAYS_V) @ rig.weights
+    truth_um = play_states(loops_v, PLAYS_V, middle_v - PLAYS_V) @ rig.weights
     model = fit.hysteresis.model
-    error_um = (stepped(loops_v, model.thresholds, middle_v - model.thresholds) @ model.weights - truth_um)[300:]
+    error_um = (play_states(loops_v, model.thresholds, middle_v - model.thresholds) @ model.weights - truth_um)[300:]
     return float(np.std(error_um))
 
 
-def stepped(drive: Array, thresholds: Array = PLAYS_V, start: Array | float = 0.0) -> Array:
+def play_states(drive: Array, thresholds: Array = PLAYS_V, start: Array | float = 0.0) -> Array:
     """Return the states of plays (V), (samples, plays), computed sample by sample from the state `start`."""
     state, states = np.broadcast_to(np.asarray(start, float), thresholds.shape), []
     for u in drive:

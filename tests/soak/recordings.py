@@ -18,8 +18,8 @@ import numpy as np
 
 from rtloop.recording.file.topics.format import chunk_rows
 from tests.recording.hand_made_loop import COLUMNS
-from tests.recording.killing import kill_a_run, recovered_ticks
-from tests.recording.real_loop import ROOT, TWO_AXES, record, scheduled
+from tests.recording.killing import kill_run, recovered_ticks
+from tests.recording.real_loop import ROOT, TWO_AXES, eventful_configuration, record
 from tests.soak.damage import judge_damaged_files
 
 LONGEST_LIFE_S = 1.5
@@ -34,7 +34,7 @@ def check_killed_runs(count: int, random: np.random.Generator) -> None:
     lags, unwritten, ticks = [], [], []
     for number in range(count):
         with tempfile.TemporaryDirectory() as folder:
-            killed = kill_a_run(Path(folder), random.uniform(0.0, LONGEST_LIFE_S), "--unpaced")
+            killed = kill_run(Path(folder), random.uniform(0.0, LONGEST_LIFE_S), "--unpaced")
             ticks.append(recovered_ticks(killed))
         lags.append(killed.executed - killed.taken)
         unwritten.append(killed.taken - ticks[-1])
@@ -85,7 +85,10 @@ def _show_progress(text: str) -> None:
 
 def check_other_processors(folder: Path) -> None:
     """Check that recordings by code for this processor replay identical by code compiled for other processors."""
-    paths = [record(folder / "one.mcap", scheduled(), 60_000)[0], record(folder / "two.mcap", TWO_AXES, 60_000)[0]]
+    paths = [
+        record(folder / "one.mcap", eventful_configuration(), 60_000)[0],
+        record(folder / "two.mcap", TWO_AXES, 60_000)[0],
+    ]
     for processor in PROCESSORS:
         environment = os.environ | {"NUMBA_CPU_NAME": processor, "NUMBA_CPU_FEATURES": ""}
         for path in paths:

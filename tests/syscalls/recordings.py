@@ -25,7 +25,7 @@ from rtloop.recording.file.topics import format
 from rtloop.recording.load import load
 from rtloop.recording.replay.replay import replay
 from rtloop.recording.views.summary import summarise
-from tests.recording.real_loop import RealLoop, scheduled
+from tests.recording.real_loop import RealLoop, eventful_configuration
 
 TICKS, SNAPSHOT_TICKS, CHUNK_BYTES = 640, 160, 1 << 14
 MAGIC = b"\x89MCAP0\r\n"
@@ -47,7 +47,9 @@ def small_chunks() -> Iterator[None]:
 @cache
 def executed_loop() -> RealLoop:
     """Return a loop that has run TICKS ticks; each recorder gets a copy of its shared block."""
-    loop = RealLoop(scheduled().replace("at_tick = 3000", "at_tick = 200").replace("at_tick = 5000", "at_tick = 400"))
+    loop = RealLoop(
+        eventful_configuration().replace("at_tick = 3000", "at_tick = 200").replace("at_tick = 5000", "at_tick = 400")
+    )
     loop.take_snapshots_every(SNAPSHOT_TICKS)
     loop.run(TICKS)
     return loop

@@ -26,7 +26,7 @@ from rtloop.recording.views.summary import summarise
 from rtloop.supervision.supervisor import RunResult as SupervisedRun
 from rtloop.workbench.run_result import RunResult
 from rtloop.workbench.step_figures import specification_rows
-from tests.recording.real_loop import changed, record
+from tests.recording.real_loop import changed_configuration, record
 from tests.recording.tamper import rewrite
 from tests.workbench.conftest import DURATION_S, PAPER
 
@@ -207,7 +207,7 @@ def test_a_part_of_a_recording_is_refused_where_the_whole_is_needed(paper_run: R
 
 def test_a_tripped_run_is_a_result_and_no_exception(tmp_path: Path):
     """The result is of a loop that was recorded in this process."""
-    text = changed(("position_um = 60.0", "position_um = 5.0"))
+    text = changed_configuration(("position_um = 60.0", "position_um = 5.0"))
     path, *_ = record(tmp_path / "run.mcap", text, 3_000)
     supervised = SupervisedRun([path], "done", {"complete": True}, [], None, 0)
     prepared = prepare(parse(text, "run", PAPER.parent, "run"))

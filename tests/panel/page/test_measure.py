@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 
 from rtloop.errors import RtloopError
-from tests.design.measured_loops import margins_of
+from tests.design.measured_loops import compute_margins
 from tests.faults.bench import Bench
 from tests.faults.evidence import wait_for
 from tests.panel.measurement_rig import MODEL_HZ, SCAN_UM, make_configuration
 from tests.panel.page.browser import TIMEOUT_S, await_text, chromium_path, open_panel, start_panel
-from tests.service.test_response import HELD_UM, LOOP
+from tests.service.test_response import LOOP, SETPOINT_UM
 
 COUNT_COLOURS = """(at) => {
   const canvas = document.querySelector(at);
@@ -94,7 +94,7 @@ def test_margins_are_shown_with_their_uncertainty_beside_the_models(view: Any, r
     await_text(view, "#measure-lamp", "axis x is measured")
     await_result(view, "#measured-margins:visible")
     await_text(view, "#measure-done", "axis x holds its earlier setpoint again")
-    true = margins_of(LOOP.open, 4.0, 4500.0)
+    true = compute_margins(LOOP.open, 4.0, 4500.0)
     measured, spread, model = cells(view, "gain margin")
     true_db = 20 * np.log10(true["gain_margin"])
     assert abs(parse_number(measured) - true_db) < 5 * parse_number(spread) + 0.005
@@ -105,7 +105,7 @@ def test_margins_are_shown_with_their_uncertainty_beside_the_models(view: Any, r
     assert parse_number(view.inner_text("#measured-figures dd")) == pytest.approx(LOOP.hz, rel=0.002)
     for plot in ("#measured-loop", "#measured-sensitivity"):
         assert view.evaluate(COUNT_COLOURS, f"{plot} canvas") > 10
-    assert reference_um(rig) == HELD_UM
+    assert reference_um(rig) == SETPOINT_UM
 
 
 def test_taps_are_swapped_after_consent_alone(view: Any, rig: Bench) -> None:
@@ -128,24 +128,24 @@ def test_a_scan_is_learned_and_plays_after_consent_alone(view: Any, rig: Bench, 
     view.click("#measure-decline")
     await_text(view, "#measure-done", "Nothing was changed")
     assert view.is_hidden("#measure-consent")
-    assert reference_um(rig) == HELD_UM
+    assert reference_um(rig) == SETPOINT_UM
     begin(view, "Learn", cycles="3")
     await_text(view, "#measure-lamp", r"cycle \d of 4 is measured: rms error")
     await_result(view, "#measure-consent:visible")
-    assert reference_um(rig) == HELD_UM
+    assert reference_um(rig) == SETPOINT_UM
     errors = [parse_number(text) for text in view.locator("#learned-cycles td:nth-of-type(1)").all_inner_texts()]
     assert min(errors) < errors[0] / 5
     view.click("#measure-agree")
     await_text(view, "#measure-done", "plays from tick")
-    wait_for(lambda: abs(reference_um(rig) - HELD_UM) > 1.0, "the table that plays")
+    wait_for(lambda: abs(reference_um(rig) - SETPOINT_UM) > 1.0, "the table that plays")
     await_text(
         view, "#measure-lamp", "not ready: axis x has no constant setpoint .100 samples, repeated.; set one first"
     )
     assert view.is_disabled("#measure-start")
     with pytest.raises(RtloopError, match="kind is table; allowed: hold"):
         rig.client.post("/response?as=ada", {"axis": "x", "amplitude_um": 0.5, "duration_s": 1.0})
-    rig.client.post("/setpoint?as=ada", {"axis": "x", "value": HELD_UM})
-    wait_for(lambda: reference_um(rig) == HELD_UM, "the setpoint after the table")
+    rig.client.post("/setpoint?as=ada", {"axis": "x", "value": SETPOINT_UM})
+    wait_for(lambda: reference_um(rig) == SETPOINT_UM, "the setpoint after the table")
 
 
 def test_refusals_are_shown_and_cancelling_or_leaving_ends_a_measurement(view: Any, rig: Bench) -> None:
@@ -159,10 +159,10 @@ def test_refusals_are_shown_and_cancelling_or_leaving_ends_a_measurement(view: A
     await_text(view, "#measure-done", "Cancelled: axis x returns to its earlier setpoint")
     await_text(view, "#measure-lamp", "ready")
     wait_for(lambda: rig.status()["measuring"] is None, "the end of the measurement")
-    assert reference_um(rig) == HELD_UM
+    assert reference_um(rig) == SETPOINT_UM
 
     begin(view, "Response", duration="30")
     await_text(view, "#measure-lamp", "axis x is measured")
     view.reload()
     wait_for(lambda: rig.status()["measuring"] is None, "the end of the measurement")
-    assert reference_um(rig) == HELD_UM
+    assert reference_um(rig) == SETPOINT_UM

@@ -12,12 +12,12 @@ import numpy as np
 import pytest
 
 from rtloop.client import Client
-from tests.design.measured_loops import margins_of
+from tests.design.measured_loops import compute_margins
 from tests.faults.bench import Bench
 from tests.faults.evidence import wait_for
 from tests.panel.measurement_rig import MODEL_HZ, SCAN_UM, TICKS, make_configuration
 from tests.panel.web.browser import Browser
-from tests.service.test_response import HELD_UM, LOOP, QUICK
+from tests.service.test_response import LOOP, QUICK_REQUEST, SETPOINT_UM
 
 CANCEL_TIMEOUT_S = 10.0
 """Time in which a measurement must end after its page has disconnected."""
@@ -64,9 +64,9 @@ def swap_body(proposal: dict[str, Any]) -> dict[str, Any]:
 
 
 def test_measured_margins_agree_with_the_rig(browser: Browser, bench: Bench):
-    status, result = browser.json("POST", "/api/response?as=ada", QUICK)
+    status, result = browser.json("POST", "/api/response?as=ada", QUICK_REQUEST)
     assert status == 200, result
-    true = margins_of(LOOP.open, result["from_hz"], result["to_hz"])
+    true = compute_margins(LOOP.open, result["from_hz"], result["to_hz"])
     for name in ("gain_margin", "phase_margin_deg", "modulus_margin"):
         margin = result["margins"][name]
         # The spread comes from three periods: Student's t with 4 degrees of freedom exceeds 10 in 6 of 10,000 cases.
@@ -79,7 +79,7 @@ def test_measured_margins_agree_with_the_rig(browser: Browser, bench: Bench):
     assert np.mean(is_far) < 0.01
     model = np.array(curves["model_loop"]) @ (1, 1j)
     np.testing.assert_allclose(np.array(curves["model_sensitivity"]) @ (1, 1j), 1 / (1 + model), rtol=1e-9)
-    assert reference_um(bench) == HELD_UM
+    assert reference_um(bench) == SETPOINT_UM
 
 
 def test_learning_shows_its_progress_and_keeps_no_table_without_consent(browser: Browser, bench: Bench):
@@ -98,11 +98,11 @@ def test_learning_shows_its_progress_and_keeps_no_table_without_consent(browser:
     assert len(progress[-1]["rms_um"]) >= 2
     assert min(errors) < errors[0] / 20
     assert bench.status()["measuring"] is None
-    assert reference_um(bench) == HELD_UM
+    assert reference_um(bench) == SETPOINT_UM
     table = {"axis": "x", "samples": result["reference_um"], "command_um": result["command_um"], "repeat": True}
     assert browser.json("POST", "/api/waveform?as=ada", table)[0] == 200
-    wait_for(lambda: abs(reference_um(bench) - HELD_UM) > 1.0, "the table that plays")
-    assert browser.json("POST", "/api/setpoint?as=ada", {"axis": "x", "value": HELD_UM})[0] == 200
+    wait_for(lambda: abs(reference_um(bench) - SETPOINT_UM) > 1.0, "the table that plays")
+    assert browser.json("POST", "/api/setpoint?as=ada", {"axis": "x", "value": SETPOINT_UM})[0] == 200
 
 
 def test_nothing_changes_before_consent_and_then_the_taps_are_the_proposed_ones(
@@ -121,7 +121,11 @@ def test_nothing_changes_before_consent_and_then_the_taps_are_the_proposed_ones(
 
 @pytest.mark.parametrize(
     ("path", "body"),
-    [("response", QUICK | {"duration_s": 30.0}), ("learn", LEARN | {"cycles": 50, "keep": True}), ("retune", RETUNE)],
+    [
+        ("response", QUICK_REQUEST | {"duration_s": 30.0}),
+        ("learn", LEARN | {"cycles": 50, "keep": True}),
+        ("retune", RETUNE),
+    ],
 )
 def test_a_measurement_ends_with_its_page(browser: Browser, bench: Bench, path: str, body: dict[str, Any]):
     before = taps(bench)
@@ -129,12 +133,12 @@ def test_a_measurement_ends_with_its_page(browser: Browser, bench: Bench, path: 
     head = f"POST /api/{path}?as=ada HTTP/1.1\r\nHost: 127.0.0.1:{browser.port}\r\nOrigin: {browser.origin}\r\n"
     with socket.create_connection(("127.0.0.1", browser.port)) as page:
         page.sendall(f"{head}Cookie: {browser.cookie}\r\nContent-Length: {len(data)}\r\n\r\n".encode() + data)
-        wait_for(lambda: reference_um(bench) != HELD_UM, "a motion")
+        wait_for(lambda: reference_um(bench) != SETPOINT_UM, "a motion")
     wait_for(lambda: bench.status()["measuring"] is None, "the end of the measurement", CANCEL_TIMEOUT_S)
-    assert reference_um(bench) == HELD_UM
+    assert reference_um(bench) == SETPOINT_UM
     tick = bench.ticks
     wait_for(lambda: bench.ticks > tick + 4 * TICKS, "ticks")
-    assert reference_um(bench) == HELD_UM
+    assert reference_um(bench) == SETPOINT_UM
     assert taps(bench) == before
     status, refusal = browser.json("POST", f"/api/{path}?as=ada", body | {"axis": "z"})
     assert (status, "z" in refusal["error"]) in ((422, True), (409, True)), refusal
@@ -157,7 +161,7 @@ def test_a_refusal_names_the_reason(
 ):
     status, response = browser.json("POST", f"/api/{path}?as=ada", body)
     assert (status, words in response["error"]) == (code, True), response
-    assert reference_um(bench) == HELD_UM
+    assert reference_um(bench) == SETPOINT_UM
 
 
 def test_measurements_are_refused_while_another_client_drives(browser: Browser, bench: Bench, proposal: dict[str, Any]):
@@ -165,7 +169,7 @@ def test_measurements_are_refused_while_another_client_drives(browser: Browser, 
     bob = Client(bench.client.path, "bob")
     browser.request("DELETE", "/api/lock?as=ada")
     bob.lock()
-    for path, body in (("response", QUICK), ("learn", LEARN), ("retune", RETUNE)):
+    for path, body in (("response", QUICK_REQUEST), ("learn", LEARN), ("retune", RETUNE)):
         status, refusal = browser.json("POST", f"/api/{path}?as=ada", body)
         assert (status, "bob has held the lock since" in refusal["error"]) == (409, True), refusal
     unchanged = swap_body(proposal) | {"replaces": proposal["prefilter"]}

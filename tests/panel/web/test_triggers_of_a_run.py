@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from tests.soak.panel_triggers import caught
+from tests.soak.panel_triggers import play_pulses
 
 PULSES = 150
 """Pulses of this test; `make soak NAME=panel-triggers` has 10,000."""
 
 
 def test_every_pulse_of_one_tick_is_found_at_its_tick(tmp_path: Path):
-    results = caught(tmp_path, PULSES)
+    results = play_pulses(tmp_path, PULSES)
     for name, result in results.items():
         assert result.pulses == PULSES, name
         assert (result.missed, result.made_up, result.furthest_ticks, result.lost_ticks) == (0, 0, 0, 0), name
