@@ -95,7 +95,7 @@ def test_weights_whose_whole_stroke_is_noise_are_named() -> None:
     assert line.startswith(
         "axis.x.feedforward.weights_um_per_v: with these weights the drive's limits reach 0.009 µm, less than the "
     )
-    assert line.endswith("noise of 0.01 µm; identify the weights on this stage")
+    assert line.endswith("noise of 0.01 µm; identify the weights of the hysteresis on this stage")
 
 
 def test_a_reference_of_the_schedule_counts() -> None:

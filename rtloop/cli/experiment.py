@@ -49,7 +49,8 @@ RUN_OPTIONS = (
         "comparison",
         metavar="CONFIG",
         type=OUTPUT,
-        help="Second configuration, which runs the same experiments; the report compares its figures and steps.",
+        help="Second configuration, with which the same experiments run; the report compares the results and the step "
+        "responses of both.",
     ),
     click.option(
         "--out",

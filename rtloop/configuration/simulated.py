@@ -133,8 +133,8 @@ def _weights(configuration: Configuration, axis: AxisOptions) -> Iterator[str]:
     ends = f"{key}: with these weights the drive's limits reach {reach_um:.4g} µm"
     if plant is not None and reach_um < plant.sensor.noise_um:
         yield (
-            f"{ends}, less than the simulated sensor's noise of {plant.sensor.noise_um:g} µm; identify the weights on "
-            "this stage"
+            f"{ends}, less than the simulated sensor's noise of {plant.sensor.noise_um:g} µm; identify the weights of the "
+            "hysteresis on this stage"
         )
         return
     ratio = None if plant is None else _stroke_ratio(axis, plant_plays(plant))
@@ -144,7 +144,7 @@ def _weights(configuration: Configuration, axis: AxisOptions) -> Iterator[str]:
         sign = " in the opposite direction" if ratio < 0 else ""
         yield (
             f"{ends}, with the weights of the simulated actuator {rig_um:.4g} µm{sign}; allowed: {low_um:.4g} … "
-            f"{high_um:.4g} µm; identify the weights on this stage"
+            f"{high_um:.4g} µm; identify the weights of the hysteresis on this stage"
         )
         return
     sensor_um = max(map(abs, sensor_ends_um(configuration, axis)))
@@ -152,7 +152,8 @@ def _weights(configuration: Configuration, axis: AxisOptions) -> Iterator[str]:
     if reach_um > allowed_um:
         yield (
             f"{ends}; the sensor's range ends at {sensor_um:.4g} µm, interlocks.position_um is "
-            f"{limits.position_um:g} µm; allowed: up to {allowed_um:.4g} µm; identify the weights on this stage"
+            f"{limits.position_um:g} µm; allowed: up to {allowed_um:.4g} µm; identify the weights of the hysteresis on "
+            "this stage"
         )
 
 

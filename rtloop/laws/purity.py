@@ -60,5 +60,5 @@ def _reason(name: str) -> str:
     if name.startswith(("NRT_", "numba_runtime")):
         return MEMORY
     if name.startswith(("Py", "numba_")):
-        return "needs the interpreter, which may wait"
+        return "needs Python's interpreter, which can delay a tick"
     return LIBM if name in _LIBRARY or name.removesuffix("f") in _LIBRARY else UNKNOWN

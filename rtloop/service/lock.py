@@ -83,7 +83,11 @@ class Lock:
         with self._guard:
             holder = self._current_holder()
             if holder is not None and holder.name != name:
-                log.warning("%s takes the lock from %s by the emergency key", name, holder.name)
+                log.warning(
+                    "%s takes the lock from %s: the request had the emergency key (service.emergency_key_sha256)",
+                    name,
+                    holder.name,
+                )
                 self._holder = None
             self._take(name)
 

@@ -68,7 +68,7 @@ CLASS = "class Mine(Controller):\n"
 USLEEP = "from numba import types\nusleep = types.ExternalFunction('usleep', types.int32(types.uint32))\n"
 BY_ADDRESS = "import ctypes\nusleep = ctypes.CDLL(None).usleep\nusleep.argtypes = [ctypes.c_uint]\n"
 REFUSED = {
-    "prints": ("say = print\n" + text("say(s.seen)"), "needs the interpreter"),
+    "prints": ("say = print\n" + text("say(s.seen)"), "needs Python's interpreter"),
     "takes memory": ("import numpy as np\n" + text("return np.zeros(3)[0]"), "allocates memory"),
     "calls libm": ("import math\n" + text("return math.sin(told.error_um)"), "differs between processors"),
     "calls what is no intrinsic": (

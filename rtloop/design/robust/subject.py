@@ -72,7 +72,9 @@ def build_subject(axis: AxisOptions, check: AxisCheck, design: DesignOptions, la
     """
     model, specification, options = axis.model or design.plant, design.specification, design.shape
     if check.linear is None:
-        raise ValueError(f"controller: {_controller_fault(check)}; taps need a linear controller of one axis")
+        raise ValueError(
+            f"controller: {_controller_fault(check)}; the taps of a pre-filter need a linear controller of one axis"
+        )
     if model is None:
         raise ValueError("model: missing; set [axis.model], or [plant] in the specification")
     overshoot_percent, command, faults = (

@@ -131,8 +131,8 @@ def _range_notes(run: RecordedRun) -> list[str]:
     if low_v <= limits.lowest_v and limits.drive_v <= high_v:
         return []
     return [
-        f"The limits allow a drive of {limits.lowest_v:g} … {limits.drive_v:g} V. The largest loop leaves out the part "
-        "in which the interlocks of position or sensor would trip."
+        f"The limits allow a drive of {limits.lowest_v:g} … {limits.drive_v:g} V. The largest hysteresis loop was "
+        "driven over a smaller range, because the interlocks of position or sensor would have tripped in the rest."
     ]
 
 

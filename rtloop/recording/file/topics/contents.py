@@ -76,7 +76,9 @@ def read_chunk(source: McapSource, entry: ChunkEntry) -> bytes:
     if entry.index:
         head = parse_chunk_head(record)
         if (head.start, head.end, head.uncompressed) != (entry.index.start, entry.index.end, entry.index.uncompressed):
-            raise DamagedChunk("the times or the size in its header differ from the index")
+            raise DamagedChunk(
+                "the header of a data block is damaged: its times or its size differ from the file's index"
+            )
     return record
 
 

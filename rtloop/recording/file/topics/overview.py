@@ -124,9 +124,11 @@ class OverviewLayout:
     def require_overview(self, payload: bytes) -> None:
         """Raise ValueError for a payload whose length or fields do not match these columns."""
         if len(payload) != self._dtype.itemsize:
-            raise ValueError("an overview of omitted ticks has a wrong length")
+            raise ValueError("a summary of ticks that were left out is damaged: it has a wrong length")
         if not np.array_equal(np.frombuffer(payload, np.uint8)[self._fixed], self._tags):
-            raise ValueError("the fields of an overview of omitted ticks do not match the recorded signals")
+            raise ValueError(
+                "a summary of ticks that were left out is damaged: its signals are not those of the recording"
+            )
 
     def parse_intervals(self, payloads: Sequence[bytes]) -> Intervals:
         """Return intervals (n, columns, 3: minimum, maximum, mean) of n payloads that `require_overview` accepted."""
