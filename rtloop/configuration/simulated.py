@@ -133,8 +133,8 @@ def _weights(configuration: Configuration, axis: AxisOptions) -> Iterator[str]:
     ends = f"{key}: with these weights the drive's limits reach {reach_um:.4g} µm"
     if plant is not None and reach_um < plant.sensor.noise_um:
         yield (
-            f"{ends}, less than the simulated sensor's noise of {plant.sensor.noise_um:g} µm; identify the weights of the "
-            "hysteresis on this stage"
+            f"{ends}, less than the simulated sensor's noise of {plant.sensor.noise_um:g} µm; identify the "
+            "weights of the hysteresis on this stage"
         )
         return
     ratio = None if plant is None else _stroke_ratio(axis, plant_plays(plant))
