@@ -15,6 +15,7 @@ from tests.syscalls.components import COMPONENTS, surroundings
 from tests.syscalls.kinds import REPEATED
 from tests.syscalls.mutants import MUTANTS, Mutant
 from tests.syscalls.sampling import SEED, plan, sample
+from tests.syscalls.serving import end_board
 from tests.syscalls.traced import unavailable
 
 SAMPLE = 60
@@ -24,6 +25,13 @@ SAMPLED = [component for component in COMPONENTS.values() if component.share]
 QUICK_MUTANTS = [mutant for mutant in MUTANTS if not mutant.component.startswith("service")]
 SHARES = sum(component.share for component in SAMPLED)
 pytestmark = pytest.mark.skipif(bool(unavailable()), reason=unavailable())
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _board() -> Iterator[None]:
+    """End the board of the tries after the last test."""
+    yield
+    end_board()
 
 
 @pytest.fixture(autouse=True)
