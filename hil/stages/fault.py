@@ -20,7 +20,8 @@ def change_reading(coefficients, state, reading_v):
     """Return the reading [V] that the controller gets in place of `reading_v`.
 
     Until the fault begins, and with a lost drive, it is `reading_v`; then the last reading before the fault if the
-    sensor is stuck, 0 V if it is lost.
+    sensor is stuck, 0 V if it is lost. Each call before the fault stores `reading_v` in `state`; time is counted by
+    `change_drive`.
     """
     if state.fault_wait > 0:
         state.fault_reading_v = reading_v

@@ -118,7 +118,7 @@ def _attribute(options: Any, path: str, key: str) -> Any:
 
 
 def _choices_text(value: Any) -> str:
-    """Return the end of a message, "; allowed: …", with the parts that a value has; "" where it can have none."""
+    """Return "; allowed: …" with the fields of Options, the keys of a table or the places of a tuple; else ""."""
     names = list(type(value).model_fields) if isinstance(value, Options) else []
     names = list(value) if isinstance(value, Mapping) else names
     if isinstance(value, tuple):

@@ -144,7 +144,7 @@ def _present(values: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _rig_values(values: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the values that change the driver's options."""
+    """Return the entries whose dotted keys belong to the rig (`is_rig_key`), with unchanged keys."""
     return {key: value for key, value in values.items() if is_rig_key(key)}
 
 

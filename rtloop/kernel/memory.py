@@ -127,10 +127,10 @@ class Layout:
         return int.from_bytes(data[:8], "little"), coefficients, states, loop
 
     def require_allowed_axis(self, number: int, coefficients: Records, states: Records) -> None:
-        """Raise ValueError for a whole number of axis `number`, or its laws, that is not allowed, or a misplaced law.
+        """Raise ValueError if an integer field of axis `number` (from 0), or of its laws, is outside its allowed range.
 
-        `coefficients` and `states` are the records of all axes. A law is misplaced in a slot for another number of
-        axes.
+        `coefficients` and `states` are the records of all axes. Also raises it for a law in a slot for another number
+        of axes.
         """
         axis, state, owner = coefficients[number], states[number], f"axis {number}"
         require_allowed(owner, axis, {**ALLOWED_COEFFICIENTS, **self._law_number_rules(number, len(coefficients))})

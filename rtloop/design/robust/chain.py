@@ -140,8 +140,9 @@ def _selected_axis(configuration: Configuration, axis: str | None) -> AxisOption
 def _require_reachable_steps(
     stage: Stage, design: DesignOptions, axis: str | None, folder: Path, spec_name: str
 ) -> None:
-    """Raise NoDesign if the stage's drive cannot hold the specification's reference step: a check before the long
-    computation, left out for a design without a plant.
+    """Raise NoDesign if the stage's drive cannot hold the specification's reference step; without plant, do nothing.
+
+    `axis` None is the first axis; relative paths of the configuration begin at `folder`.
     """
     configuration = parse(stage_configuration(stage, {}, [], axis, spec_name), "identified", folder, spec_name)
     axis_options = _selected_axis(configuration, axis)

@@ -198,7 +198,10 @@ def _raw_gain(run: RecordedRun) -> float:
 
 
 def _low_frequency_db(sweep: Real) -> float:
-    """Median magnitude in dB of a sweep (frequencies, 4) up to LOW_HZ, or at its lowest frequency if it is above."""
+    """Return the median magnitude in dB up to LOW_HZ, or at the lowest frequency if that is above.
+
+    Rows of `sweep` (frequencies, 4): frequency in Hz, rising; magnitude in dB; phase in °; coherence.
+    """
     is_low = sweep[:, 0] <= max(LOW_HZ, sweep[0, 0])
     return float(np.median(sweep[is_low, 1]))
 

@@ -69,9 +69,9 @@ def _emit_object_code(module: Any, name: str, machine: Any, raises: bool) -> byt
 
 
 def _wrapper_text(module: Any, numba_name: str, name: str) -> str:
-    """Return the assembly text of a C function `name` with the signature of numba's C function `numba_name`.
+    """Return LLVM's text (IR) of a C function `name` with the signature of `numba_name`, a C function of numba's.
 
-    It calls the same kernel, and ignores the kernel's status.
+    It calls the same kernel and ignores the kernel's status. `module` is the parsed LLVM module that defines both.
     """
     kernel, function = module.get_function(numba_name.removeprefix("cfunc.")), module.get_function(numba_name)
     return WRAPPER_TEMPLATE.format(

@@ -69,7 +69,9 @@ def read_stabilizer(path: Path) -> Table:
 
 
 def _frames(path: Path, data: np.ndarray, samples: int) -> np.ndarray:
-    """Return the bytes of all frames, (frames, bytes); the incomplete last one is left out.
+    """Return all frames of `data`, uint8 (n,), as (frames, bytes); the incomplete last one is left out.
+
+    `samples` is the number of samples of each channel in a batch.
 
     The length is the shortest one with which every frame begins with the first one's header but for the sequence.
     Raises UnreadableData without such a length.

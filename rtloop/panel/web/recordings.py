@@ -40,6 +40,7 @@ class Recordings:
     """Handlers for the recordings of a service; `current_run` returns the number of the run that pages show."""
 
     def __init__(self, service: Service, current_run: Callable[[], int]) -> None:
+        """Serve the recordings of `service`; `current_run()` is the number of the run that pages show."""
         self._service, self._current_run = service, current_run
         self._processes, self._readers = ProcessRunner(), CapacityLimiter(MAX_READERS)
         self._folder_cache: RecordingFolder | None = None

@@ -19,6 +19,7 @@ class Motion:
     """Running sums of drive and position, taken from their first values, so that small changes keep their digits."""
 
     def __init__(self) -> None:
+        """Begin without ticks; `add` takes them in the order of the run."""
         self._count, self._travel_v = 0, 0.0
         self._first, self._last_v = np.zeros((2, 1)), np.zeros(0)
         self._lowest_v, self._highest_v = math.inf, -math.inf
