@@ -39,6 +39,7 @@ def _rehearse_other_processes() -> None:
 
     from rtloop.drivers.comedi import comedi_read, comedi_write
     from rtloop.drivers.node.exchange import node_read, node_write
+    from rtloop.drivers.playback import playback_read, playback_wait, playback_write
     from rtloop.drivers.shm import ShmOptions, shm_read, shm_write
     from rtloop.engine.commands import send, withdraw
     from rtloop.engine.memory import SharedBlock, Sizes
@@ -46,11 +47,12 @@ def _rehearse_other_processes() -> None:
     from rtloop.engine.ring import drain
     from rtloop.hil.board import serve
     from rtloop.recording.capture.recorder import Recorder
-    from rtloop.recording.file.topics.tick_kernels import first_fault
+    from rtloop.recording.file.topics.tick_kernels import RecordLayout, first_fault
     from rtloop.recording.replay.kernels import fill_tape, first_unequal
     from rtloop.signals import COMMON_SIGNALS
 
-    for function in (comedi_read, comedi_write, node_read, node_write, shm_read, shm_write):
+    playback = playback_read, playback_wait, playback_write
+    for function in (comedi_read, comedi_write, node_read, node_write, shm_read, shm_write, *playback):
         _ = function.address  # compiles it
     block = SharedBlock.create(Sizes(columns=1, axes=1, rate_hz=1.0, snapshot_bytes=8, table_samples=1))
     Recorder(block)
@@ -59,6 +61,7 @@ def _rehearse_other_processes() -> None:
     rows = np.zeros((1, len(COMMON_SIGNALS)))
     first_unequal(rows, rows)
     first_fault(np.zeros((2, 1)), np.zeros((2, 2)), np.zeros((2, 1), np.int64), 1)
+    RecordLayout(np.zeros(8, np.uint8), np.zeros(8, np.bool_)).take_out(bytes(8), np.zeros(1, np.int64))
     fill_tape(rows, np.zeros((0, 2), np.int64), rows.copy(), np.zeros(1, np.bool_))
     with tempfile.TemporaryDirectory() as folder:
         serve(Path(folder) / "board", ShmOptions(), ["x"], 1000.0, lambda: True)
