@@ -15,7 +15,7 @@ from scipy import signal
 PERIOD_S = 1e-4
 MOTIONS = ("multisine", "sweep", "steps")
 SHORTEST, LONGEST = 50, 150
-"""Shortest and longest step in samples: steps of unequal length leave no gaps in the spectrum."""
+"""Shortest and longest dwell time of a step in samples: steps of unequal length leave no gaps in the spectrum."""
 
 
 @dataclass(frozen=True)
@@ -32,36 +32,37 @@ class TrueLoop:
         return plant_polynomials(self.modes, self.delay_ticks)
 
     @property
-    def closed(self) -> np.ndarray:
-        """The loop's characteristic polynomial in 1/z."""
+    def characteristic_polynomial(self) -> np.ndarray:
+        """Denominator of the closed loop's transfer functions, a polynomial in 1/z."""
         (b, a), (q, p) = self.plant, self.controller
         return poly_sum(np.convolve(a, p), np.convolve(b, q))
 
-    def in_loop(self, reference: np.ndarray, noise: np.ndarray) -> dict[str, np.ndarray]:
+    def simulate_loop(self, reference: np.ndarray, noise: np.ndarray) -> dict[str, np.ndarray]:
         """Return the signals r, v and x (µm) of the closed loop from rest, by the loop's transfer functions."""
-        (b, a), (q, p) = self.plant, self.controller
-        command = filtered(np.convolve(q, a), self.closed, reference - noise)
-        position = filtered(np.convolve(b, q), self.closed, reference) + filtered(np.convolve(a, p), self.closed, noise)
+        (b, a), (q, p), closed = self.plant, self.controller, self.characteristic_polynomial
+        command = lfilter(np.convolve(q, a), closed, reference - noise)
+        position = lfilter(np.convolve(b, q), closed, reference) + lfilter(np.convolve(a, p), closed, noise)
         return {"reference_um": reference, "command_um": command, "position_um": position}
 
-    def open(self, command: np.ndarray, noise: np.ndarray) -> dict[str, np.ndarray]:
-        """Return the signals (µm) of the plant without a loop: the command is also the reference."""
+    def simulate_plant(self, command: np.ndarray, noise: np.ndarray) -> dict[str, np.ndarray]:
+        """Return the signals (µm) of the plant without a controller, from rest; the command is also the reference."""
         b, a = self.plant
-        return {"reference_um": command, "command_um": command, "position_um": filtered(b, a, command) + noise}
+        return {"reference_um": command, "command_um": command, "position_um": lfilter(b, a, command) + noise}
 
 
 def plant_polynomials(modes: tuple[tuple[float, float, float], ...], delay_ticks: int) -> tuple[np.ndarray, np.ndarray]:
     """Return (numerator, denominator) in 1/z: each mode behind its hold by scipy, summed over a common denominator."""
-    top, bottom = np.zeros(1), np.ones(1)
+    numerator, denominator = np.zeros(1), np.ones(1)
     for hz, damping, share in modes:
         omega = 2 * np.pi * hz
-        held: Any = signal.cont2discrete(([share * omega**2], [1, 2 * damping * omega, omega**2]), PERIOD_S, "zoh")
-        b, a = held[0], held[1]
-        top, bottom = poly_sum(np.convolve(top, a), np.convolve(b.ravel(), bottom)), np.convolve(bottom, a)
-    return np.concatenate([np.zeros(delay_ticks), top]), bottom
+        discrete: Any = signal.cont2discrete(([share * omega**2], [1, 2 * damping * omega, omega**2]), PERIOD_S, "zoh")
+        b, a = discrete[0], discrete[1]
+        numerator = poly_sum(np.convolve(numerator, a), np.convolve(b.ravel(), denominator))
+        denominator = np.convolve(denominator, a)
+    return np.concatenate([np.zeros(delay_ticks), numerator]), denominator
 
 
-def filtered(b: Any, a: Any, signal_: np.ndarray) -> np.ndarray:
+def lfilter(b: Any, a: Any, signal_: np.ndarray) -> np.ndarray:
     """Return the signal filtered by B/A (polynomials in 1/z) from rest."""
     return np.asarray(signal.lfilter(b, a, signal_))
 
@@ -73,7 +74,7 @@ def poly_sum(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 def draw_loop(random: np.random.Generator) -> TrueLoop:
-    """Return a stable loop: two light modes, 0 to 3 samples of delay, damping part of L real, 1 to 4 at the first."""
+    """Return a stable loop: two lightly damped modes, 0 to 3 samples of delay, `damping_controller` of gain 1 to 4."""
     while True:
         hz, share = random.uniform(150, 900), random.uniform(0.05, 0.2)
         modes = (
@@ -82,23 +83,23 @@ def draw_loop(random: np.random.Generator) -> TrueLoop:
         )
         loop = TrueLoop(modes, int(random.integers(0, 4)), (np.ones(1), np.ones(1)))
         loop = TrueLoop(modes, loop.delay_ticks, damping_controller(loop, random.uniform(1, 4), random.uniform(10, 40)))
-        if np.abs(np.roots(loop.closed)).max() < np.exp(-PERIOD_S / 0.1):
+        if np.abs(np.roots(loop.characteristic_polynomial)).max() < np.exp(-PERIOD_S / 0.1):
             return loop
 
 
 def damping_controller(loop: TrueLoop, gain: float, ki_per_s: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return C in 1/z: k_i T/(z − 1) plus a broad resonance at the first mode; its part of L there is `gain`, real."""
+    """Return C in 1/z: k_i T/(z − 1) plus a broad resonance that adds the real number `gain` to L at the first mode."""
     hz = loop.modes[0][0]
-    omega, back = 2 * np.pi * hz, np.exp(-2j * np.pi * hz * PERIOD_S)
+    omega, z_inverse = 2 * np.pi * hz, np.exp(-2j * np.pi * hz * PERIOD_S)
     b, a = loop.plant
-    target = gain / (np.polyval(b[::-1], back) / np.polyval(a[::-1], back))
-    bottom = np.poly(np.exp(omega * PERIOD_S * np.roots([1, 0.6, 1]))).real
-    at_mode = target * np.polyval(bottom[::-1], back) / back
-    slope = at_mode.imag / back.imag
-    resonant = np.array([0.0, at_mode.real - slope * back.real, slope])
+    target = gain / (np.polyval(b[::-1], z_inverse) / np.polyval(a[::-1], z_inverse))
+    denominator = np.poly(np.exp(omega * PERIOD_S * np.roots([1, 0.6, 1]))).real
+    numerator_at_mode = target * np.polyval(denominator[::-1], z_inverse) / z_inverse
+    slope = numerator_at_mode.imag / z_inverse.imag
+    resonant = np.array([0.0, numerator_at_mode.real - slope * z_inverse.real, slope])
     integral = np.array([0.0, ki_per_s * PERIOD_S]), np.array([1.0, -1.0])
-    return poly_sum(np.convolve(resonant, integral[1]), np.convolve(integral[0], bottom)), np.convolve(
-        bottom, integral[1]
+    return poly_sum(np.convolve(resonant, integral[1]), np.convolve(integral[0], denominator)), np.convolve(
+        denominator, integral[1]
     )
 
 
@@ -114,7 +115,7 @@ def noise_denominators(near_hz: float) -> tuple[np.ndarray, np.ndarray]:
 
 def coloured_noise(random: np.random.Generator, samples: int, near_hz: float, rms_um: float) -> np.ndarray:
     """Return noise (µm): vibration near `near_hz` and drift, scaled by `rms_um`, and the sensor's white noise."""
-    vibration, drift = (filtered([1.0], a, random.normal(size=samples)) for a in noise_denominators(near_hz))
+    vibration, drift = (lfilter([1.0], a, random.normal(size=samples)) for a in noise_denominators(near_hz))
     parts = VIBRATION * vibration / vibration.std() + DRIFT * drift / drift.std()
     return rms_um * parts + random.normal(0, SENSOR_UM, samples)
 

@@ -29,7 +29,7 @@ reference_um = 10.0
 command_um = 12.0
 [weights]
 disturbance_rule = "none"
-[weights.tracking]                 # 0.2 %, 300 rad/s, 5 %: twice as good as asked, for what γ and reduction cost
+[weights.tracking]                 # 0.2 %, 300 rad/s, 5 %: stricter than [specification], because γ and reduction add errors
 form = "zpk"
 gain = 0.9523809523809523
 zeros = [[-315.0, 0.0]]
@@ -53,14 +53,14 @@ class ModalRig(NamedTuple):
 
     @property
     def reach_um(self) -> float:
-        """Displacement (µm) at 10 V, driven from rest."""
+        """Displacement (µm) at 10 V after one rise from rest."""
         if self.bouc_wen is None:
             return float(np.sum(self.weights_um_per_v * (10.0 - np.array(THRESHOLDS_V))))
         d, rise, decay, lean = self.bouc_wen.values()
         return 10.0 * d - rise / (decay + lean) * (1.0 - math.exp(-10.0 * (decay + lean)))
 
     def configuration(self, sine: bool) -> str:
-        """Return the configuration (TOML) for the slow sine at 1 kHz, or for the steps up and down at 10 kHz."""
+        """Return the configuration (TOML) for the slow sine at 1 kHz if `sine`, else for steps up and down, 10 kHz."""
         omega = 2 * np.pi * self.hz
         poles = np.array([complex(-z * w, w * np.sqrt(1 - z**2)) for z, w in zip(self.damping, omega, strict=True)])
         scale = float(np.exp(np.mean(np.log(omega))))
@@ -71,7 +71,7 @@ class ModalRig(NamedTuple):
             other_factors = [factor for k, factor in enumerate(factors) if k != i]
             numerator += math.prod(other_factors, start=np.poly1d([self.gain[i] * w**2]))
         zeros = scale * np.roots(numerator.coeffs) if numerator.order else np.empty(0)
-        leading = float(numerator.coeffs[0]) * scale ** (2 * omega.size - numerator.order)
+        leading_coefficient = float(numerator.coeffs[0]) * scale ** (2 * omega.size - numerator.order)
         dynamics = [
             f"zeros = {[[float(z.real), float(z.imag)] for z in zeros.astype(complex)]}",
             f"poles = {[[float(p.real), float(p.imag)] for p in np.concatenate([poles, poles.conj()])]}",
@@ -86,7 +86,7 @@ class ModalRig(NamedTuple):
             f'[driver]\nkind = "sim"\nseed = {self.seed}\nlatency_ticks = {0 if sine else self.delay_ticks}',
             '[driver.channels.x]\ninput = "adc0"\noutput = "dac0"\num_per_v = 10.0',
             self._hysteresis(),
-            f'[driver.plant.dynamics]\nform = "zpk"\ngain = {leading!r}',
+            f'[driver.plant.dynamics]\nform = "zpk"\ngain = {leading_coefficient!r}',
             *dynamics,
             "" if self.noise_um is None else f"[driver.plant.sensor]\num_per_v = 10.0\nnoise_um = {self.noise_um!r}",
             '[[axis]]\nname = "x"',
@@ -117,8 +117,8 @@ def noisy_rig(seed: int) -> ModalRig:
     if seed % 2 == 0:
         return ModalRig(seed, *modes, weights, noise_um, command_um=43.0)
     d, decay = 4.6 * random.uniform(0.8, 1.2), random.uniform(0.1, 0.4)
-    lean, part = decay * random.uniform(-0.5, 0.5), random.uniform(0.05, 0.2)
-    numbers = {"um_per_v": d, "rise_um_per_v": part * d, "decay_per_v": decay, "lean_per_v": lean}
+    lean, rise_share = decay * random.uniform(-0.5, 0.5), random.uniform(0.05, 0.2)
+    numbers = {"um_per_v": d, "rise_um_per_v": rise_share * d, "decay_per_v": decay, "lean_per_v": lean}
     return ModalRig(seed, *modes, weights, noise_um, 43.0, {name: float(value) for name, value in numbers.items()})
 
 

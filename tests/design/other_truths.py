@@ -27,12 +27,12 @@ def creeping_plays(drive_v: Array) -> Array:
 
 def bouc_wen(drive_v: Array) -> Array:
     """Return x = 4 u − 2 z, dz = 0.8 du − 0.15 |du| z − 0.05 du |z| (Bouc 1967, Wen 1976; n = 1), in µm, from rest."""
-    z, last, outputs_um = 0.0, 0.0, []
+    z, previous, outputs_um = 0.0, 0.0, []
     for u in drive_v:
         for _ in range(10):
-            du = (u - last) / 10
+            du = (u - previous) / 10
             z += 0.8 * du - 0.15 * abs(du) * z - 0.05 * du * abs(z)
-        last = u
+        previous = u
         outputs_um.append(4.0 * u - 2.0 * z)
     return np.array(outputs_um)
 
@@ -40,7 +40,7 @@ def bouc_wen(drive_v: Array) -> Array:
 def preisach(drive_v: Array) -> Array:
     """Return the output (µm) of relays, on at α, off at β ≤ α, within ±10 V, densest in the middle (Preisach 1935)."""
     levels = np.linspace(-10, 10, 81)
-    on, off = (side.ravel() for side in np.meshgrid(levels, levels))
+    on, off = (thresholds.ravel() for thresholds in np.meshgrid(levels, levels))
     on, off = on[on >= off], off[on >= off]
     density = np.exp(-((on + off) ** 2) / 120 - (on - off) ** 2 / 50)
     state, outputs = np.where(on + off < 0, 1.0, -1.0), []
@@ -62,12 +62,12 @@ def step_plays(drive_v: Array, thresholds_v: Array, weights_um_per_v: Array) -> 
 def random_drive(random: np.random.Generator, samples: int, turns: int = 3) -> tuple[Array, Array]:
     """Return a past and a drive (V): straight strokes between random turning points. The drive reaches −9 V and 9 V,
     then `turns` random points."""
-    past = _strokes(np.append(0.0, random.uniform(-9, 9, 4)), samples // 2)
+    past = _sample_strokes(np.append(0.0, random.uniform(-9, 9, 4)), samples // 2)
     corners = np.concatenate([past[-1:], random.uniform(-9, 9, 1), [-9.0, 9.0], random.uniform(-9, 9, turns)])
-    return past, _strokes(corners, samples)
+    return past, _sample_strokes(corners, samples)
 
 
-def _strokes(corners: Array, samples: int) -> Array:
+def _sample_strokes(corners: Array, samples: int) -> Array:
     """Return `samples` points (V), equally spaced along the path through the corners."""
-    places = np.cumsum(np.append(0.0, np.abs(np.diff(corners))))
-    return np.interp(np.linspace(0, places[-1], samples), places, corners)
+    path_v = np.cumsum(np.append(0.0, np.abs(np.diff(corners))))
+    return np.interp(np.linspace(0, path_v[-1], samples), path_v, corners)

@@ -31,6 +31,7 @@ from rtloop.hysteresis.play_model import PlayModel
 from rtloop.hysteresis.plays import model_output
 
 SLOW_S, FAST_S = 1e-3, 1e-4
+"""Sampling periods of the slow sine, and of the steps and chirps."""
 SENSOR_UM_PER_V = 10.0
 EQ_4 = PlayModel(np.array(THRESHOLDS_V), np.array(NOMINAL_WEIGHTS_UM_PER_V))
 COMMAND_UM = 40.0
@@ -83,7 +84,10 @@ class ModelErrors(NamedTuple):
 
 
 def draw_rig(seed: int, *, moved_thresholds: float = 0.0) -> Rig:
-    """Return a rig: weights of eq (4) ± 20 % each, resonance ± 10 %, noise, offset, 16 bit, thresholds moved."""
+    """Return a rig: weights of eq (4) ± 20 %, resonance ± 10 %, offset ± 1 µm, 10 nm of noise, ADC of 16 bit.
+
+    The gaps between thresholds vary by the part `moved_thresholds`; the last threshold stays.
+    """
     random = np.random.default_rng(seed)
     weights = np.array(NOMINAL_WEIGHTS_UM_PER_V) * random.uniform(0.8, 1.2, len(NOMINAL_WEIGHTS_UM_PER_V))
     gaps = np.diff(THRESHOLDS_V, prepend=0.0) * random.uniform(1 - moved_thresholds, 1 + moved_thresholds, weights.size)
@@ -98,14 +102,14 @@ def draw_rig(seed: int, *, moved_thresholds: float = 0.0) -> Rig:
         adc=ConverterOptions(bits=16),
     )
     zeros, poles, gain = zeros_poles_gain(dynamics)
-    light = poles[np.argmin(np.abs(-poles.real / np.abs(poles) - 55 / 2 / 1.4e7**0.5))]
+    light_pole = poles[np.argmin(np.abs(-poles.real / np.abs(poles) - 55 / 2 / 1.4e7**0.5))]
     d0 = float((gain * np.prod(-zeros / 1e4) / np.prod(-poles / 1e4)).real / 1e4)
     return Rig(
         RigOptions(plant=plant, seed=seed),
         weights,
         thresholds,
-        float(abs(light)) / (2 * np.pi),
-        float(-light.real / abs(light)),
+        float(abs(light_pole)) / (2 * np.pi),
+        float(-light_pole.real / abs(light_pole)),
         d0,
     )
 
@@ -129,30 +133,30 @@ def chirp_drive(volts: float = 1.0, duration_s: float = 2.0) -> np.ndarray[Any, 
 
 
 def model_excitation(model: PlayModel, run: AxisRecording) -> Excitation:
-    """Return the hysteresis model's output (µm) for the recorded drive, beside the recorded position."""
+    """Return the hysteresis model's output (µm) for the recorded drive, and the recorded position."""
     return Excitation(run.name, model_output(model, run.drive_v), run.position_um, run.period_s)
 
 
 def identify_rig(rig: Rig, **options: Any) -> tuple[HysteresisFit, DynamicsFit]:
-    """Return the hysteresis and dynamics identified from a slow sine and a step; `options` are of the hysteresis."""
-    shape = identify_hysteresis([rig.measure(slow_sine(), SLOW_S)], **options)
-    return shape, identify_dynamics(model_excitation(shape.model, rig.measure(step_drive(), FAST_S)))
+    """Return hysteresis and dynamics identified from a slow sine and a step; `options` go to `identify_hysteresis`."""
+    hysteresis = identify_hysteresis([rig.measure(slow_sine(), SLOW_S)], **options)
+    return hysteresis, identify_dynamics(model_excitation(hysteresis.model, rig.measure(step_drive(), FAST_S)))
 
 
-def model_errors(rig: Rig, shape: HysteresisFit, dynamics: DynamicsFit) -> ModelErrors:
-    """Return errors of hysteresis loop (largest, of its range), resonance, damping, static gain at the peak; and ξ."""
+def model_errors(rig: Rig, hysteresis: HysteresisFit, dynamics: DynamicsFit) -> ModelErrors:
+    """Return errors of the loop (largest, of its range), resonance, damping and gain (at the drive's peak), and ξ."""
     drive = slow_sine()
-    truth, model = rig.static_um(drive), dynamics.static_gain * model_output(shape.model, drive)
+    truth, model = rig.static_um(drive), dynamics.static_gain * model_output(hysteresis.model, drive)
     mode = min(dynamics.modes, key=lambda mode: abs(mode.frequency_hz - rig.resonance_hz))
-    top = int(np.argmax(drive))
-    actuator = PlayModel(shape.model.thresholds, dynamics.static_gain * shape.model.weights)
+    peak = int(np.argmax(drive))
+    actuator = PlayModel(hysteresis.model.thresholds, dynamics.static_gain * hysteresis.model.weights)
     return ModelErrors(
         100 * float(np.abs(model - truth).max() / np.ptp(truth)),
         100 * (mode.frequency_hz / rig.resonance_hz - 1),
         100 * (mode.damping / rig.damping - 1),
-        100 * float(model[top] / truth[top] - 1),
+        100 * float(model[peak] / truth[peak] - 1),
         dynamics.model.order,
-        *bound_tightness(rig, actuator, shape.max_error_um),
+        *bound_tightness(rig, actuator, hysteresis.max_error_um),
     )
 
 

@@ -9,12 +9,12 @@ from rtloop.design.paper import PAPER_C
 from rtloop.linear.discretise import discretise_controller
 from rtloop.linear.transfer import Transfer
 
-T = 1e-4
+PERIOD_S = 1e-4
 
 
 def test_plain_tustin_moves_the_notch_and_is_warned_about() -> None:
     """(w + z)/(w − z) with w = 2/T brings the zero pair s² + 43 s + 1.4e7 to 588.70 Hz."""
-    comparison = compare_controllers(PAPER_C, discretise_controller(PAPER_C, T, "tustin"))
+    comparison = compare_controllers(PAPER_C, discretise_controller(PAPER_C, PERIOD_S, "tustin"))
     notch = next(shift for shift in comparison.shifts if shift.kind == "notch")
     assert notch.frequency_hz == pytest.approx(595.50, abs=0.01)
     assert notch.discrete_hz == pytest.approx(588.70, abs=0.01)
@@ -28,7 +28,7 @@ def test_plain_tustin_moves_the_notch_and_is_warned_about() -> None:
 
 @pytest.mark.parametrize(("method", "prewarp_hz"), [("tustin", 595.5), ("matched", None), ("foh", None)])
 def test_methods_that_keep_the_notch_are_not(method, prewarp_hz) -> None:
-    comparison = compare_controllers(PAPER_C, discretise_controller(PAPER_C, T, method, prewarp_hz))
+    comparison = compare_controllers(PAPER_C, discretise_controller(PAPER_C, PERIOD_S, method, prewarp_hz))
     assert comparison.warnings == []
     notch = next(shift for shift in comparison.shifts if shift.kind == "notch")
     assert notch.discrete_hz == pytest.approx(595.5, abs=0.25)
@@ -53,20 +53,20 @@ def test_a_notch_above_half_the_sampling_rate_is_lost() -> None:
 
 def test_an_undamped_notch_is_judged_by_its_frequency() -> None:
     undamped = Transfer.from_factors(1, [[1, 0, 1.4e7]], [[1, 900], [1, 4000]])
-    assert compare_controllers(undamped, discretise_controller(undamped, T, "matched")).warnings == []
-    assert len(compare_controllers(undamped, discretise_controller(undamped, T, "tustin")).warnings) == 1
+    assert compare_controllers(undamped, discretise_controller(undamped, PERIOD_S, "matched")).warnings == []
+    assert len(compare_controllers(undamped, discretise_controller(undamped, PERIOD_S, "tustin")).warnings) == 1
 
 
 def test_two_notches_keep_their_own_images() -> None:
     notches = Transfer.from_factors(1, [[1, 10, 1.4e7], [1, 10, 1.5e7]], [[1, 900], [1, 4000], [1, 5000], [1, 6000]])
-    shifts = compare_controllers(notches, discretise_controller(notches, T, "tustin")).shifts
+    shifts = compare_controllers(notches, discretise_controller(notches, PERIOD_S, "tustin")).shifts
     assert len({shift.discrete_hz for shift in shifts}) == 2
     assert all(-0.02 < shift.relative < -0.01 for shift in shifts)
 
 
 def test_a_static_gain_has_nothing_to_compare() -> None:
     gain = Transfer.from_zpk([], [], 2.0)
-    comparison = compare_controllers(gain, discretise_controller(gain, T, "matched"))
+    comparison = compare_controllers(gain, discretise_controller(gain, PERIOD_S, "matched"))
     assert comparison.max_deviation == 0
     assert comparison.shifts == ()
     assert comparison.warnings == []

@@ -18,16 +18,16 @@ RESIDUAL_RIG = PlayModel(np.array(THRESHOLDS_V), np.array(RESIDUAL_WEIGHTS_UM_PE
 
 
 @st.composite
-def models(draw) -> PlayModel:
+def play_models(draw) -> PlayModel:
     """Draw a play model whose loading curve increases, with or without a dead band."""
     slopes = draw(st.lists(st.floats(0.2, 8.0), min_size=1, max_size=8))
     gaps = draw(st.lists(st.floats(0.05, 2.0), min_size=len(slopes), max_size=len(slopes)))
-    first = draw(st.sampled_from([0.0, gaps[0]]))
-    return PlayModel(np.cumsum([first, *gaps[1:]]), np.diff(slopes, prepend=0.0))
+    first_threshold = draw(st.sampled_from([0.0, gaps[0]]))
+    return PlayModel(np.cumsum([first_threshold, *gaps[1:]]), np.diff(slopes, prepend=0.0))
 
 
 @settings(deadline=None)
-@given(models(), models(), st.lists(st.floats(-1, 1), min_size=1, max_size=40))
+@given(play_models(), play_models(), st.lists(st.floats(-1, 1), min_size=1, max_size=40))
 def test_the_composition_is_the_operator_and_stays_within_its_bound(actuator, compensator, commands) -> None:
     inverse, v = compensator.remove_dead_band().inverse(), COMMAND_UM * np.array(commands)
     residual = residual_operator(actuator, inverse, COMMAND_UM)
@@ -40,7 +40,7 @@ def test_the_composition_is_the_operator_and_stays_within_its_bound(actuator, co
 
 
 @settings(deadline=None)
-@given(models(), models())
+@given(play_models(), play_models())
 def test_the_bound_is_reached(actuator, compensator) -> None:
     inverse = compensator.remove_dead_band().inverse()
     residual = residual_operator(actuator, inverse, COMMAND_UM)

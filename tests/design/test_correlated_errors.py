@@ -10,18 +10,18 @@ from rtloop.design.identification.dynamics.innovations import Innovations
 from rtloop.design.identification.dynamics.measured_levels import correct_levels
 from rtloop.design.identification.dynamics.prediction_error import Excitation, minimise_errors
 
-PERIOD_S, TICKS, LONG, NOISE_UM = 1e-4, 4000, 3000, 0.02
+PERIOD_S, TICKS, DWELL_TICKS, NOISE_UM = 1e-4, 4000, 3000, 0.02
 RESONANCE = 2 * np.pi * 800.0 * (-0.02 + 1j * np.sqrt(1 - 0.02**2))
-NONE = np.zeros(1, dtype=complex)
+NO_NOISE_GAINS = np.zeros(1, dtype=complex)
 RESIDUE = np.array([-1j], dtype=complex)
-SCALE = Innovations(PERIOD_S, np.array([RESONANCE]), RESIDUE, NONE).static_gain
-TRUTH = Innovations(PERIOD_S, np.array([RESONANCE]), np.array([RESIDUE[0] / SCALE]), NONE)
+SCALE = Innovations(PERIOD_S, np.array([RESONANCE]), RESIDUE, NO_NOISE_GAINS).static_gain
+TRUTH = Innovations(PERIOD_S, np.array([RESONANCE]), np.array([RESIDUE[0] / SCALE]), NO_NOISE_GAINS)
 
 
 @pytest.mark.parametrize("pole", [0.0, -0.9])
 def test_standard_deviations_are_the_spread_of_estimates_under_coloured_noise(pole: float) -> None:
     """150 recordings are fitted with H = 1, while their noise is white (pole 0) or an autoregression (pole -0.9)."""
-    random, u = np.random.default_rng(1), held_levels(TICKS // 2, 0.0, 20.0)
+    random, u = np.random.default_rng(1), repeat_levels(TICKS // 2, 0.0, 20.0)
     values, stated, assumed_white = [], [], []
     narrowest, widest = 0.8, 1.25
     for _ in range(150):
@@ -43,34 +43,34 @@ def test_standard_deviations_are_the_spread_of_estimates_under_coloured_noise(po
     assert white_deviates == (pole != 0), white_ratios
 
 
-def held_levels(dwell_ticks: int, *values: float) -> np.ndarray:
+def repeat_levels(dwell_ticks: int, *values: float) -> np.ndarray:
     """Return the values, each repeated for `dwell_ticks` samples."""
     return np.repeat(values, dwell_ticks).astype(float)
 
 
 def misjudged_levels(dwell_ticks: int, added_um: np.ndarray | float = 0.0) -> Excitation:
     """Return a recording: the hysteresis model gives 20.0 and 3.1 µm where the actuator holds 20.3 and 3.0."""
-    true_um = held_levels(dwell_ticks, 0.0, 20.3, 0.0, 3.0)
+    true_um = repeat_levels(dwell_ticks, 0.0, 20.3, 0.0, 3.0)
     noise_um = np.random.default_rng(2).normal(0.0, NOISE_UM, true_um.size)
     position_um = TRUTH.simulate_output(true_um) + noise_um + added_um
-    return Excitation("made", held_levels(dwell_ticks, 0.0, 20.0, 0.0, 3.1), position_um, PERIOD_S)
+    return Excitation("made", repeat_levels(dwell_ticks, 0.0, 20.0, 0.0, 3.1), position_um, PERIOD_S)
 
 
 def test_levels_that_the_hysteresis_model_misses_are_measured() -> None:
     """Corrected levels are proportional to the true ones; the factor is left to the static gain."""
-    before = misjudged_levels(LONG)
-    run, largest = correct_levels(before)
-    _, high, low, end = run.input[LONG // 2 :: LONG]
-    assert high / 20.3 == pytest.approx(end / 3.0, rel=1e-3)
+    misjudged = misjudged_levels(DWELL_TICKS)
+    corrected, largest_correction_um = correct_levels(misjudged)
+    _, high, low, last = corrected.input[DWELL_TICKS // 2 :: DWELL_TICKS]
+    assert high / 20.3 == pytest.approx(last / 3.0, rel=1e-3)
     assert low == pytest.approx(0.0, abs=2e-3)
-    assert largest == pytest.approx(np.abs(run.input - before.input).max())
+    assert largest_correction_um == pytest.approx(np.abs(corrected.input - misjudged.input).max())
 
 
 @pytest.mark.parametrize("reason", ["drift", "ringing", "short holds", "two levels"])
 def test_levels_are_left_alone_where_they_cannot_be_measured(reason: str) -> None:
-    time_s, u = PERIOD_S * np.arange(4 * LONG), held_levels(LONG, 0.0, 20.0)
+    time_s, u = PERIOD_S * np.arange(4 * DWELL_TICKS), repeat_levels(DWELL_TICKS, 0.0, 20.0)
     added_um = {"drift": 0.1 * time_s, "ringing": 0.1 * np.sin(5000.0 * time_s)}.get(reason, 0.0)
-    run = misjudged_levels(80 if reason == "short holds" else LONG, added_um)
+    run = misjudged_levels(80 if reason == "short holds" else DWELL_TICKS, added_um)
     if reason == "two levels":
         run = Excitation("made", u, 1.01 * TRUTH.simulate_output(u), PERIOD_S)
     assert correct_levels(run) == (run, 0.0)

@@ -15,7 +15,7 @@ from rtloop.linear.transfer import Transfer
 PERIOD_S = 1e-3
 
 
-def loop(axes: int, seed: int) -> tuple[CoupledLoop, control.StateSpace, control.StateSpace]:
+def draw_loop(axes: int, seed: int) -> tuple[CoupledLoop, control.StateSpace, control.StateSpace]:
     """Return a loop of integrators and coupled second-order plants; the same controller and plant in python-control."""
     random = np.random.default_rng(seed)
     omegas, dampings = random.uniform(60, 200, axes), random.uniform(0.1, 0.8, axes)
@@ -29,18 +29,18 @@ def loop(axes: int, seed: int) -> tuple[CoupledLoop, control.StateSpace, control
     coupled_loop = CoupledLoop(SampledCoupledSystem(system, PERIOD_S), CoupledPlant(transfers, delays, coupling))
     delayed_plants = []
     for w, z, ticks in zip(omegas, dampings, delays, strict=True):
-        held = control.c2d(control.ss(control.tf([w**2], [1.0, 2 * z * w, w**2])), PERIOD_S, "zoh")
+        sampled = control.c2d(control.ss(control.tf([w**2], [1.0, 2 * z * w, w**2])), PERIOD_S, "zoh")
         delay = control.ss([], [], [], 1.0, PERIOD_S)
         if ticks:
             delay = control.ss(control.tf([1.0], [1.0] + [0.0] * ticks, PERIOD_S))
-        delayed_plants.append(control.series(delay, held))
+        delayed_plants.append(control.series(delay, sampled))
     plant = control.append(*delayed_plants) * control.ss([], [], [], coupling, PERIOD_S)
     return coupled_loop, control.ss(*system, PERIOD_S), plant
 
 
 @pytest.mark.parametrize(("axes", "seed"), [(2, 0), (2, 1), (3, 2)])
 def test_s_is_that_of_python_control(axes, seed):
-    coupled_loop, controller, plant = loop(axes, seed)
+    coupled_loop, controller, plant = draw_loop(axes, seed)
     identity = control.ss([], [], [], np.eye(axes), PERIOD_S)
     hz = np.geomspace(0.5, 450.0, 40)
     expected = control.feedback(identity, plant * controller)(np.exp(2j * np.pi * hz * PERIOD_S))
@@ -55,7 +55,7 @@ def test_s_is_that_of_python_control(axes, seed):
 @pytest.mark.parametrize(("axes", "seed"), [(2, 0), (3, 2)])
 def test_a_loop_broken_alone_is_that_of_the_others_closed(axes, seed):
     """1 + l_i = 1/S_ii; the closed axis loop has the step response of that axis in the full loop."""
-    coupled_loop, controller, plant = loop(axes, seed)
+    coupled_loop, controller, plant = draw_loop(axes, seed)
     hz = np.geomspace(0.5, 450.0, 40)
     tracking = control.feedback(plant * controller, control.ss([], [], [], np.eye(axes), PERIOD_S))
     times_s = np.arange(300) * PERIOD_S
@@ -77,30 +77,30 @@ def largest_diagonal_gain(matrix: np.ndarray) -> float:
     count = matrix.shape[0]
     phases = np.linspace(0, 2 * np.pi, 91)
     grid = np.stack(np.meshgrid(*[phases] * (count - 1), indexing="ij"), axis=-1).reshape(-1, count - 1)
-    turns = np.exp(1j * np.hstack([np.zeros((grid.shape[0], 1)), grid]))
-    return float(np.abs(np.linalg.eigvals(turns[:, :, None] * matrix)).max())
+    rotations = np.exp(1j * np.hstack([np.zeros((grid.shape[0], 1)), grid]))
+    return float(np.abs(np.linalg.eigvals(rotations[:, :, None] * matrix)).max())
 
 
 @pytest.mark.parametrize(("axes", "seed"), [(2, 0), (2, 1), (2, 5), (3, 2), (3, 7)])
 def test_the_disk_margin_is_what_a_search_over_all_changes_finds(axes, seed):
-    coupled_loop, *_ = loop(axes, seed)
+    coupled_loop, *_ = draw_loop(axes, seed)
     margins = coupled_loop.margins
     hz = np.geomspace(1.0, 450.0, 300) if axes == 2 else margins.disk_margin_hz * np.geomspace(0.8, 1.25, 11)
     searched = max(largest_diagonal_gain(matrix) for matrix in coupled_loop.sensitivity(hz) - np.eye(axes) / 2)
     assert 1 / margins.disk_margin == pytest.approx(searched, rel=0.02)
-    assert 1 / margins.disk_margin >= searched * (1 - 1e-3)  # never promised more than there is
+    assert 1 / margins.disk_margin >= searched * (1 - 1e-3)  # the margin is not above the searched one
     expected = np.linalg.norm(coupled_loop.sensitivity(np.geomspace(1.0, 450.0, 300)), 2, axis=(1, 2)).max()
     assert margins.max_sensitivity == pytest.approx(expected, rel=0.01)
 
 
 def test_gains_within_the_disk_margin_keep_it_stable():
     """Every combination of the two sensors' extreme gains within the disk margin leaves the loop stable."""
-    coupled_loop, controller, plant = loop(2, 1)
-    disk = coupled_loop.margins.disk_margin
+    coupled_loop, controller, plant = draw_loop(2, 1)
+    margin = coupled_loop.margins.disk_margin
     for low in (0, 1):
         for high in (0, 1):
-            ends = (1 - disk / 2) / (1 + disk / 2) * 1.001, (1 + disk / 2) / (1 - disk / 2) * 0.999
-            gains = control.ss([], [], [], np.diag([ends[low], ends[high]]), PERIOD_S)
+            extremes = (1 - margin / 2) / (1 + margin / 2) * 1.001, (1 + margin / 2) / (1 - margin / 2) * 0.999
+            gains = control.ss([], [], [], np.diag([extremes[low], extremes[high]]), PERIOD_S)
             closed = control.feedback(gains * plant * controller, control.ss([], [], [], np.eye(2), PERIOD_S))
             assert np.abs(closed.poles()).max() < 1
 

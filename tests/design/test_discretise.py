@@ -33,20 +33,20 @@ def exact_c(zeros, poles, gain, method, prewarp_hz, hz):
         if method == "matched":
             zd, pd = [mp.exp(x * period) for x in zs], [mp.exp(x * period) for x in ps]
             zd += [mp.mpf(-1)] * (len(pd) - len(zd))
-            near = mp.mpf("1e-40")  # both gains are compared just beside s = 0, where an integrator's gain is finite
-            continuous = gain * mp.fprod(near - x for x in zs) / mp.fprod(near - x for x in ps)
-            at = mp.exp(near * period)
-            discrete = mp.fprod(at - x for x in zd) / mp.fprod(at - x for x in pd)
+            near_0 = mp.mpf("1e-40")  # the gains are compared near s = 0, where that of an integrator is finite
+            continuous = gain * mp.fprod(near_0 - x for x in zs) / mp.fprod(near_0 - x for x in ps)
+            near_1 = mp.exp(near_0 * period)
+            discrete = mp.fprod(near_1 - x for x in zd) / mp.fprod(near_1 - x for x in pd)
             return complex(continuous / discrete * mp.fprod(z - x for x in zd) / mp.fprod(z - x for x in pd))
         ps = [p + (abs(p) + 1) * (i + 1) * mp.mpf("1e-30") for i, p in enumerate(ps)]
         total = mp.mpf(gain if len(zs) == len(ps) else 0)
         for i, p in enumerate(ps):
             residue = gain * mp.fprod(p - x for x in zs) / mp.fprod(p - q for j, q in enumerate(ps) if j != i)
-            grown = mp.exp(p * period)
+            pole_z = mp.exp(p * period)
             if method == "zoh":
-                total += residue * (grown - 1) / p / (z - grown)
+                total += residue * (pole_z - 1) / p / (z - pole_z)
             else:  # (z − 1)²/(Tz) times the z transform of the sampled ramp response
-                total += residue * ((z - 1) ** 2 / (z - grown) - (z - 1) - p * period) / (period * p**2)
+                total += residue * ((z - 1) ** 2 / (z - pole_z) - (z - 1) - p * period) / (period * p**2)
         return complex(total)
 
 
@@ -119,8 +119,8 @@ roots = st.tuples(st.lists(rates, max_size=3), st.lists(pairs, max_size=3)).map(
 
 
 @settings(max_examples=100, deadline=None)
-@given(poles=roots, zeros=roots, repeat=st.booleans(), integrator=st.booleans(), how=st.sampled_from(METHODS))
-def test_any_controller(poles, zeros, repeat, integrator, how) -> None:
+@given(poles=roots, zeros=roots, repeat=st.booleans(), integrator=st.booleans(), rule=st.sampled_from(METHODS))
+def test_any_controller(poles, zeros, repeat, integrator, rule) -> None:
     """For any poles: state space = C(z), anti-windup stable and exact, steady state correct.
 
     The tolerance is 1e-7: zeros near 3 Hz among distant poles also cancel inside the cascade and cost digits (six zeros
@@ -130,10 +130,10 @@ def test_any_controller(poles, zeros, repeat, integrator, how) -> None:
     poles = (poles + poles if repeat and len(poles) <= 5 else poles) + ([0.0] if integrator else [])
     zeros = zeros[: len(poles)] if len(zeros) <= len(poles) else []
     transfer = Transfer.from_zpk(zeros, poles, float(np.prod([abs(p) or 1 for p in poles])))
-    controller = discretise_controller(transfer, T, *how)
-    assert worst_error(transfer, *how, hz=HZ[1::3]) < max(1e-7, rounding_error(controller, HZ[1::3]))
+    controller = discretise_controller(transfer, T, *rule)
+    assert worst_error(transfer, *rule, hz=HZ[1::3]) < max(1e-7, rounding_error(controller, HZ[1::3]))
     a, b, c, m = controller.a, controller.b, controller.c, controller.antiwindup
-    if np.abs(c).max(initial=0) > 1e-6:  # otherwise every pole has its zero
+    if np.abs(c).max(initial=0) > 1e-6:  # otherwise zeros cancel all poles
         assert c @ m == pytest.approx(1.0, rel=1e-9)
         assert np.abs(np.linalg.eigvals(a - np.outer(a @ m, c))).max() < 1
     if not integrator:
@@ -199,8 +199,8 @@ def test_dc_gain_is_kept() -> None:
 
 def test_unstable_controller_is_limited_stably() -> None:
     controller = discretise_controller(Transfer.from_factors(10, [[1, 50]], [[1, -30], [1, 700]]), T, "matched")
-    error = controller.a - np.outer(controller.a @ controller.antiwindup, controller.c)
-    assert np.abs(np.linalg.eigvals(error)).max() < 1
+    limited = controller.a - np.outer(controller.a @ controller.antiwindup, controller.c)
+    assert np.abs(np.linalg.eigvals(limited)).max() < 1
 
 
 @pytest.mark.parametrize(

@@ -47,7 +47,10 @@ def scalar_plant(a: float) -> GeneralisedPlant:
 
 @pytest.mark.parametrize("a", [-30.0, -1.0, 0.0, 0.5, 4.0])
 def test_a_scalar_plant_in_closed_form(a) -> None:
-    """X = Y = (a + √(a² + 1 − γ⁻²))/(1 − γ⁻²) and X·Y = γ² at γ_opt; √2 for a = 0."""
+    """X = Y = (a + √(a² + 1 − γ⁻²))/(1 − γ⁻²) and X·Y = γ² at γ_opt; √2 for a = 0.
+
+    For a < 0, γ_opt is below 1: the test computes only the norm of the loop.
+    """
 
     def gap(gamma: float) -> float:
         slope = 1 - gamma**-2
@@ -64,10 +67,10 @@ def test_the_zero_on_the_right_bounds_the_sensitivity() -> None:
     """With commands at no cost, min ‖W1 S‖∞ = |W1(z)| for a zero z on the right (Zames & Francis 1983)."""
     plant = Transfer.from_zpk([20.0], [-5.0, -40.0], -1.0)
     w1 = Transfer.from_zpk([-9.0], [-0.01], 0.5)
-    free = augment(plant, PAPER_WEIGHTS._replace(
+    augmented = augment(plant, PAPER_WEIGHTS._replace(
         tracking=w1, command=Transfer.from_zpk([], [], 1e-5), disturbance=Transfer.from_zpk([], [], 0.0)
     ))  # fmt: skip
-    assert synthesise_hinf(free).gamma_opt == pytest.approx(0.5 * 29 / 20.01, rel=1e-3)
+    assert synthesise_hinf(augmented).gamma_opt == pytest.approx(0.5 * 29 / 20.01, rel=1e-3)
 
 
 @pytest.mark.parametrize("seed", [0, 1, 2, 4, 5, 6, 8, 13, 23, 29, 30])
@@ -123,7 +126,7 @@ def test_the_papers_problem_as_slicot(plant) -> None:
     assert solution.gamma_opt == pytest.approx(run_slicot(standard, 2 * solution.gamma_opt)[0], rel=1e-4)
 
 
-def altered(**parts) -> GeneralisedPlant:
+def variant(**parts) -> GeneralisedPlant:
     """Return the scalar plant with a = 1 and the given matrices replaced."""
     return scalar_plant(1.0)._replace(**{name: np.array(value, dtype=float) for name, value in parts.items()})
 
@@ -134,15 +137,15 @@ INTEGRATING = PAPER_WEIGHTS._replace(tracking=Transfer.from_zpk([-1000.0], [0.0]
 @pytest.mark.parametrize(
     ("plant", "gamma", "message"),
     [
-        (altered(b2=[[0]]), None, r"stabilisability: the command u does not move the mode at s = 1 rad/s"),
-        (altered(c2=[[0]]), None, r"detectability: the measurement y does not show the mode at s = 1 rad/s"),
-        (altered(d12=[[0], [0]]), None, r"rank: D12 has rank 0 of 1.*full column rank. Give every command u a weight"),
+        (variant(b2=[[0]]), None, r"stabilisability: the command u does not move the mode at s = 1 rad/s"),
+        (variant(c2=[[0]]), None, r"detectability: the measurement y does not show the mode at s = 1 rad/s"),
+        (variant(d12=[[0], [0]]), None, r"rank: D12 has rank 0 of 1.*full column rank. Give every command u a weight"),
         (
-            altered(d21=[[0, 0]]),
+            variant(d21=[[0, 0]]),
             None,
             r"rank: D21 has rank 0 of 1.*full row rank. Give every measurement y a disturbance",
         ),
-        (altered(b2=[[0]], c2=[[0]]), None, r"stabilisability.*; detectability"),
+        (variant(b2=[[0]], c2=[[0]]), None, r"stabilisability.*; detectability"),
         (scalar_plant(0.0)._replace(c1=np.zeros((2, 1))), None, r"zero: the path from u to z .* ω = 0 rad/s"),
         (scalar_plant(0.0)._replace(b1=np.zeros((1, 2))), None, r"zero: the path from w to y .* ω = 0 rad/s"),
         (scalar_plant(0.0), 1.2, "coupling"),
@@ -167,7 +170,7 @@ def test_the_condition_that_fails_is_named(plant, gamma, message) -> None:
 
 
 def test_an_error_that_the_command_can_cancel_directly_has_a_controller() -> None:
-    plant = altered(c1=[[1], [1]], d12=[[1], [1]], d11=[[0, 0], [0, 0]])
+    plant = variant(c1=[[1], [1]], d12=[[1], [1]], d11=[[0, 0], [0, 0]])
     assert synthesise_hinf(plant).achieved < math.inf
 
 

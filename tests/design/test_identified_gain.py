@@ -44,7 +44,7 @@ def simulate_rows(count: int) -> tuple[np.ndarray, np.ndarray]:
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Folder with the rows (npz), a specification, and per delay convention a recording, a model and printed text."""
+    """Return a folder with the rows (npz), a specification, and recording, model and output per delay convention."""
     folder = tmp_path_factory.mktemp("rows")
     drive_v, position_um = simulate_rows(6000)
     time_s = np.arange(drive_v.size) / RATE_HZ
@@ -120,17 +120,17 @@ def test_synthesis_prints_the_verdict_of_check_and_explains_gamma(folder: Path) 
     """The default weight misses this specification by the factor γ; a lenient tracking weight meets it."""
     strict = "the loop misses static error, settling (5 %)"
     lenient = SPEC + '[weights.tracking]\nform = "zpk"\ngain = 0.99\nzeros = [[-600.0, 0.0]]\npoles = [[-0.1, 0.0]]\n'
-    for name, text, words in (("strict", SPEC, strict), ("lenient", lenient, "the loop meets its specification")):
+    for name, text, expected in (("strict", SPEC, strict), ("lenient", lenient, "the loop meets its specification")):
         spec, out = folder / f"{name}.toml", folder / f"{name}-made.toml"
         spec.write_text(text, encoding="utf-8")
         result = run("design", "synthesise", spec, "--model", folder / "first.toml", "--out", out)
         assert result.exit_code == 0, result.output
         (verdict,) = [line for line in result.stdout.splitlines() if line.startswith(f"{spec}: ")]
-        assert words in verdict
+        assert expected in verdict
         assert verdict.removeprefix(f"{spec}: ") in " ".join(run("check", out).stdout.split())
         assert "fails" not in result.stderr
         assert "is the smallest γ that a controller reaches" in result.stderr
-        assert words in answer("design", "synthesise", spec, "--model", folder / "first.toml")["verdict"]
+        assert expected in answer("design", "synthesise", spec, "--model", folder / "first.toml")["verdict"]
 
 
 def test_a_file_without_a_model_is_refused(folder: Path) -> None:

@@ -70,20 +70,20 @@ ki_per_s = 15.0
 """
 
 
-def command(*arguments: str | Path) -> Result:
+def invoke(*arguments: str | Path) -> Result:
     """Run the rtloop command line in this process and return its result."""
     return CliRunner().invoke(main, [str(argument) for argument in arguments])
 
 
 def report(*arguments: str | Path) -> dict[str, Any]:
     """Run a command with --json, assert success and return the parsed output."""
-    result = command(*arguments, "--json")
+    result = invoke(*arguments, "--json")
     assert result.exit_code == 0, result.output
     return json.loads(result.stdout)
 
 
 def change_config(folder: Path, name: str, *changes: tuple[str, str]) -> Path:
-    """Write a shipped configuration with (old, new) texts replaced into the folder; return its path."""
+    """Replace (old, new) texts of a shipped configuration, write it into the folder and return its path."""
     text = (DEPLOY / name).read_text()
     for old, new in changes:
         assert text.count(old) == 1, old
@@ -94,7 +94,7 @@ def change_config(folder: Path, name: str, *changes: tuple[str, str]) -> Path:
 
 
 def record_config(config: Path, duration_s: float, folder: Path) -> Path:
-    """Return a recording of the real law on the simulated rig, made in this process."""
+    """Record the real law on the simulated rig in this process; return the path of the recording."""
     return record(folder / f"{config.stem}.mcap", config.read_text(), round(duration_s * loop_rate_hz(config)))[0]
 
 
@@ -110,13 +110,13 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def sine(folder: Path) -> Path:
-    """Return a recording of 25 s of the slow sine."""
+    """Return the path of a recording of 25 s of the slow sine."""
     return record_config(DEPLOY / "characterise.toml", 25, folder)
 
 
 @pytest.fixture(scope="module")
 def step(folder: Path) -> Path:
-    """Return a recording of the step, made by `rtloop run` in a process."""
+    """Return the path of a recording of the step, made by `rtloop run` in a process."""
     code, summary, _ = run(DEPLOY / "step-response.toml", "--duration", "1", "--unpaced", "--out", folder)
     assert code == 0
     return Path(summary["recording"])
@@ -124,7 +124,7 @@ def step(folder: Path) -> Path:
 
 @pytest.fixture(scope="module")
 def section(folder: Path, sine: Path) -> Path:
-    """Return the file with the [axis.feedforward] identified from the slow sine."""
+    """Return the path of the TOML file with the [axis.feedforward] identified from the slow sine."""
     out = folder / "hysteresis.toml"
     result = report("identify", "hysteresis", sine, "--out", out, "--plot", folder / "hysteresis.png")
     assert result["invertible"]
@@ -170,30 +170,30 @@ def test_the_dynamics_of_a_loop_that_stays_closed(tmp_path: Path) -> None:
     assert mode["frequency_hz"] == pytest.approx(320.0, rel=0.002)
     assert mode["damping"] == pytest.approx(0.01, rel=0.1)
     assert model["loop"] == {"from_tick": 0, "to_tick": 10_000, "outside": ["x_reference_um", "x_feed_um"]}
-    printed = command("identify", "dynamics", path, "--order", "2", "--delay", "1").stdout
+    printed = invoke("identify", "dynamics", path, "--order", "2", "--delay", "1").stdout
     assert "; ticks 0 to 9999, moved by x_reference_um" in printed.replace("\n", " ")  # 10,000 ticks, the first is 0
     assert "instrumental variables" in model["method"]
     assert "instrumental variables" in (tmp_path / "model.toml").read_text()
-    assert command("export", path, "--to", "mat", "--out", tmp_path / "chirp.mat").exit_code == 0
-    assert command("import", tmp_path / "chirp.mat", "--out", tmp_path / "again.mcap").exit_code == 0
-    again = report("identify", "dynamics", tmp_path / "again.mcap", "--input", "drive", "--order", "2", "--delay", "2")
-    assert again["modes"][0]["frequency_hz"] == pytest.approx(mode["frequency_hz"], rel=1e-5)
-    opened = command("identify", "dynamics", path, "--loop", "open", "--order", "2", "--delay", "1")
-    assert "instrumental variables" not in opened.output
-    at_rest = text.replace(CHIRP, 'kind = "sine"\namplitude = 8.0\nfrequency_hz = 2.0')
-    limited = record(tmp_path / "limited.mcap", at_rest.replace("command_um = 42.0", "command_um = 2.0"), 4000)[0]
-    for says, *arguments in (
+    assert invoke("export", path, "--to", "mat", "--out", tmp_path / "chirp.mat").exit_code == 0
+    assert invoke("import", tmp_path / "chirp.mat", "--out", tmp_path / "again.mcap").exit_code == 0
+    copy = report("identify", "dynamics", tmp_path / "again.mcap", "--input", "drive", "--order", "2", "--delay", "2")
+    assert copy["modes"][0]["frequency_hz"] == pytest.approx(mode["frequency_hz"], rel=1e-5)
+    open_loop = invoke("identify", "dynamics", path, "--loop", "open", "--order", "2", "--delay", "1")
+    assert "instrumental variables" not in open_loop.output
+    sine_text = text.replace(CHIRP, 'kind = "sine"\namplitude = 8.0\nfrequency_hz = 2.0')
+    limited = record(tmp_path / "limited.mcap", sine_text.replace("command_um = 42.0", "command_um = 2.0"), 4000)[0]
+    for message, *arguments in (
         ("a limit changed the command at tick", limited, "--input", "command"),
         ("the recording has no x_wobble", path, "--outside", "x_wobble"),
         ("an imported recording has no model of the hysteresis; use --hysteresis FILE", tmp_path / "again.mcap"),
     ):
-        result = command("identify", "dynamics", *arguments)
-        assert (result.exit_code, says in result.stderr) == (1, True), result.output
-    held = text.replace(CHIRP, 'kind = "hold"\nvalue = 8.0')
-    for says, ticks in (("no external excitation: the reference is constant", 17_000), ("needs at least 0.04 s", 300)):
-        still = record(tmp_path / f"{ticks}.mcap", held, ticks)[0]
-        result = command("identify", "dynamics", path, "--order", "2", "--delay", "1", "--compare", still)
-        assert (result.exit_code, says in result.stderr) == (1, True), result.output
+        result = invoke("identify", "dynamics", *arguments)
+        assert (result.exit_code, message in result.stderr) == (1, True), result.output
+    held_text = text.replace(CHIRP, 'kind = "hold"\nvalue = 8.0')
+    for cause, ticks in (("no external excitation: the reference is constant", 17_000), ("needs at least 0.04 s", 300)):
+        constant = record(tmp_path / f"{ticks}.mcap", held_text, ticks)[0]
+        result = invoke("identify", "dynamics", path, "--order", "2", "--delay", "1", "--compare", constant)
+        assert (result.exit_code, cause in result.stderr) == (1, True), result.output
 
 
 def test_what_the_compensation_in_use_leaves(section: Path) -> None:
@@ -211,11 +211,11 @@ def test_an_inverse_leaves_only_the_dead_band_of_its_own_model(tmp_path: Path) -
     same.write_text(model.format(1.3))
     different.write_text(model.format(1.4))
     for config, actuator, is_same in ((same, same, True), (paper, paper, True), (same, different, False)):
-        words = ("design", "compensation", config, "--actuator", actuator, "--command-um", "5")
-        result = report(*words)
+        arguments = ("design", "compensation", config, "--actuator", actuator, "--command-um", "5")
+        result = report(*arguments)
         assert result["same_model"] == is_same
         assert (result["bounds"][0]["xi_um"] < 1e-9) == (config is actuator is same)
-        assert ("warning: the actuator equals the model" in command(*words).stderr) == is_same
+        assert ("warning: the actuator equals the model" in invoke(*arguments).stderr) == is_same
 
 
 def test_of_several_axes_the_compensation_is_that_of_the_first_as_its_help_says(tmp_path: Path) -> None:
@@ -225,11 +225,11 @@ def test_of_several_axes_the_compensation_is_that_of_the_first_as_its_help_says(
     arguments = ("design", "compensation", DEPLOY / "two-axis.toml", "--actuator", actuator)
     weights = [report(*arguments, *option)["weights"] for option in ((), ("--axis", "x"), ("--axis", "y"))]
     assert weights[0] == weights[1] != weights[2]
-    assert "[default: the first axis]" in command("design", "compensation", "--help").stdout
+    assert "[default: the first axis]" in invoke("design", "compensation", "--help").stdout
 
 
 @pytest.mark.parametrize(
-    "words",
+    "arguments",
     [
         ("design", "auto", "none.mcap", "none.mcap", "--specs", "none.toml"),
         ("identify", "hysteresis", "none.mcap"),
@@ -239,19 +239,19 @@ def test_of_several_axes_the_compensation_is_that_of_the_first_as_its_help_says(
         ("ctl", "--socket", "none.sock", "learn", "x", "scan.txt"),
     ],
 )
-def test_an_existing_file_is_refused_before_the_work(words: tuple[str, ...], tmp_path: Path) -> None:
+def test_an_existing_file_is_refused_before_the_work(arguments: tuple[str, ...], tmp_path: Path) -> None:
     """The command refuses before it reads a recording or connects to a service: neither of them exists here."""
     out = tmp_path / "precious"
     out.write_text("precious")
     (tmp_path / "scan.txt").write_text("0.0\n1.0\n")
-    result = command(*(tmp_path / word if "." in word else word for word in words), "--out", out)
+    result = invoke(*(tmp_path / argument if "." in argument else argument for argument in arguments), "--out", out)
     assert (result.exit_code, out.read_text()) == (73, "precious"), result.output
     assert f"{out}: exists already" in result.stderr
 
 
 def test_an_existing_file_is_not_overwritten(section: Path, sine: Path) -> None:
     before = section.read_text()
-    result = command("identify", "hysteresis", sine, "--out", section)
+    result = invoke("identify", "hysteresis", sine, "--out", section)
     assert result.exit_code == 73
     assert f"{section}: exists already" in result.stderr
     assert section.read_text() == before
@@ -274,21 +274,21 @@ def test_an_existing_file_is_not_overwritten(section: Path, sine: Path) -> None:
 def test_a_run_that_shows_too_little_is_refused(tmp_path: Path, kind, name, duration_s, old, new, messages) -> None:
     """The run tripped, its ADC of ±4 V reads ±40 µm of ±43 µm, or its drive is too small."""
     recording = record_config(change_config(tmp_path, name, (old, new)), duration_s, tmp_path)
-    result = command("identify", kind, recording, "--json")
+    result = invoke("identify", kind, recording, "--json")
     assert result.exit_code == 1
-    assert all(words in json.loads(result.stdout)["error"] for words in messages)
+    assert all(message in json.loads(result.stdout)["error"] for message in messages)
 
 
 def test_a_drive_that_is_no_slow_sine_is_named(tmp_path: Path, sine: Path, step: Path) -> None:
     """`design auto` refuses swapped recordings; `identify hysteresis` warns of a step and of a controller's drive."""
     out = tmp_path / "out.toml"
-    swapped = command("design", "auto", step, sine, "--specs", DEPLOY / "own-stage-spec.toml", "--out", out)
+    swapped = invoke("design", "auto", step, sine, "--specs", DEPLOY / "own-stage-spec.toml", "--out", out)
     assert swapped.exit_code == 1
     assert f"the two recordings seem to be swapped: {step} has steps of the drive, {sine} has none" in swapped.stderr
     assert not out.exists()
     closed = record_config(DEPLOY / "paper.toml", 1, tmp_path)
     for recording, cause in ((closed, "a controller computed the drive"), (step, "the drive has steps"), (sine, None)):
-        identified = command("identify", "hysteresis", recording)
+        identified = invoke("identify", "hysteresis", recording)
         warnings = [line for line in identified.stderr.splitlines() if line.startswith("warning: ")]
         assert [line for line in warnings if f"{cause}" in line] == warnings
         assert len(warnings) == (0 if cause is None else 1), identified.output
@@ -299,10 +299,10 @@ def test_an_imported_step_is_refused_because_it_has_no_configuration(
     tmp_path: Path, sine: Path, step: Path, more
 ) -> None:
     out, imported = tmp_path / "out.toml", tmp_path / "step.mcap"
-    assert command("export", step, "--to", "mat", "--out", tmp_path / "step.mat").exit_code == 0
-    assert command("import", tmp_path / "step.mat", "--out", imported).exit_code == 0
+    assert invoke("export", step, "--to", "mat", "--out", tmp_path / "step.mat").exit_code == 0
+    assert invoke("import", tmp_path / "step.mat", "--out", imported).exit_code == 0
     arguments = ("design", "auto", sine, imported, "--specs", DEPLOY / "own-stage-spec.toml", "--out", out, *more)
-    result = command(*arguments)
+    result = invoke(*arguments)
     assert (result.exit_code, out.exists()) == (1, False), result.output
     assert f"{imported}: an imported recording has no configuration" in result.stderr
     assert "Record the step with `rtloop run`" in result.stderr
@@ -328,7 +328,7 @@ def test_mistakes_end_with_their_exit_codes(tmp_path: Path, sine: Path, section:
     unequal = tmp_path / "unequal.toml"
     unequal.write_text("[axis.feedforward]\nthresholds_v = [0.0, 1.0]\nweights_um_per_v = [1.0]\n")
     missing, paper = tmp_path / "nothing.mcap", DEPLOY / "paper.toml"
-    for code, says, *arguments in (
+    for code, message, *arguments in (
         (66, "nothing.mcap", "identify", "hysteresis", missing),
         (66, "no axis 'y'; select one of x", "identify", "hysteresis", sine, "--axis", "y"),
         (2, "numbers separated by commas", "identify", "hysteresis", sine, "--thresholds", "a,b"),
@@ -337,8 +337,8 @@ def test_mistakes_end_with_their_exit_codes(tmp_path: Path, sine: Path, section:
         (78, "allowed: every partial sum above 0", "design", "compensation", broken, "--actuator", section),
         (78, "thresholds and", "design", "compensation", paper, "--actuator", unequal),
     ):
-        result = command(*arguments)
-        assert (result.exit_code, says in result.stderr) == (code, True), (arguments, result.output)
+        result = invoke(*arguments)
+        assert (result.exit_code, message in result.stderr) == (code, True), (arguments, result.output)
         assert "Traceback" not in result.output
 
 
@@ -349,7 +349,7 @@ def test_one_command_makes_a_configuration_that_runs_as_promised(folder: Path, s
     The position agrees within 5 % of the step at each promised time, the settling time within 1.5 ms.
     """
     out = folder / "my.toml"
-    result = command("design", "auto", sine, step, "--specs", DEPLOY / "paper-spec.toml", "--out", out, "--json")
+    result = invoke("design", "auto", sine, step, "--specs", DEPLOY / "paper-spec.toml", "--out", out, "--json")
     verdict = json.loads(result.stdout)
     assert result.exit_code == (0 if verdict["meets"] else 1)
     text = out.read_text()

@@ -44,7 +44,7 @@ def excitation(
     return Excitation("rig", GAIN_UM_PER_V * drive_v, 10.0 * adc_v, PERIOD_S)
 
 
-def up_and_down(duration_s: float = 0.6) -> np.ndarray:
+def up_and_down_drive(duration_s: float = 0.6) -> np.ndarray:
     """Return a drive (V): 0, then 10 from 0.05 s to 55 % of the duration, then 0."""
     time_s = PERIOD_S * np.arange(round(duration_s / PERIOD_S))
     return np.where((time_s >= 0.05) & (time_s < 0.55 * duration_s), 10.0, 0.0)
@@ -56,7 +56,7 @@ def up_and_down(duration_s: float = 0.6) -> np.ndarray:
 )
 def test_the_delay_is_found_and_no_pole_stands_in_for_it(drive, delay_ticks) -> None:
     """Up and down leaves the second half for a test of the fit; one step leaves only the fit itself."""
-    drive_v = up_and_down() if drive == "up and down" else np.where(np.arange(3000) < 500, 0.0, 10.0)
+    drive_v = up_and_down_drive() if drive == "up and down" else np.where(np.arange(3000) < 500, 0.0, 10.0)
     fit = identify_dynamics(excitation(800.0, 0.02, delay_ticks, drive_v))
     assert fit.delay_ticks == delay_ticks
     assert fit.model.order == 2
@@ -72,7 +72,7 @@ def test_a_noisy_drive_tells_the_delay_too() -> None:
 
 
 def test_a_fast_lag_does_not_stand_in_for_a_sample_of_delay() -> None:
-    fit = identify_dynamics(excitation(800.0, 0.02, 2, up_and_down(0.3), 4000.0), criterion="held-out")
+    fit = identify_dynamics(excitation(800.0, 0.02, 2, up_and_down_drive(0.3), 4000.0), criterion="held-out")
     assert fit.delay_ticks == 2
     lag = max(fit.modes, key=lambda mode: mode.damping)
     assert abs(lag.frequency_hz - 4000.0) < 4 * lag.frequency_std_hz
@@ -101,7 +101,7 @@ def test_fewest_poles_win_among_equally_good_predictions(candidates: list[Candid
 @pytest.mark.parametrize("criterion", ["aic", "held-out"])
 def test_creep_is_not_taken_for_a_mode(criterion) -> None:
     """Creep is 0.08 µm per factor e of time; a mode slower than the recording would fit it and falsify D(0)."""
-    drive_v = up_and_down()
+    drive_v = up_and_down_drive()
     run = excitation(800.0, 0.02, 1, drive_v)
     creep_um = 0.08 * np.log1p(np.maximum(PERIOD_S * np.arange(drive_v.size) - 0.05, 0.0) / 0.01)
     fit = identify_dynamics(replace(run, position_um=run.position_um + creep_um), criterion=criterion)
@@ -113,9 +113,9 @@ def test_creep_is_not_taken_for_a_mode(criterion) -> None:
 
 def test_a_stage_that_has_not_settled_by_the_end_is_refused() -> None:
     """With a lag of 2 s, a recording of 0.6 s does not determine the final position."""
-    run = Excitation("rig", up_and_down(), np.zeros(6000), PERIOD_S)
-    lag = 1 - np.exp(-PERIOD_S / 2.0)
-    position_um = lfilter([0.0, lag], [1.0, lag - 1.0], run.input) + np.random.default_rng(1).normal(
+    run = Excitation("rig", up_and_down_drive(), np.zeros(6000), PERIOD_S)
+    decay = 1 - np.exp(-PERIOD_S / 2.0)
+    position_um = lfilter([0.0, decay], [1.0, decay - 1.0], run.input) + np.random.default_rng(1).normal(
         scale=1e-3, size=6000
     )
     with pytest.raises(

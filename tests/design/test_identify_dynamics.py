@@ -61,7 +61,7 @@ def test_a_chirp_serves_as_well_and_so_does_validation_on_a_step() -> None:
     assert abs(light.frequency_hz - rig.resonance_hz) < 0.5
     assert fit.static_gain == pytest.approx(rig.d0, rel=0.01)
     assert fit.transfer.dc_gain == pytest.approx(1.0, abs=1e-12)
-    assert min(c.validation_rms_um for c in fit.candidates) < 0.2
+    assert min(candidate.validation_rms_um for candidate in fit.candidates) < 0.2
 
 
 @pytest.mark.parametrize("signs", [(-1.0, 1.0), (1.0, -1.0)])
@@ -95,11 +95,11 @@ def test_standard_deviations_are_those_of_repeated_experiments() -> None:
     )
     runs = [Excitation("made", drive, clean + random.normal(0, 0.02, drive.size), FAST_S) for _ in range(12)]
     fits = [identify_dynamics(run, order=3) for run in runs]
-    pairs = [min(fit.modes, key=lambda mode: mode.damping) for fit in fits]
-    size_hz, damping = abs(PAIR_AND_REAL.rates[0]) / (2 * np.pi), 200 / abs(PAIR_AND_REAL.rates[0])
+    pair_modes = [min(fit.modes, key=lambda mode: mode.damping) for fit in fits]
+    natural_hz, damping = abs(PAIR_AND_REAL.rates[0]) / (2 * np.pi), 200 / abs(PAIR_AND_REAL.rates[0])
     for values, deviations, true in (
-        ([mode.frequency_hz for mode in pairs], [mode.frequency_std_hz for mode in pairs], size_hz),
-        ([mode.damping for mode in pairs], [mode.damping_std for mode in pairs], damping),
+        ([mode.frequency_hz for mode in pair_modes], [mode.frequency_std_hz for mode in pair_modes], natural_hz),
+        ([mode.damping for mode in pair_modes], [mode.damping_std for mode in pair_modes], damping),
     ):
         assert np.std(values) == pytest.approx(np.mean(deviations), rel=0.6)
         assert abs(np.mean(values) - true) < 4 * np.mean(deviations) / np.sqrt(12)
@@ -114,10 +114,10 @@ def test_sensitivities_are_the_derivatives_of_the_errors() -> None:
     values = PAIR_AND_REAL.pack(noise=True)
     for i, row in enumerate(rows):
         h = 1e-6 * max(abs(values[i]), 1.0)
-        sides = [
+        shifted = [
             PAIR_AND_REAL.unpack(values + s * h * np.eye(values.size)[i], noise=True).errors(u, y) for s in (1, -1)
         ]
-        assert np.allclose((sides[0] - sides[1]) / (2 * h), row, rtol=1e-5, atol=1e-6 * np.abs(row).max())
+        assert np.allclose((shifted[0] - shifted[1]) / (2 * h), row, rtol=1e-5, atol=1e-6 * np.abs(row).max())
 
 
 def test_residues_are_fitted_under_the_noise_model() -> None:
@@ -126,13 +126,13 @@ def test_residues_are_fitted_under_the_noise_model() -> None:
     u, noise = random.normal(size=400), 0.01 * random.normal(size=400)
     y = PAIR_AND_REAL.simulate_output(u) + noise
 
-    def model(values: np.ndarray) -> Innovations:
+    def make_model(values: np.ndarray) -> Innovations:
         residues = np.array([values[0] + 1j * values[1], values[2]])
         return dataclasses.replace(PAIR_AND_REAL, residues=residues, offset=float(values[3]))
 
-    optimum = least_squares(lambda values: model(values).errors(u, y), np.zeros(4), jac="3-point", xtol=1e-14)
-    fitted = fit_residues(model(np.zeros(4)), u, y)
-    assert np.allclose(fitted.residues, model(optimum.x).residues, atol=1e-8)
+    optimum = least_squares(lambda values: make_model(values).errors(u, y), np.zeros(4), jac="3-point", xtol=1e-14)
+    fitted = fit_residues(make_model(np.zeros(4)), u, y)
+    assert np.allclose(fitted.residues, make_model(optimum.x).residues, atol=1e-8)
     assert fitted.offset == pytest.approx(optimum.x[3], abs=1e-8)
 
 
@@ -140,8 +140,8 @@ def test_errors_are_those_of_the_armax_polynomials() -> None:
     """The oracle is ε from A y − B u = C ε with multiplied-out polynomials, which is accurate for three poles."""
     random = np.random.default_rng(2)
     u, y = random.normal(size=50), random.normal(size=50)
-    images, pair = PAIR_AND_REAL.z_poles, PAIR_AND_REAL.discrete()
-    a = np.poly([images[0], images[0].conj(), images[1]]).real
+    z_poles, pair = PAIR_AND_REAL.z_poles, PAIR_AND_REAL.discrete()
+    a = np.poly([z_poles[0], z_poles[0].conj(), z_poles[1]]).real
 
     def numerator(residues: np.ndarray) -> np.ndarray:
         terms = [np.poly(np.delete(pair.poles, i)) * r for i, r in enumerate(residues)]
@@ -151,11 +151,11 @@ def test_errors_are_those_of_the_armax_polynomials() -> None:
     b = numerator(pair.residues[0])
     c = a + np.concatenate([[0.0], numerator(np.array([gains[0], gains[1], gains[0].conj()]))])
     centred, expected = y - PAIR_AND_REAL.offset, np.zeros(50)
-    past = lambda signal, k, i: signal[k - i] if k >= i else 0.0
+    delayed = lambda signal, k, i: signal[k - i] if k >= i else 0.0
     for k in range(50):
-        expected[k] = centred[k] + sum(a[i] * past(centred, k, i) for i in (1, 2, 3))
-        expected[k] -= sum(b[i] * past(u, k, i + 1) for i in range(3))
-        expected[k] -= sum(c[i] * past(expected, k, i) for i in (1, 2, 3))
+        expected[k] = centred[k] + sum(a[i] * delayed(centred, k, i) for i in (1, 2, 3))
+        expected[k] -= sum(b[i] * delayed(u, k, i + 1) for i in range(3))
+        expected[k] -= sum(c[i] * delayed(expected, k, i) for i in (1, 2, 3))
     assert np.allclose(PAIR_AND_REAL.errors(u, y), expected, atol=1e-10)
 
 
@@ -164,8 +164,8 @@ def hold_exactly(modal: ModalSystem, period_s: float) -> list[tuple[mpmath.mpc, 
     modes = []
     for pole, residue in zip(modal.poles, modal.residues[0], strict=True):
         p, r = mpmath.mpc(pole), mpmath.mpc(residue)
-        image = mpmath.exp(p * mpmath.mpf(period_s))
-        modes.append((image, r * (image - 1) / p))
+        pole_z = mpmath.exp(p * mpmath.mpf(period_s))
+        modes.append((pole_z, r * (pole_z - 1) / p))
     return modes
 
 
@@ -183,9 +183,9 @@ def test_the_inverse_hold_keeps_its_digits(case: str) -> None:
     else:
         modal = ModalSystem(np.array([-1.0 + 0j, -1e5 + 0j]), np.array([[2.0 + 0j, -3e4 + 0j]]), np.zeros(1))
     with mpmath.workdps(50):
-        held = hold_exactly(modal, FAST_S)
+        exact = hold_exactly(modal, FAST_S)
     discrete = ModalSystem(
-        np.array([complex(image) for image, _ in held]), np.array([[complex(r) for _, r in held]]), np.zeros(1)
+        np.array([complex(pole) for pole, _ in exact]), np.array([[complex(r) for _, r in exact]]), np.zeros(1)
     )
     rates = np.log(discrete.poles) / FAST_S
     recovered = continuous_modal(rates, discrete.residues, discrete.direct, FAST_S)
@@ -203,12 +203,12 @@ def test_twenty_modes_and_slow_beside_fast_are_predicted_exactly() -> None:
     assert model.order == 20
     u = np.random.default_rng(4).normal(size=300)
     with mpmath.workdps(50):
-        images = [mpmath.exp(mpmath.mpc(rate) * mpmath.mpf(FAST_S)) for rate in rates]
+        z_poles = [mpmath.exp(mpmath.mpc(rate) * mpmath.mpf(FAST_S)) for rate in rates]
         states, expected = [mpmath.mpc(0)] * 11, []
         for value in u:
             sums = [(2 if rate.imag else 1) * r * x for rate, r, x in zip(rates, residues, states, strict=True)]
             expected.append(float(mpmath.fsum(sums).real))
-            states = [image * x + mpmath.mpf(float(value)) for image, x in zip(images, states, strict=True)]
+            states = [pole * x + mpmath.mpf(float(value)) for pole, x in zip(z_poles, states, strict=True)]
     assert np.allclose(model.simulate_output(u), expected, rtol=1e-11, atol=1e-12)
 
 

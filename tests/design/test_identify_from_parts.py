@@ -57,7 +57,7 @@ def test_within_what_was_covered_a_past_is_a_constant(seed: int) -> None:
 
 @pytest.mark.parametrize("seed", [0, 1, 2, 103])
 def test_not_knowing_the_memory_costs_little(seed: int) -> None:
-    """The rigs are the first three of the soak, and one with a recording that the others cover less than it seems."""
+    """The rigs are the first three of the soak, and rig 103: its recordings cover one of them less than it seems."""
     rig = random_rig(seed)
     fit, known_fit = fit_unknown_and_known_memory(rig)
     assert reported_um(fit, fit) <= ALLOWED_RATIO * reported_um(known_fit, fit)
@@ -66,8 +66,8 @@ def test_not_knowing_the_memory_costs_little(seed: int) -> None:
 
 def test_a_recording_whose_memory_is_never_known_is_not_judged() -> None:
     drive = 1.0 + 8.0 * np.sin(np.linspace(0.5, 9.0, SAMPLES))
-    straight = np.linspace(-5.0, 5.0, SAMPLES)
-    runs = [make_recording(drive_v, sum_of_plays(drive_v)) for drive_v in (drive, straight)]
+    rising_drive = np.linspace(-5.0, 5.0, SAMPLES)
+    runs = [make_recording(drive_v, sum_of_plays(drive_v)) for drive_v in (drive, rising_drive)]
     fit = identify_from_parts(runs, 8, other_runs=runs[1:])
     assert [judgement.known_share > 0 for judgement in (*fit.judgements, *fit.other_judgements)] == [True, False, False]
     assert np.isnan(fit.other_judgements[0].rms_um)

@@ -212,7 +212,7 @@ def test_a_wrong_sign_and_a_position_that_does_not_follow_are_named() -> None:
 
 @pytest.mark.parametrize(("truth", "creeps"), [(creeping_plays, True), (preisach, False)])
 def test_what_plays_leave_is_called_creep_where_a_lag_over_time_explains_it(truth, creeps: bool) -> None:
-    """Half a micrometre per volt, with a lag of a second and a half in 25 s; noise of a nanometre."""
+    """The creep is 0.5 µm/V with a lag of 1.5 s, in a recording of 25 s with 1 nm of noise."""
     drive = slow_sine(9.0)[::15]
     position = truth(drive) + 1e-3 * np.random.default_rng(3).normal(size=drive.size)
     run = AxisRecording("made", 15 * SLOW_S, drive, np.append(0.0, position[:-1]), position, True, "", "")

@@ -31,13 +31,13 @@ ONE_MODE = ((HZ, DAMPING, 1.0),)
 
 def one_mode() -> TrueLoop:
     """Return a loop whose controller damps its only mode, behind one sample of delay."""
-    plain = TrueLoop(ONE_MODE, 1, (np.ones(1), np.ones(1)))
-    return TrueLoop(ONE_MODE, 1, damping_controller(plain, 3.0, 20.0))
+    without_controller = TrueLoop(ONE_MODE, 1, (np.ones(1), np.ones(1)))
+    return TrueLoop(ONE_MODE, 1, damping_controller(without_controller, 3.0, 20.0))
 
 
 def record_loop(loop: TrueLoop, reference: np.ndarray, noise: np.ndarray, start: int = 0) -> LoopExcitation:
-    """Return the signals of a loop from tick `start` on."""
-    signals = {name: signal[start:] for name, signal in loop.in_loop(reference, noise).items()}
+    """Return the excitation (reference, command, position) of a loop from tick `start` on."""
+    signals = {name: signal[start:] for name, signal in loop.simulate_loop(reference, noise).items()}
     return LoopExcitation(
         "drawn", signals["command_um"], signals["position_um"], PERIOD_S, signals["reference_um"][np.newaxis]
     )
@@ -78,7 +78,8 @@ def test_standard_deviations_are_the_least_that_any_method_can_have(seed: int) -
     near_hz = 1.05 * loop.modes[0][0]
     reference, noise = reference_motion("steps", random, SAMPLES, 20.0), coloured_noise(random, SAMPLES, near_hz, 0.05)
     modes = identify_in_loop(record_loop(loop, reference, noise), order=4, delay_ticks=loop.delay_ticks).modes
-    bounds = bounds_percent(loop, loop.in_loop(reference, 0 * noise)["command_um"], near_hz, 0.05)
+    clean_command_um = loop.simulate_loop(reference, 0 * noise)["command_um"]
+    bounds = bounds_percent(loop, clean_command_um, near_hz, 0.05)
     for mode, (hz, damping, _), (hz_bound, damping_bound) in zip(modes, loop.modes, bounds, strict=True):
         assert 100 * mode.frequency_std_hz / hz == pytest.approx(hz_bound, rel=0.25)
         assert 100 * mode.damping_std / damping == pytest.approx(damping_bound, rel=0.25)
@@ -90,8 +91,8 @@ def test_a_light_mode_is_found_first_beside_all_that_is_slow() -> None:
     random, samples = np.random.default_rng(23), 60_000
     loop = draw_loop(random)
     noise = coloured_noise(random, samples, loop.modes[0][0] * random.uniform(0.9, 1.1), 0.05)
-    command = loop.in_loop(reference_motion("steps", random, samples, 20.0), 0 * noise)["command_um"]
-    position = loop.open(command, noise)["position_um"]
+    command = loop.simulate_loop(reference_motion("steps", random, samples, 20.0), 0 * noise)["command_um"]
+    position = loop.simulate_plant(command, noise)["position_um"]
     run = shift_to_zero(LoopExcitation("drawn", command, position, PERIOD_S, command[np.newaxis]))
     residual_um = run.position_um - driven_input(replace(run, input=run.position_um))
     candidates = ModelSearch(InstrumentedRecording(run, run.input), fit_whitening(residual_um, 4)).grow(
@@ -112,10 +113,10 @@ def test_what_follows_from_outside_is_the_input_without_its_noise() -> None:
     reference = reference_motion("multisine", random, SAMPLES, 3.0)
     noise = coloured_noise(random, SAMPLES, 640.0, 0.1)
     run = record_loop(loop, reference, noise)
-    clean = loop.in_loop(reference, np.zeros(SAMPLES))["command_um"]
+    clean_command_um = loop.simulate_loop(reference, np.zeros(SAMPLES))["command_um"]
     driven = driven_input(run)
-    assert np.corrcoef(driven, clean)[0, 1] > 0.98
-    assert np.corrcoef(run.input, clean)[0, 1] < 0.9
+    assert np.corrcoef(driven, clean_command_um)[0, 1] > 0.98
+    assert np.corrcoef(run.input, clean_command_um)[0, 1] < 0.9
 
 
 @pytest.mark.parametrize(

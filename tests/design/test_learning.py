@@ -42,12 +42,12 @@ def simulate_last_period(hz: float, gain: float, table: np.ndarray) -> np.ndarra
     a, b, c, _, _ = signal.cont2discrete(signal.tf2ss(*plant(hz)), PERIOD_S, "zoh")
     k, h, g, d, _ = signal.cont2discrete(signal.tf2ss(*controller(gain)), PERIOD_S, "bilinear")
     r = np.tile(table[:, 0], SETTLED)
-    filtered_um, feed = signal.lfilter(TAPS, 1, r), signal.lfilter(COMMAND_TAPS, 1, r) + np.tile(table[:, 1], SETTLED)
+    input_um, feed_um = signal.lfilter(TAPS, 1, r), signal.lfilter(COMMAND_TAPS, 1, r) + np.tile(table[:, 1], SETTLED)
     x, s, position = np.zeros((2, 1)), np.zeros((2, 1)), np.zeros(r.size)
     for tick in range(r.size):
         position[tick] = (c @ x).item()
-        error = filtered_um[tick] - position[tick]
-        v = (g @ s + d * error).item() + feed[tick]
+        error = input_um[tick] - position[tick]
+        v = (g @ s + d * error).item() + feed_um[tick]
         x, s = a @ x + b * v, k @ s + h * error
     return position[-TICKS:]
 

@@ -21,11 +21,13 @@ T = 1e-4
 
 
 def analyse_continuous(*parts: Transfer) -> LoopAnalysis:
+    """Return the analysis of the continuous loop of controller and plant."""
     loop = continuous_loop(*parts)
     return analyse_loop(loop, loop_margins(loop), 0)
 
 
 def analyse_discrete(controller: DiscreteController, plant: Transfer, delay_ticks: int = 0) -> LoopAnalysis:
+    """Return the analysis of the sampled loop of controller, plant and delay."""
     loop = discrete_loop(controller, plant, delay_ticks)
     return analyse_loop(loop, loop_margins(loop), delay_ticks)
 
@@ -114,7 +116,7 @@ def test_discrete_step_equals_a_simulation_tick_by_tick() -> None:
     for _ in range(200):
         positions.append(x[0])
         error = 1.0 - x[0]
-        commands.append(2.0 * integral + 0.001 * error)  # tustin of 2/s: half a period of error beside the sum
+        commands.append(2.0 * integral + 0.001 * error)  # Tustin of 2/s adds half a period of the error
         integral += 1e-3 * error
         queue.append(commands[-1])
         x = ad @ x + bd * queue.pop(0)

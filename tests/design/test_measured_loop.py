@@ -21,6 +21,7 @@ from rtloop.linear.transfer import Transfer
 from tests.design.measured_loops import RATE_HZ, TrueLoop
 
 AMPLITUDE_UM, FADE = 0.5, 500
+"""Largest motion (µm), and ticks in which the excitation fades out."""
 LOOPS = (
     TrueLoop(595.5, 0.007, 0, 30.0),
     TrueLoop(595.5, 0.007, 1, 40.0),
@@ -31,7 +32,7 @@ LOOPS = (
 
 
 def split_periods(lines: LineGrid, signals: dict[str, np.ndarray], periods: int) -> PeriodSignals:
-    """Return the signals of `periods` periods of the multisine, without the first."""
+    """Return error, command and position of `periods` periods of the multisine, from the second on."""
     parts = (signals[name][lines.samples : (periods + 1) * lines.samples].reshape(periods, -1)
              for name in ("error_um", "command_um", "position_um"))  # fmt: skip
     return PeriodSignals(*parts)
@@ -40,24 +41,24 @@ def split_periods(lines: LineGrid, signals: dict[str, np.ndarray], periods: int)
 def measure(loop: TrueLoop, near_hz: float, periods: int = 4, seed: int = 0) -> tuple[LoopMeasurement, float]:
     """Measure a loop as the service does. Return the measurement and the largest |true position| (µm) of all runs."""
     lines = make_grid(RATE_HZ, 1.0, 2.0, 4400.0, near_hz)
-    period, furthest_um = excitation.first_period(lines, AMPLITUDE_UM), 0.0
+    period, largest_um = excitation.first_period(lines, AMPLITUDE_UM), 0.0
     signals = loop.run(excitation_sequence(period, 2, 0.0, FADE), seed)
     for ratio in excitation.AMPLITUDE_RATIOS:
-        furthest_um = max(furthest_um, float(np.abs(signals["true_um"]).max()))
+        largest_um = max(largest_um, float(np.abs(signals["true_um"]).max()))
         period = excitation.shape_period(lines, period, split_periods(lines, signals, 2), AMPLITUDE_UM, ratio)
         count = periods if ratio == excitation.AMPLITUDE_RATIOS[-1] else 2
         signals = loop.run(excitation_sequence(period, count, 0.0, FADE), seed + 1)
-    return measure_loop(signals, RATE_HZ, near_hz), max(furthest_um, float(np.abs(signals["true_um"]).max()))
+    return measure_loop(signals, RATE_HZ, near_hz), max(largest_um, float(np.abs(signals["true_um"]).max()))
 
 
 @pytest.mark.parametrize("loop", LOOPS, ids=lambda loop: f"{loop.hz:g} Hz, delay {loop.delay_ticks}")
 def test_margins_are_those_of_the_loop_and_the_position_keeps_within_the_amplitude(loop: TrueLoop) -> None:
-    measurement, furthest_um = measure(loop, near_hz=1.05 * loop.hz)
+    measurement, largest_um = measure(loop, near_hz=1.05 * loop.hz)
     true = loop.margins(measurement.response.hz[0], measurement.response.hz[-1])
     assert measurement.margins.gain_margin.value == pytest.approx(true["gain_margin"], rel=0.02)
     assert measurement.margins.phase_margin_deg.value == pytest.approx(true["phase_margin_deg"], abs=2.0)
     assert measurement.margins.modulus_margin.value == pytest.approx(true["modulus_margin"], rel=0.02)
-    assert furthest_um <= AMPLITUDE_UM
+    assert largest_um <= AMPLITUDE_UM
 
 
 @pytest.mark.parametrize("noise_um", [0.010, 0.100])
@@ -99,17 +100,17 @@ def test_a_margin_says_how_far_off_it_is_where_the_light_mode_decides_it() -> No
         signals = loop.run(excitation_sequence(period, 2, 0.0, FADE), seed=99)
         period = excitation.shape_period(lines, period, split_periods(lines, signals, 2), AMPLITUDE_UM, ratio)
     reference, true = excitation_sequence(period, 4, 0.0, FADE), loop.margins(lines.hz[0], lines.hz[-1])
-    measured_margins = [measure_loop(loop.run(reference, seed), RATE_HZ, loop.hz).margins for seed in range(20)]
+    all_margins = [measure_loop(loop.run(reference, seed), RATE_HZ, loop.hz).margins for seed in range(20)]
     for name in ("gain_margin", "modulus_margin"):
-        errors = [(getattr(run, name).value - true[name]) / getattr(run, name).std for run in measured_margins]
-        assert 0.6 < np.sqrt(np.mean(np.square(errors))) < 1.7  # without the mode's own uncertainty: 2.3
+        errors = [(getattr(margins, name).value - true[name]) / getattr(margins, name).std for margins in all_margins]
+        assert 0.6 < np.sqrt(np.mean(np.square(errors))) < 1.7  # 2.3 if the uncertainty of the mode is left out
 
 
 def _responses(loop: TrueLoop, lines: LineGrid) -> tuple[np.ndarray, np.ndarray]:
     """Return the responses of position and command to the reference, at the excited lines."""
-    opened = loop.open(lines.hz)
+    open_loop = loop.open(lines.hz)
     z = np.exp(2j * np.pi * lines.hz / RATE_HZ)
-    return opened / (1 + opened), (loop.kp + loop.ki_per_s / RATE_HZ / (z - 1)) / (1 + opened)
+    return open_loop / (1 + open_loop), (loop.kp + loop.ki_per_s / RATE_HZ / (z - 1)) / (1 + open_loop)
 
 
 def test_what_is_not_linear_is_told_from_noise() -> None:
@@ -118,7 +119,7 @@ def test_what_is_not_linear_is_told_from_noise() -> None:
     lines = make_grid(RATE_HZ, 0.25, 8.0, 2000.0, 595.5)
     reference = excitation_sequence(excitation.fit_period(lines, *_responses(loop, lines), AMPLITUDE_UM), 2, 0.0, FADE)
     linear = measure_response(lines, split_periods(lines, loop.run(reference), 2))
-    distorted = measure_response(lines, split_periods(lines, loop.run(reference, bend=lambda v: v + 5.0 * v**2), 2))
+    distorted = measure_response(lines, split_periods(lines, loop.run(reference, actuator=lambda v: v + 5.0 * v**2), 2))
     assert np.median(linear.spread / linear.spread_of_noise) < 2
     assert np.median(distorted.spread / distorted.spread_of_noise) > 10
 
@@ -214,7 +215,7 @@ def test_the_misfit_of_a_mode_is_one_where_noise_is_all_that_is_left() -> None:
         modes.append(mode)
     assert np.mean([mode.misfit**2 for mode in modes]) == pytest.approx(1.0, abs=0.1)
     errors = [(mode.hz - 595.5) / mode.hz_std for mode in modes]
-    assert np.sqrt(np.mean(np.square(errors))) == pytest.approx(0.95, abs=0.2)  # a misfit below 1 does not narrow them
+    assert np.sqrt(np.mean(np.square(errors))) == pytest.approx(0.95, abs=0.2)  # a misfit below 1 leaves the deviations
 
 
 def test_curves_of_a_measurement_are_those_of_its_loop_and_of_the_models() -> None:
@@ -225,32 +226,32 @@ def test_curves_of_a_measurement_are_those_of_its_loop_and_of_the_models() -> No
     controller = discretise_controller(Transfer.from_zpk([], [0.0], 30.0), 1 / RATE_HZ)
     model = discrete_loop(controller, Transfer.from_zpk([], [-900.0], 900.0))
     curves = measure_loop(loop.run(reference), RATE_HZ, 595.5, model).for_json()["response"]
-    opened, of_model, sensitivity = (
+    open_loop, model_loop, sensitivity = (
         np.array(curves[name]) @ [1.0, 1j] for name in ("loop", "model_loop", "model_sensitivity")
     )
-    lower, upper = (1 / (1 + opened * (1 + change)) for change in (-1e-6, 1e-6))
-    slope = np.abs(upper - lower) / 2e-6 * np.abs(1 + opened)
+    lower, upper = (1 / (1 + open_loop * (1 + change)) for change in (-1e-6, 1e-6))
+    slope = np.abs(upper - lower) / 2e-6 * np.abs(1 + open_loop)
     np.testing.assert_allclose(curves["sensitivity_spread"], slope * curves["loop_spread"], rtol=1e-4)
-    np.testing.assert_allclose(sensitivity * (1 + of_model), 1.0, rtol=1e-9)
+    np.testing.assert_allclose(sensitivity * (1 + model_loop), 1.0, rtol=1e-9)
 
 
 @pytest.mark.parametrize("reference", [np.zeros(5000), np.arange(5000.0), np.repeat([0.0, 5.0, 0.0], 2000)])
 def test_a_reference_without_a_multisine_is_refused(reference: np.ndarray) -> None:
-    still = dict.fromkeys(("error_um", "command_um", "position_um"), np.zeros(reference.size))
+    zero_signals = dict.fromkeys(("error_um", "command_um", "position_um"), np.zeros(reference.size))
     with pytest.raises(ValueError, match="record a multisine of several periods"):
-        measure_loop({"reference_um": reference, **still}, RATE_HZ)
+        measure_loop({"reference_um": reference, **zero_signals}, RATE_HZ)
 
 
 def test_a_period_with_a_missed_tick_is_left_out() -> None:
     loop = TrueLoop(595.5, 0.02, 0, 40.0)
     lines = make_grid(RATE_HZ, 0.25, 8.0, 2000.0, 595.5)
     signals = loop.run(excitation_sequence(excitation.first_period(lines, 1.0), 4, 0.0, FADE))
-    missed = np.zeros(signals["reference_um"].size)
-    missed[round(2.5 * lines.samples)] = 1.0
-    assert measure_loop({**signals, "periods_missed": missed}, RATE_HZ).response.periods == 3
-    missed[lines.samples :: lines.samples] = 1.0
+    missed_ticks = np.zeros(signals["reference_um"].size)
+    missed_ticks[round(2.5 * lines.samples)] = 1.0
+    assert measure_loop({**signals, "periods_missed": missed_ticks}, RATE_HZ).response.periods == 3
+    missed_ticks[lines.samples :: lines.samples] = 1.0
     with pytest.raises(ValueError, match=r"periods of the multisine in the recording: \d; allowed: at least 2"):
-        measure_loop({**signals, "periods_missed": missed}, RATE_HZ)
+        measure_loop({**signals, "periods_missed": missed_ticks}, RATE_HZ)
 
 
 def test_what_reaches_the_command_past_the_controller_is_not_the_controllers() -> None:
@@ -258,10 +259,10 @@ def test_what_reaches_the_command_past_the_controller_is_not_the_controllers() -
     loop = TrueLoop(595.5, 0.02, 1, 40.0, noise_um=1e-4)
     lines = make_grid(RATE_HZ, 0.5, 4.0, 2000.0, 595.5)
     reference = excitation_sequence(excitation.fit_period(lines, *_responses(loop, lines), AMPLITUDE_UM), 3, 0.0, FADE)
-    taps, feed = [0.3, -0.1, 0.05], 0.2 * np.roll(reference, 7)
-    path_um = signal.lfilter(taps, 1.0, reference) + feed
-    signals = loop.run(reference, past=path_um)
-    with_paths = measure_loop({**signals, "feed_um": feed}, RATE_HZ, 595.5, command_taps=taps)
+    command_taps, feedforward_um = [0.3, -0.1, 0.05], 0.2 * np.roll(reference, 7)
+    path_um = signal.lfilter(command_taps, 1.0, reference) + feedforward_um
+    signals = loop.run(reference, bypass_um=path_um)
+    with_paths = measure_loop({**signals, "feed_um": feedforward_um}, RATE_HZ, 595.5, command_taps=command_taps)
     without_paths = measure_loop(signals, RATE_HZ, 595.5)
     true = loop.open(lines.hz)
     assert np.median(np.abs(with_paths.response.plant * with_paths.response.controller / true - 1)) < 1e-3

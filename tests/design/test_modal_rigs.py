@@ -31,8 +31,8 @@ def test_a_rig_drawn_at_random_gets_a_loop_that_runs(tmp_path, seed) -> None:
     rig = modal_rig(seed)
     chain, written = design_rig(rig, tmp_path)
     assert chain.stage.dynamics.delay_ticks == rig.delay_ticks > 0
-    light = sorted(mode.frequency_hz for mode in chain.stage.dynamics.modes if mode.damping < 0.1)
-    assert light == pytest.approx(rig.hz, rel=1e-3)
+    light_hz = sorted(mode.frequency_hz for mode in chain.stage.dynamics.modes if mode.damping < 0.1)
+    assert light_hz == pytest.approx(rig.hz, rel=1e-3)
     assert verdict(chain) == "meets it"
     running = prepare(load(written)).checks[0].running
     assert running is not None
@@ -62,7 +62,7 @@ def test_the_stage_of_ones_own_keeps_its_specification(tmp_path, monkeypatch) ->
     assert axis.interlocks.oscillation_swings > 0
     trips, _ = run(out, prepare(load(out)).checks[0].running)
     assert trips == []
-    monkeypatch.setattr(theme, "THEMES", {"light": theme.LIGHT})  # one theme is enough here; users get both
+    monkeypatch.setattr(theme, "THEMES", {"light": theme.LIGHT})  # one of the two themes is enough for this test
     _check_experiment_reports(load(out), tmp_path)
 
 
@@ -101,9 +101,9 @@ def _check_experiment_reports(made: Configuration, folder: Path) -> None:
     assert rows["settling time to 5 %, median"]["asked"] == "≤ 6 ms"
     assert rows["settling time to 5 %, median"]["met"]
     assert rows["remaining error at 2.9 Hz"]["met"]
-    assert rows["remaining error at 50 Hz"]["met"] is None  # asked up to 5 Hz
+    assert rows["remaining error at 50 Hz"]["met"] is None  # the specification ends at 5 Hz
     disturbed = [recorded_run for recorded_run in recorded_runs if recorded_run.experiment == "disturbance"]
-    curves = EXPERIMENTS["disturbance"].analyse(disturbed, options).curves  # of the last run
+    curves = EXPERIMENTS["disturbance"].analyse(disturbed, options).curves  # `options` are those of the last experiment
     assert curves["time_ms"] == pytest.approx(0.1 * np.arange(1500))  # 150 ms of ticks of 0.1 ms, from the step on
     assert 0.0 < curves["time_ms"][np.abs(curves["step"]).argmax()] < 10.0
     for quantity in (

@@ -98,8 +98,8 @@ def test_taps_step_in_the_middle_of_the_range() -> None:
     lowest, highest = bounds.command_limits(np.array(1.0))
     assert lowest == pytest.approx(1 - highest)
     assert lowest == pytest.approx((REMANENCE_UM - bounds.lowest_um) / 30.0)
-    half = MODEL_OPTIONS.model_copy(update={"gain": 2.0})  # D(0) = 0.5: the command is twice the position
-    assert step_bounds(axis, half, require_steps(15.0)).lowest_um == pytest.approx(bounds.lowest_um / 2)
+    half_gain = MODEL_OPTIONS.model_copy(update={"gain": 2.0})  # D(0) = 0.5: the command is twice the position
+    assert step_bounds(axis, half_gain, require_steps(15.0)).lowest_um == pytest.approx(bounds.lowest_um / 2)
     with pytest.raises(
         ValueError, match=rf"value is 41 µm; allowed: up to {HIGH_UM - REMANENCE_UM:.4g} µm, because the"
     ):

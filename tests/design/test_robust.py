@@ -21,7 +21,7 @@ from rtloop.design.robust.search import find_robust_controller, minimise
 from rtloop.design.robust.section import robust_configuration
 from rtloop.design.synthesis.hinf.assumptions import NoController
 from rtloop.design.synthesis.specification import DesignOptions
-from rtloop.design.toml_text import write_section as text
+from rtloop.design.toml_text import write_section
 from rtloop.linear.discretise import discretise_controller
 from rtloop.linear.transfer import Transfer
 
@@ -58,19 +58,19 @@ generations = 80
 
 def sample_stage(gain_percent: float, shift_percent: float, factor: float, delay_ticks: int):
     """Return numerator and denominator of G(z) of the changed stage, by scipy."""
-    omega, ratio = OMEGA * (1 + shift_percent / 100), RATIO * factor
-    plain = ([(1 + gain_percent / 100) * omega**2], [1.0, 2 * ratio * omega, omega**2])
-    numerator, denominator, _ = signal.cont2discrete(plain, PERIOD_S, method="zoh")
+    omega, damping = OMEGA * (1 + shift_percent / 100), RATIO * factor
+    changed_stage = ([(1 + gain_percent / 100) * omega**2], [1.0, 2 * damping * omega, omega**2])
+    numerator, denominator, _ = signal.cont2discrete(changed_stage, PERIOD_S, method="zoh")
     return np.trim_zeros(numerator[0], "f"), np.append(denominator, np.zeros(delay_ticks))
 
 
 def evaluate(polynomials, z):
-    """Return the value of (numerator, denominator) at z."""
+    """Return the value of the quotient of two polynomials (numerator, denominator) at z."""
     return np.polyval(polynomials[0], z) / np.polyval(polynomials[1], z)
 
 
 def matched_polynomials(controller: Transfer):
-    """Return numerator and denominator of C(z) of a controller discretised by "matched"."""
+    """Return numerator and denominator of C(z), discretised from the controller by "matched"."""
     discrete = discretise_controller(controller, PERIOD_S, "matched")
     return discrete.gain * np.real(np.poly(discrete.zeros)), np.real(np.poly(discrete.poles))
 
@@ -96,9 +96,9 @@ def peak_sensitivity(controller, plant) -> float:
 def decay_ms(controller, plant) -> float:
     """Return the time constant (ms) of the slowest closed-loop mode between 0.55 and 1.85 times the resonance."""
     poles = np.roots(loop_polynomial(controller, plant))
-    band = np.abs(np.angle(poles)) / PERIOD_S / OMEGA
-    counted = np.abs(poles[(band > 0.55) & (band < 1.85)])
-    return float(np.max(-1e3 * PERIOD_S / np.log(counted), initial=0.0))
+    relative_omega = np.abs(np.angle(poles)) / PERIOD_S / OMEGA
+    radii = np.abs(poles[(relative_omega > 0.55) & (relative_omega < 1.85)])
+    return float(np.max(-1e3 * PERIOD_S / np.log(radii), initial=0.0))
 
 
 def random_point(random) -> np.ndarray:
@@ -129,9 +129,9 @@ def test_two_modes_move_by_themselves_in_every_combination() -> None:
     resonances = {scenario.resonance for scenario in Family(model, 2, RANGE, PERIOD_S).corner_scenarios()}
     assert {(-8.0, 8.0), (8.0, -8.0), (0.0, 8.0), (0.0, 0.0)} <= resonances
     assert {scenario.delay_ticks for scenario in Family(model, 2, RANGE, PERIOD_S).corner_scenarios()} == {2}
-    both = RANGE.model_copy(update={"delay_ticks": (0, 1)})
-    assert {scenario.delay_ticks for scenario in Family(model, 2, both, PERIOD_S).corner_scenarios()} == {0, 1}
-    sweep = Family(model, 2, both, PERIOD_S).sweep_scenarios(3)
+    two_delays = RANGE.model_copy(update={"delay_ticks": (0, 1)})
+    assert {scenario.delay_ticks for scenario in Family(model, 2, two_delays, PERIOD_S).corner_scenarios()} == {0, 1}
+    sweep = Family(model, 2, two_delays, PERIOD_S).sweep_scenarios(3)
     swept = [(scenario.delay_ticks, scenario.resonance[0]) for scenario in sweep]
     assert set(swept) == {(ticks, percent) for ticks in (0, 1) for percent in (-8.0, 0.0, 8.0)}
 
@@ -168,9 +168,9 @@ def test_what_is_written_is_the_controller_that_was_searched() -> None:
             evaluate((numerator, denominator), z), build_candidates(point[None]).response(z)[0], rtol=1e-7
         )  # fmt: skip
         a, b, c, d = (part[0] for part in build_candidates(point[None]).matrices())
-        by_states = signal.ss2tf(a, b[:, None], c[None], np.array([[d]]))
+        state_quotient = signal.ss2tf(a, b[:, None], c[None], np.array([[d]]))
         np.testing.assert_allclose(
-            evaluate((by_states[0][0], by_states[1]), z), evaluate((numerator, denominator), z), rtol=1e-5
+            evaluate((state_quotient[0][0], state_quotient[1]), z), evaluate((numerator, denominator), z), rtol=1e-5
         )
 
 
@@ -185,26 +185,26 @@ def test_what_is_searched_is_the_worst_of_the_closed_loops() -> None:
         point[:2] = rng.uniform(-8.0, -4.0), -0.5
         measures = objective.measure(point[None])
         controller = matched_polynomials(point_transfer(point, PERIOD_S))
-        radii, decays, peaks, at_5 = [], [], [], []
+        radii, decays, peaks, sensitivities_5hz = [], [], [], []
         for scenario in scenarios:
             plant = sample_stage(scenario.gain, scenario.resonance[0], scenario.damping, scenario.delay_ticks)
             radii.append(np.abs(np.roots(loop_polynomial(controller, plant))).max())
             decays.append(1e-3 * decay_ms(controller, plant))
             peaks.append(np.max(1 / np.abs(1 + evaluate(controller, objective.z) * evaluate(plant, objective.z))))
-            low = np.exp(2j * np.pi * 5.0 * PERIOD_S)
-            at_5.append(1 / np.abs(1 + evaluate(controller, low) * evaluate(plant, low)))
+            z_5hz = np.exp(2j * np.pi * 5.0 * PERIOD_S)
+            sensitivities_5hz.append(1 / np.abs(1 + evaluate(controller, z_5hz) * evaluate(plant, z_5hz)))
         assert measures.radius[0] == pytest.approx(max(radii), abs=1e-6)
         if max(radii) < 0.9999:
             stable_count += 1
             assert measures.decay_s[0] == pytest.approx(max(decays), rel=1e-4)
-            assert measures.disturbance[0] == pytest.approx(max(at_5), rel=1e-6)
+            assert measures.disturbance[0] == pytest.approx(max(sensitivities_5hz), rel=1e-6)
             assert measures.sensitivity[0] == pytest.approx(max(peaks), rel=1e-6)
     assert stable_count >= 3
 
 
 @pytest.fixture(scope="module", autouse=True)
 def reduced_proofs():
-    """Prove on fewer plants: each plant takes some ten milliseconds."""
+    """Reduce the plants of a proof to a few: each plant takes some ten milliseconds."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(certificate, "SWEEP_POINTS", 5)
         patch.setattr(certificate, "RANDOM_PLANTS", 10)
@@ -220,14 +220,14 @@ def solution(reduced_proofs):
 def test_a_controller_damps_the_resonance_and_keeps_its_walls_wherever_the_plant_lies(solution) -> None:
     """Plants between the scenarios: all stable, max |S| ≤ 2, the disturbance held, the resonance damped."""
     controller, random = matched_polynomials(solution.controller), np.random.default_rng(1)
-    low = np.exp(2j * np.pi * 5.0 * PERIOD_S)
+    z_5hz = np.exp(2j * np.pi * 5.0 * PERIOD_S)
     for _ in range(20):
         plant = sample_stage(random.uniform(-5, 5), random.uniform(-8, 8), np.exp(random.uniform(*np.log([0.5, 2]))), 0)
         assert np.abs(np.roots(loop_polynomial(controller, plant))).max() < 1
         assert peak_sensitivity(controller, plant) <= 2.0 + 1e-9
         assert noise_gain(controller, plant) <= 3.0 + 1e-9
-        assert 1 / np.abs(1 + evaluate(controller, low) * evaluate(plant, low)) <= 0.1 + 1e-9
-        assert decay_ms(controller, plant) < 1e3 / (0.5 * RATIO * OMEGA) / 5  # without control it rings for 53 ms
+        assert 1 / np.abs(1 + evaluate(controller, z_5hz) * evaluate(plant, z_5hz)) <= 0.1 + 1e-9
+        assert decay_ms(controller, plant) < 1e3 / (0.5 * RATIO * OMEGA) / 5  # uncontrolled, it decays in 53 ms
 
 
 def test_a_proof_is_what_its_worst_plants_do(solution) -> None:
@@ -284,7 +284,7 @@ def test_what_cannot_be_is_refused_with_what_misses() -> None:
 def test_a_specification_that_cannot_be_is_a_clear_error(tmp_path, section, key, value, message) -> None:
     raw = tomllib.loads(SPEC)
     raw[section] |= {key: value}
-    (tmp_path / "spec.toml").write_text(text("", raw))
+    (tmp_path / "spec.toml").write_text(write_section("", raw))
     result = CliRunner().invoke(main, ["design", "robust", str(tmp_path / "spec.toml")])
     assert result.exit_code == 78
     assert message in result.stderr

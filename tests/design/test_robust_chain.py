@@ -61,7 +61,7 @@ def recordings(tmp_path_factory):
 
 @pytest.fixture(autouse=True)
 def reduced_proofs(monkeypatch) -> None:
-    """Prove on fewer plants; other tests cover the proofs of the search and of the taps."""
+    """Reduce the plants of all proofs to a few; other tests cover the proofs of the search and of the taps."""
     monkeypatch.setattr(certificate, "SWEEP_POINTS", 3)
     monkeypatch.setattr(certificate, "RANDOM_PLANTS", 10)
     monkeypatch.setattr(shape_module, "SWEEP_PLACES", 3)
@@ -97,8 +97,8 @@ def test_two_recordings_become_a_loop_with_taps_that_keeps_its_promise(recording
 
 def test_what_cannot_be_had_is_refused_and_nothing_is_written(recordings, tmp_path) -> None:
     """No mode of 800 Hz dies away in a thousandth of a millisecond."""
-    budget = "restarts = 2\ngenerations = 60"
-    text = SPEC.format(percent=3.0).replace(budget, "restarts = 1\ngenerations = 9\ndecay_ms = 0.001")
+    search_lines = "restarts = 2\ngenerations = 60"
+    text = SPEC.format(percent=3.0).replace(search_lines, "restarts = 1\ngenerations = 9\ndecay_ms = 0.001")
     refused = design_auto(recordings, tmp_path, text)
     assert refused.exit_code == 1, refused.output
     assert "allowed: up to 0.001" in refused.stderr
@@ -112,7 +112,7 @@ def test_a_disturbance_beyond_half_the_rate_is_refused_without_a_stated_range_to
     refused = design_auto(recordings, tmp_path, text)
     assert refused.exit_code == 1, refused.output
     assert "up_to_hz: 6000 Hz; allowed: below half of controller.rate_hz, 5000 Hz" in refused.stderr
-    assert "no controller" not in refused.stderr  # which would blame the range of the resonance
+    assert "no controller" not in refused.stderr  # that message would blame the range of the resonance
     assert not (tmp_path / "made.toml").exists()
 
 
@@ -130,8 +130,8 @@ def test_a_specification_that_says_too_little_is_refused_first(recordings, tmp_p
 
 def test_a_reference_beyond_the_drive_is_refused_before_the_search(recordings, tmp_path) -> None:
     """The stage reaches 20 µm at 10 V."""
-    command, larger = "reference_um = 18.0\ncommand_um = 19.5", "reference_um = 30.0\ncommand_um = 33.0"
-    text = SPEC.format(percent=3.0).replace(command, larger)
+    limits, larger_limits = "reference_um = 18.0\ncommand_um = 19.5", "reference_um = 30.0\ncommand_um = 33.0"
+    text = SPEC.format(percent=3.0).replace(limits, larger_limits)
     refused = design_auto(recordings, tmp_path, text)
     assert refused.exit_code == 1, refused.output
     assert "specification.command.reference_um: value is 30 µm; allowed: up to 20 µm" in refused.stderr
@@ -155,7 +155,7 @@ def test_a_controller_without_taps_is_written_all_the_same(recordings, tmp_path,
     assert check.running.stable
 
 
-def modal(hz, damping, gain) -> Transfer:
+def modal_transfer(hz, damping, gain) -> Transfer:
     """Return Σ g ω²/(s² + 2ζω s + ω²), added by numpy's polynomials."""
     omega = 2 * np.pi * np.array(hz)
     denominators = [np.poly1d([1.0, 2 * z * w, w**2]) for z, w in zip(damping, omega, strict=True)]
@@ -169,12 +169,12 @@ def modal(hz, damping, gain) -> Transfer:
 
 def test_of_many_light_modes_those_that_stand_out_move_by_themselves() -> None:
     hz, damping, gain = [200.0, 500.0, 900.0, 1500.0], [0.02, 0.02, 0.003, 0.02], [0.9, 0.02, 0.06, 0.02]
-    family = Family(modal(hz, damping, gain), 1, ScenarioOptions(), PERIOD_S)
-    assert family.leading == (0, 2)  # g/2ζ: 22, 0.5, 10, 0.5
+    family = Family(modal_transfer(hz, damping, gain), 1, ScenarioOptions(), PERIOD_S)
+    assert family.leading == (0, 2)  # heights of the peaks, g/2ζ: 22, 0.5, 10, 0.5
     shifts = {scenario.resonance for scenario in family.corner_scenarios()}
     assert {(10.0, 0.0, -10.0, 0.0), (-10.0, 0.0, 10.0, 0.0), (10.0,) * 4, (-10.0,) * 4} <= shifts
     assert all(shift[1] == shift[3] == 0 or len(set(shift)) == 1 for shift in shifts)
-    random_scenarios = family.random_scenarios(20, 0)  # the proof shifts each mode
+    random_scenarios = family.random_scenarios(20, 0)  # each mode has a shift of its own here
     assert np.all([len(set(scenario.resonance)) == 4 for scenario in random_scenarios])
     bands = family.bands / (2 * np.pi)
     expected = [[110.0, np.sqrt(200 * 500)], [np.sqrt(500 * 900), np.sqrt(900 * 1500)]]
@@ -190,8 +190,8 @@ def test_a_pole_beyond_reach_in_s_is_a_finite_one_that_answers_alike_at_the_tick
     np.testing.assert_array_equal(finite_rates[1:], rates[1:])
     z = np.exp(2j * np.pi * np.geomspace(1.0, 4900.0, 30) * PERIOD_S)
 
-    def response(poles, parts):
-        return np.sum(parts[0] / (z[:, None] - np.exp(poles * PERIOD_S)), axis=1)
+    def response(poles, modal_residues):
+        return np.sum(modal_residues[0] / (z[:, None] - np.exp(poles * PERIOD_S)), axis=1)
 
     np.testing.assert_allclose(response(finite_rates, finite_residues), response(rates, residues), rtol=1e-5)
 

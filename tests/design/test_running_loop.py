@@ -72,6 +72,7 @@ PATHS = [
 
 
 def reference_path(taps: np.ndarray, command_taps: np.ndarray, section: list[float] | None) -> ReferencePath:
+    """Return the reference path with one second-order section, or none."""
     return ReferencePath(taps, command_taps, np.array([section] if section else []).reshape(-1, 5))
 
 
@@ -133,8 +134,8 @@ def test_figures_of_a_step_are_those_between_ticks(path) -> None:
         assert np.isnan([metrics.overshoot_percent, metrics.settling_time_s]).all()
         return
     assert metrics.overshoot_percent == pytest.approx(100 * max(0.0, positions.max() / final - 1), abs=1e-3)
-    outside = np.flatnonzero(np.abs(positions - final) > 0.05 * final)[-1]
-    assert metrics.settling_time_s == pytest.approx((outside + 0.5) * PERIOD_S / POINTS, abs=0.51 * PERIOD_S / POINTS)
+    last = np.flatnonzero(np.abs(positions - final) > 0.05 * final)[-1]
+    assert metrics.settling_time_s == pytest.approx((last + 0.5) * PERIOD_S / POINTS, abs=0.51 * PERIOD_S / POINTS)
 
 
 def test_without_an_integrator_the_command_path_moves_the_final_value() -> None:
@@ -151,8 +152,8 @@ def test_responses_to_the_reference_are_those_of_its_step(path) -> None:
     """The oracle is the z-transform of the differences of the step response."""
     loop, hz = loop_with_path(path), np.array([1.0, 30.0, 88.0, 300.0])
     positions, commands = simulate_step(1, path)
-    tail = TICKS + 1  # after so many ticks the transient is far below the tolerance
-    exponentials = np.exp(-2j * np.pi * hz[:, None] * PERIOD_S * np.arange(tail - 1))
+    ticks = TICKS + 1  # by then the transient is far below the tolerance
+    exponentials = np.exp(-2j * np.pi * hz[:, None] * PERIOD_S * np.arange(ticks - 1))
     position, command = loop.response_from_reference(hz)
     for response, step_values, final in (
         (position, positions[::POINTS], loop.final_values[0]),

@@ -37,9 +37,9 @@ def test_python_control_agrees_and_a_wrong_gain_or_delay_is_found(name: str) -> 
         numbers = LoopNumbers((a, b, c, d), axis.model, check.delay_ticks, axis.prefilter, check.linear.period_s)
         opinion = second_opinion(numbers)
         assert disagreements(check.on_model, opinion) == []
-        louder = second_opinion(numbers._replace(controller=(a, b, 1.01 * np.asarray(c), 1.01 * d)))
+        higher_gain = second_opinion(numbers._replace(controller=(a, b, 1.01 * np.asarray(c), 1.01 * d)))
         delayed = check.loop(check.plant, check.delay_ticks + 1)
-        for faults in (disagreements(check.on_model, louder), disagreements(delayed, opinion)):
+        for faults in (disagreements(check.on_model, higher_gain), disagreements(delayed, opinion)):
             assert faults[0].startswith("closed-loop poles:")
             assert any(fault.startswith("step response: rtloop and python-control differ by") for fault in faults)
         assert disagreements(delayed, second_opinion(numbers._replace(delay_ticks=check.delay_ticks + 1))) == []
@@ -50,15 +50,15 @@ def test_axes_that_share_a_controller_are_judged_together() -> None:
     prepared = prepare(load(DEPLOY / "laws" / "coupled.toml"))
     assert faults_on_models(prepared) == []
     a, b, c, d = prepared.checks[0].together.linear.system
-    pairs = zip(prepared.configuration.axes, prepared.checks, strict=True)
-    axes = [LoopNumbers((a, b, c, d), axis.model, check.delay_ticks, axis.prefilter, 1e-4) for axis, check in pairs]
+    checked = zip(prepared.configuration.axes, prepared.checks, strict=True)
+    axes = [LoopNumbers((a, b, c, d), axis.model, check.delay_ticks, axis.prefilter, 1e-4) for axis, check in checked]
     coupling = np.array([[1.0, 0.15], [-0.12, 1.0]])
-    louder = [numbers._replace(controller=(a, b, 1.01 * c, 1.01 * d)) for numbers in axes]
+    higher_gain = [numbers._replace(controller=(a, b, 1.01 * c, 1.01 * d)) for numbers in axes]
     delayed = [axes[0], axes[1]._replace(delay_ticks=axes[1].delay_ticks + 1)]
-    for place, check in enumerate(prepared.checks):
-        assert disagreements(check.on_model, coupled_opinion(axes, coupling, place)) == []
-        for wrong in ((louder, coupling), (axes, coupling.T), (delayed, coupling)):
-            faults = disagreements(check.on_model, coupled_opinion(*wrong, place))
+    for index, check in enumerate(prepared.checks):
+        assert disagreements(check.on_model, coupled_opinion(axes, coupling, index)) == []
+        for wrong_loop in ((higher_gain, coupling), (axes, coupling.T), (delayed, coupling)):
+            faults = disagreements(check.on_model, coupled_opinion(*wrong_loop, index))
             assert faults[0].startswith("closed-loop poles:")
 
 

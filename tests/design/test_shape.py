@@ -42,19 +42,19 @@ def simulate(taps, command_taps, shift_percent: float, delay_ticks: int, ticks: 
     z, p, k = CONTROLLER.zeros, CONTROLLER.poles, CONTROLLER.gain
     numerator, denominator = k * np.real(np.poly(z)), np.real(np.poly(p))
     numerator = np.concatenate([np.zeros(denominator.size - numerator.size), numerator])
-    q = np.concatenate([np.cumsum(taps), np.full(ticks, np.sum(taps))])
-    w = np.concatenate([np.cumsum(command_taps), np.full(ticks, np.sum(command_taps))])
+    filtered_reference = np.concatenate([np.cumsum(taps), np.full(ticks, np.sum(taps))])
+    added_command = np.concatenate([np.cumsum(command_taps), np.full(ticks, np.sum(command_taps))])
     state, errors, outputs = np.zeros(2), np.zeros(denominator.size), np.zeros(denominator.size - 1)
     position, command = [], []
     for tick in range(ticks):
         x = float((c @ state)[0])
-        errors = np.concatenate([[q[tick] - x], errors[:-1]])
+        errors = np.concatenate([[filtered_reference[tick] - x], errors[:-1]])
         output = float(numerator @ errors - denominator[1:] @ outputs)
         outputs = np.concatenate([[output], outputs[:-1]])
-        command.append(output + w[tick])
-        held = command[tick - delay_ticks] if tick >= delay_ticks else 0.0
+        command.append(output + added_command[tick])
+        applied = command[tick - delay_ticks] if tick >= delay_ticks else 0.0
         for _ in range(FINE):
-            state = a @ state + b[:, 0] * held
+            state = a @ state + b[:, 0] * applied
             position.append(float((c @ state)[0]))
     return np.array(position), np.array(command)
 
@@ -81,7 +81,7 @@ def test_responses_are_those_of_the_loop_between_ticks_too(delay_ticks) -> None:
 
 @pytest.fixture(scope="module", autouse=True)
 def reduced_proofs():
-    """Prove on fewer plants and draw fewer points; the tests simulate plants between them."""
+    """Reduce the plants of the proof and the points of the curve; the tests simulate plants between them."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(shape_module, "SWEEP_PLACES", 3)
         patch.setattr(shape_module, "PROOF_PLACES", 9)
@@ -109,8 +109,8 @@ def test_taps_keep_band_overshoot_undershoot_and_drive_wherever_the_resonance_is
     assert design.taps.reference.sum() == pytest.approx(1.0, abs=1e-9)
     assert design.fastest_ms == design.settling_ms < 2.0
     without_taps, _ = simulate([1.0], [0.0], 0.0, 1)
-    outside = time_ms[np.abs(without_taps - 1) > 0.05].max()
-    assert outside > 2 * design.settling_ms  # without taps, settling takes more than twice as long
+    settling_without_ms = time_ms[np.abs(without_taps - 1) > 0.05].max()
+    assert settling_without_ms > 2 * design.settling_ms
 
 
 def test_nothing_faster_exists_and_less_overshoot_costs_time(design) -> None:
@@ -120,7 +120,7 @@ def test_nothing_faster_exists_and_less_overshoot_costs_time(design) -> None:
     fastest = fastest_settling(programme, 0.004)
     assert fastest * 0.1 <= design.fastest_ms + 1e-9
     assert not programme.is_feasible(fastest - 0.25, 0.004)
-    overshoots = [programme.least_overshoot_taps(fastest + more).overshoot for more in (0.0, 1.0, 3.0)]
+    overshoots = [programme.least_overshoot_taps(fastest + extra_ticks).overshoot for extra_ticks in (0.0, 1.0, 3.0)]
     assert overshoots[0] >= overshoots[1] - 1e-9 >= overshoots[2] - 2e-9
     assert overshoots[0] <= 0.004
 
@@ -147,20 +147,20 @@ def test_what_cannot_be_says_what_binds_and_the_fastest() -> None:
 
 
 def test_bounds_let_every_step_between_allowed_levels_stay_within_the_drive() -> None:
-    """v = a·s + h·w for every level a, step h, and w at its bounds; at one end or another it reaches the drive."""
+    """v = a·s + h·w for every level a, step h, and w at its bounds (s: v/x at rest); v reaches one of its limits."""
     cases = ((BOUNDS, 0.97), (Bounds(0.05, 40.0, 0.0, 0.0, 44.0), 1.02), (Bounds(0.05, 40.0, 25.0, 15.0, 72.0), 1.02))
-    for bounds, static in cases:
-        low, high = (float(value) for value in bounds.command_limits(np.array(static)))
-        starts = np.linspace(bounds.lowest_um, max(bounds.lowest_um, 0.0) + 40.0, 41)
-        reached = []
+    for bounds, command_per_um in cases:
+        low, high = (float(value) for value in bounds.command_limits(np.array(command_per_um)))
+        levels_um = np.linspace(bounds.lowest_um, max(bounds.lowest_um, 0.0) + 40.0, 41)
+        commands_um = []
         for w in (low, high):
-            for a in starts:
-                for b in starts:
+            for a in levels_um:
+                for b in levels_um:
                     if abs(b - a) <= bounds.step_um:
-                        reached.append(a * static + (b - a) * w)
-        assert min(reached) >= bounds.low_um - 1e-9
-        assert max(reached) <= bounds.high_um + 1e-9
-        assert min(abs(min(reached) - bounds.low_um), abs(max(reached) - bounds.high_um)) < 1e-9
+                        commands_um.append(a * command_per_um + (b - a) * w)
+        assert min(commands_um) >= bounds.low_um - 1e-9
+        assert max(commands_um) <= bounds.high_um + 1e-9
+        assert min(abs(min(commands_um) - bounds.low_um), abs(max(commands_um) - bounds.high_um)) < 1e-9
 
 
 CONFIG = """# my stage
@@ -290,11 +290,11 @@ def test_a_linear_programme_that_no_solver_finishes_is_refused_in_a_sentence(tmp
         ({"excess": 0.01}, "fail the proof on 9 plants: .* and the command v exceeds its limits by 1 % of a step"),
     ],
 )
-def test_taps_that_their_proof_does_not_bear_out_are_refused(monkeypatch, missed, message) -> None:
+def test_taps_that_their_proof_does_not_bear_out_are_refused(monkeypatch, excess, message) -> None:
     """A plant outside the linear programme misses the designed figures in every round: an error, not a warning."""
     monkeypatch.setattr(shape_module, "MOST_ROUNDS", 2)
-    real = shape_module.measure_step
-    monkeypatch.setattr(shape_module, "measure_step", lambda *arguments: real(*arguments)._replace(**missed))
+    measure_step = shape_module.measure_step
+    monkeypatch.setattr(shape_module, "measure_step", lambda *arguments: measure_step(*arguments)._replace(**excess))
     with pytest.raises(NoDesign, match=message):
         design_taps(SUBJECT)
 

@@ -75,9 +75,9 @@ command_um = 30.0
 """
 
 
-def linear_rig(more: str = "") -> Configuration:
-    """Return the configuration LINEAR, whose inverse is exact, with the lines `more` added."""
-    return parse(LINEAR + more, "linear", Path(), "linear")
+def linear_rig(lines: str = "") -> Configuration:
+    """Return the configuration LINEAR, whose inverse is exact, with `lines` of TOML added."""
+    return parse(LINEAR + lines, "linear", Path(), "linear")
 
 
 def test_a_simulation_is_the_run_itself() -> None:
@@ -120,7 +120,7 @@ def test_a_disturbance_moves_it_between_ticks_too() -> None:
     run = bench.run("x", (0.0,), 0.02)
     true_um = bench.true_positions(run, "x").ravel()
     np.testing.assert_allclose(true_um[::POINTS], run["x_true_position_um"], atol=1e-12)
-    time_s = np.arange(POINTS) / POINTS / RATE_HZ  # in the first period the controller has not moved yet
+    time_s = np.arange(POINTS) / POINTS / RATE_HZ  # the controller does not act in the first period
     damped = OMEGA * np.sqrt(1 - ZETA**2)
     decay = np.exp(-ZETA * OMEGA * time_s)
     swing = np.cos(damped * time_s) + ZETA * OMEGA / damped * np.sin(damped * time_s)
@@ -199,7 +199,7 @@ def test_noise_at_rest_is_that_of_a_run(paper) -> None:
     rms = {name: 1e3 * rows[:, names.index(name)].std() for name in ("x_command_um", "x_true_position_um")}
     assert paper.noise_v_nm == pytest.approx(rms["x_command_um"], rel=0.35)
     assert paper.noise_x_nm == pytest.approx(rms["x_true_position_um"], rel=0.6)
-    assert paper.noise_v_nm > 5 * 12.95  # the linear loop has 13 nm
+    assert paper.noise_v_nm > 5 * 12.95  # the linear loop has 12.95 nm
 
 
 def test_an_amplifier_with_one_side_steps_to_that_side() -> None:
@@ -213,19 +213,19 @@ def test_an_amplifier_with_one_side_steps_to_that_side() -> None:
 
 def test_a_model_stands_for_hardware() -> None:
     """The rig is built without residual hysteresis, and with the value of a compensation experiment."""
-    card = replace(PAPER, driver_kind="card", driver_options=Options())
-    exact = HardwareModel(PAPER.axes[0].model, 0.01, 0.01, None, 0.0)
+    hardware_setup = replace(PAPER, driver_kind="card", driver_options=Options())
+    exact_model = HardwareModel(PAPER.axes[0].model, 0.01, 0.01, None, 0.0)
     design = DesignOptions.model_validate({"simulation": {"steps_um": [20.0]}})
     simulations = [
-        simulate(Bench(card, {"x": hardware}), card.axes[0], 0.031, design)
-        for hardware in (exact, exact._replace(residual_percent=3.75))
+        simulate(Bench(hardware_setup, {"x": hardware}), hardware_setup.axes[0], 0.031, design)
+        for hardware in (exact_model, exact_model._replace(residual_percent=3.75))
     ]
     assert {simulation.truth for simulation in simulations} == {"a rig built from the axis's models"}
     assert simulations[1].steps[0].overshoot_percent > simulations[0].steps[0].overshoot_percent
     with pytest.raises(ValueError, match=r"axis.x.model: missing; the simulation of the hardware"):
-        Bench(card, {"x": exact._replace(model=None)})
+        Bench(hardware_setup, {"x": exact_model._replace(model=None)})
     with pytest.raises(ValueError, match=r"residual_percent: 90 %; allowed: above .* % and below .* %"):
-        Bench(card, {"x": exact._replace(residual_percent=90.0)})
+        Bench(hardware_setup, {"x": exact_model._replace(residual_percent=90.0)})
 
 
 @pytest.mark.parametrize(
@@ -247,9 +247,9 @@ def test_the_step_that_is_asked_for_is_simulated_and_judged(specification, simul
 
 
 def test_what_cannot_run_is_not_simulated() -> None:
-    without = replace(PAPER, axes=(PAPER.axes[0].model_copy(update={"controller": None}),))
+    without_controller = replace(PAPER, axes=(PAPER.axes[0].model_copy(update={"controller": None}),))
     with pytest.raises(ConfigError, match="mode closed_loop needs it"):
-        Bench(without, {})
+        Bench(without_controller, {})
 
 
 @pytest.mark.parametrize("percent", [2.0, 3.75, 10.0])
@@ -258,12 +258,12 @@ def test_hysteresis_that_is_left_is_as_much_as_was_said(percent: float) -> None:
     model = PlayModel(np.array([0.0, 1.0, 2.0, 4.0, 6.0]), np.array([1.3, 0.3, 0.2, 0.3, 0.2]))
     changed_model = add_residual_hysteresis(model, percent, 10.0)
     inverse = model.inverse()
-    top = float(np.maximum(10.0 - model.thresholds, 0) @ model.weights)
-    v = top * np.interp(np.arange(6001), [0, 1000, 3000, 5000, 6000], [0, 1, -1, 1, 0])
+    half_range_um = float(np.maximum(10.0 - model.thresholds, 0) @ model.weights)
+    v = half_range_um * np.interp(np.arange(6001), [0, 1000, 3000, 5000, 6000], [0, 1, -1, 1, 0])
     y = simulate_plays(simulate_plays(v, inverse), changed_model)
     down, up = y[1000:3001], y[3000:5001][::-1]
     assert 100 * np.abs(down - up).max() / np.ptp(y[1000:]) == pytest.approx(percent, rel=0.03)
-    assert np.ptp(y) == pytest.approx(2 * top, rel=1e-3)
+    assert np.ptp(y) == pytest.approx(2 * half_range_um, rel=1e-3)
 
 
 def simulate_plays(values: np.ndarray, model: PlayModel) -> np.ndarray:
@@ -297,8 +297,8 @@ def test_as_many_steps_keep_what_is_said_of_them() -> None:
     [
         (3.2, 3.0, True, True),
         (4.0, 3.0, False, False),
-        (np.inf, 3.0, False, False),  # some of the steps settle, which noise decides
-        (np.inf, np.inf, True, True),  # none settles
+        (np.inf, 3.0, False, False),  # noise decides which steps settle
+        (np.inf, np.inf, True, True),  # no step settles
     ],
 )
 def test_noise_decides_a_figure_whose_quantile_is_far_from_its_median(quantile, median, in_time, in_percent) -> None:

@@ -16,7 +16,7 @@ CHANCE = 1e-6
 
 
 def require_stated(stated: float, values: np.ndarray, bias: float) -> None:
-    """Fail unless normally distributed `values` spread as stated, apart from CHANCE and a relative bias of `room`."""
+    """Fail unless normally distributed `values` spread as stated, apart from CHANCE and a relative `bias`."""
     freedom = values.size - 1
     low, high = np.sqrt(stats.chi2.ppf([CHANCE / 2, 1 - CHANCE / 2], freedom) / freedom)
     ratio = values.std(ddof=1) / stated
@@ -38,9 +38,9 @@ def test_margins_of_a_measured_loop_spread_as_stated():
     hz, spread = np.geomspace(0.05, 0.6, 60), 0.02
     loop = 2 / (2j * np.pi * hz + 1) ** 3
     stated = measured_margins(MeasuredLoop(hz, loop, np.full(hz.size, spread), 1e4, None))
-    dense = 2 / (2j * np.pi * np.geomspace(0.05, 0.6, 4000) + 1) ** 3
+    dense_loop = 2 / (2j * np.pi * np.geomspace(0.05, 0.6, 4000) + 1) ** 3
     parts = np.random.default_rng(2).normal(0.0, spread * np.sqrt(0.5), (DRAWS, 2))
-    modulus = np.array([np.abs(1 + dense * (1 + complex(*part))).min() for part in parts])
-    assert stated.modulus_margin.value == pytest.approx(np.abs(1 + dense).min(), rel=1e-4)
+    modulus = np.array([np.abs(1 + dense_loop * (1 + complex(*part))).min() for part in parts])
+    assert stated.modulus_margin.value == pytest.approx(np.abs(1 + dense_loop).min(), rel=1e-4)
     require_stated(stated.modulus_margin.std, modulus, bias=0.02)
     require_stated(stated.max_sensitivity.std, 1 / modulus, bias=0.02)

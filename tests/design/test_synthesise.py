@@ -52,10 +52,10 @@ def test_the_papers_controller_from_the_papers_data(name) -> None:
 
 
 def test_the_step_is_that_of_the_printed_controller() -> None:
-    ours, printed = continuous_loop(PAPER.controller, PAPER_D), continuous_loop(PAPER_C, PAPER_D)
-    assert ours.is_stable
+    computed, printed = continuous_loop(PAPER.controller, PAPER_D), continuous_loop(PAPER_C, PAPER_D)
+    assert computed.is_stable
     times = np.linspace(0, 0.03, 301)
-    assert max(abs(position_after_step(ours, t) - position_after_step(printed, t)) for t in times) < 0.02
+    assert max(abs(position_after_step(computed, t) - position_after_step(printed, t)) for t in times) < 0.02
 
 
 def test_truncation_has_no_direct_part_and_residualisation_has() -> None:
@@ -86,6 +86,7 @@ def test_poles_at_1_beside_1e5_survive() -> None:
 
 
 def run(*arguments: str):
+    """Run `rtloop design synthesise` in this process; return the result of the command."""
     return CliRunner().invoke(main, ["design", "synthesise", *arguments])
 
 

@@ -25,16 +25,16 @@ NOT_STRONGLY_STABILISABLE = Transfer.from_zpk([10.0], [50.0, -100.0], 50.0)
 & Lu, Automatica 10, 1974)."""
 
 
-def factors(modes: list[tuple[float, float]]) -> list[list[float]]:
+def quadratic_factors(modes: list[tuple[float, float]]) -> list[list[float]]:
     """Return the coefficients of s² + 2ζω s + ω² for each mode (Hz, ζ)."""
     return [[1.0, 4 * math.pi * hz * damping, (2 * math.pi * hz) ** 2] for hz, damping in modes]
 
 
-def specification(
+def write_specification(
     folder: Path, modes: list[tuple[float, float]], settling_ms: float = 3.0, delay_ticks: int = 0
 ) -> Path:
-    """Write the paper's specification for a plant of static gain 1; return the path."""
-    denominator = factors(modes)
+    """Write a specification like the paper's for a plant of static gain 1; return the path of the file."""
+    denominator = quadratic_factors(modes)
     path = folder / "spec.toml"
     path.write_text(
         f'[plant]\nform = "factors"\ngain = {math.prod(factor[-1] for factor in denominator)!r}\nnumerator = []\n'
@@ -48,6 +48,7 @@ def specification(
 
 
 def run(*arguments: str | Path) -> Result:
+    """Run the rtloop command line in this process and return its result."""
     return CliRunner().invoke(main, [str(argument) for argument in arguments])
 
 
@@ -56,7 +57,7 @@ def run(*arguments: str | Path) -> Result:
 def test_what_is_written_passes_check(tmp_path, modes, delay_ticks) -> None:
     """`prepare` raises an error for every fault that `check` refuses. Warnings are errors in tests: none is printed."""
     out = tmp_path / "written.toml"
-    result = run("design", "synthesise", specification(tmp_path, modes, 8.0, delay_ticks), "--out", out)
+    result = run("design", "synthesise", write_specification(tmp_path, modes, 8.0, delay_ticks), "--out", out)
     assert result.exit_code == 0, result.output
     (check,) = prepare(load(out)).checks
     assert check.running is not None
@@ -67,12 +68,12 @@ def test_what_is_written_passes_check(tmp_path, modes, delay_ticks) -> None:
 @pytest.mark.parametrize("modes", [ONE_MODE, TWO_MODES], ids=["one mode", "two modes"])
 def test_roots_far_beyond_the_rate_are_not_written_and_the_band_is_kept(tmp_path, modes) -> None:
     """The oracle is the controller with all its roots: its gain at 0 Hz and its response up to half the rate."""
-    result = run("design", "synthesise", specification(tmp_path, modes), "--json")
+    result = run("design", "synthesise", write_specification(tmp_path, modes), "--json")
     assert result.exit_code == 0, result.output
     report = json.loads(result.stdout)
     zeros, poles = (np.array([complex(*root) for root in report[name]]) for name in ("zeros", "poles"))
     assert max(np.abs(zeros).max(), np.abs(poles).max()) < 1000 * HALF_RATE_RAD_S
-    denominator = factors(modes)
+    denominator = quadratic_factors(modes)
     plant = Transfer.from_factors(math.prod(factor[-1] for factor in denominator), [], denominator)
     weights = PAPER_WEIGHTS._replace(disturbance=Transfer.from_zpk([-1.0], [-1000.0], 0.1 / 3.285))
     reference = synthesise(plant, weights).controller
@@ -94,17 +95,18 @@ def test_a_plant_that_only_an_unstable_controller_stabilises() -> None:
 def test_the_file_holds_an_axis_that_a_running_service_can_take_the_controller_from(tmp_path) -> None:
     """`rtloop ctl controller` reads the axis of a whole configuration."""
     out = tmp_path / "written.toml"
-    assert run("design", "synthesise", specification(tmp_path, ONE_MODE), "--out", out, "--axis", "z").exit_code == 0
+    spec = write_specification(tmp_path, ONE_MODE)
+    assert run("design", "synthesise", spec, "--out", out, "--axis", "z").exit_code == 0
     (axis,) = load(out).axes
     assert axis.name == "z"
     assert axis.controller is not None
-    section = tomllib.loads(run("design", "synthesise", tmp_path / "spec.toml").stdout)["axis"]["controller"]
+    section = tomllib.loads(run("design", "synthesise", spec).stdout)["axis"]["controller"]
     assert section["poles"] == [list(root) for root in axis.controller.poles]
 
 
 def test_what_does_not_run_is_refused_with_what_would_help(tmp_path) -> None:
     """The loop cannot settle within 2 ms behind 16 samples of delay."""
-    spec = specification(tmp_path, ONE_MODE, 2.0, 16)
+    spec = write_specification(tmp_path, ONE_MODE, 2.0, 16)
     result = run("design", "synthesise", spec)
     assert result.exit_code == 1
     assert "settling" in result.stderr
@@ -112,7 +114,7 @@ def test_what_does_not_run_is_refused_with_what_would_help(tmp_path) -> None:
 
 
 def test_a_plant_of_repeated_poles_gets_a_rig_that_takes_them(tmp_path) -> None:
-    out, spec = tmp_path / "written.toml", specification(tmp_path, ONE_MODE)
+    out, spec = tmp_path / "written.toml", write_specification(tmp_path, ONE_MODE)
     text = spec.read_text(encoding="utf-8")
     start, end = text.index("gain ="), text.index("[specification]")
     plant = (

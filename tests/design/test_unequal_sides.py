@@ -27,7 +27,7 @@ MODEL = PlayModel(np.array(THRESHOLDS_V), np.array(WEIGHTS_UM_PER_V))
 
 
 def stage(**limits: float) -> Configuration:
-    """Return the configuration of the stage with changed limits."""
+    """Return the configuration of the stage with the given [axis.limits] replaced."""
     configuration = parse(STAGE, "stage", Path(), "stage")
     (axis,) = configuration.axes
     changed = LimitsOptions.model_validate(axis.limits.model_dump() | limits)
@@ -117,7 +117,7 @@ def test_omitted_steps_are_told_with_both_ends_of_the_range() -> None:
     assert note == f"Steps of 46 µm were left out: the command's range is {low_um:.4g} … {high_um:.4g} µm."
 
 
-def required(reference_um: float, command_um: float) -> DesignOptions:
+def require_steps(reference_um: float, command_um: float) -> DesignOptions:
     """Return a design for steps of `reference_um` (µm) with commands up to `command_um` (µm)."""
     command = {"reference_um": reference_um, "command_um": command_um}
     return DesignOptions.model_validate({"specification": {"overshoot_percent": 1.0, "command": command}})
@@ -130,24 +130,24 @@ def test_taps_step_between_0_and_the_reference_where_the_sides_are_unequal() -> 
     (axis,) = stage().axes
     high_um, low_um = curve([HIGHEST_V, LOWEST_V])
     assert command_range_um(axis) == pytest.approx((low_um, high_um))
-    bounds = step_bounds(axis, MODEL_OPTIONS, required(34.5, 38.0))
+    bounds = step_bounds(axis, MODEL_OPTIONS, require_steps(34.5, 38.0))
     assert (bounds.lowest_um, bounds.step_um) == (0.0, 34.5)
     assert (bounds.low_um, bounds.high_um) == pytest.approx((low_um, high_um))
     lowest, highest = bounds.command_limits(np.array(1.0))
     assert lowest < 0.0 < 1.0 < highest  # the step and the step back have room beyond their ends
-    assert step_bounds(axis, MODEL_OPTIONS, required(3.0, 4.0)).lowest_um == -3.0  # 4 µm fit on both sides
-    assert step_bounds(axis, MODEL_OPTIONS, required(3.0, 38.0)).lowest_um == 0.0
+    assert step_bounds(axis, MODEL_OPTIONS, require_steps(3.0, 4.0)).lowest_um == -3.0  # 4 µm fit on both sides
+    assert step_bounds(axis, MODEL_OPTIONS, require_steps(3.0, 38.0)).lowest_um == 0.0
 
 
 def test_taps_of_a_drive_that_is_mostly_negative_are_those_of_its_mirror_image() -> None:
     (axis,), (mirrored,) = stage().axes, stage(drive_v=2.0, drive_min_v=-10.0).axes
-    bounds, expected = (step_bounds(side, MODEL_OPTIONS, required(34.5, 38.0)) for side in (mirrored, axis))
+    bounds, expected = (step_bounds(side, MODEL_OPTIONS, require_steps(34.5, 38.0)) for side in (mirrored, axis))
     assert bounds == pytest.approx(expected)
 
 
 def test_equal_sides_keep_steps_to_both() -> None:
     (axis,) = stage(drive_min_v=-10.0).axes
-    assert step_bounds(axis, MODEL_OPTIONS, required(34.5, 38.0)).lowest_um == -34.5
+    assert step_bounds(axis, MODEL_OPTIONS, require_steps(34.5, 38.0)).lowest_um == -34.5
 
 
 def test_a_reference_beyond_the_drive_is_refused_with_key_value_and_what_is_possible() -> None:
@@ -155,7 +155,7 @@ def test_a_reference_beyond_the_drive_is_refused_with_key_value_and_what_is_poss
     key = r"specification\.command\.reference_um"
     message = rf"{key}: value is 50 µm; allowed: up to 40 µm, because the command .*limits\.drive_min_v = -2"
     with pytest.raises(ValueError, match=message):
-        step_bounds(axis, MODEL_OPTIONS, required(50.0, 55.0))
-    half = MODEL_OPTIONS.model_copy(update={"gain": 2.0})  # D(0) = 0.5: the command is twice the position
+        step_bounds(axis, MODEL_OPTIONS, require_steps(50.0, 55.0))
+    half_gain = MODEL_OPTIONS.model_copy(update={"gain": 2.0})  # D(0) = 0.5: the command is twice the position
     with pytest.raises(ValueError, match=r"value is 30 µm; allowed: up to 20 µm"):
-        step_bounds(axis, half, required(30.0, 55.0))
+        step_bounds(axis, half_gain, require_steps(30.0, 55.0))

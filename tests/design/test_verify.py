@@ -44,12 +44,13 @@ MODEST = "[specification]\nsettling_ms = 5.0\novershoot_percent = 3.0\nstatic_er
 
 
 def run(*arguments: str):
+    """Run `rtloop design verify` in this process; return the result of the command."""
     return CliRunner().invoke(main, ["design", "verify", *arguments])
 
 
 @pytest.fixture(autouse=True, scope="module")
 def unmeasured_host(tmp_path_factory):
-    """Set RUNTIME_DIRECTORY to an empty folder, which has no measured delay of this host."""
+    """Set RUNTIME_DIRECTORY to an empty folder, which has no delay measured on this host."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("RUNTIME_DIRECTORY", str(tmp_path_factory.mktemp("run")))
         yield
@@ -144,7 +145,7 @@ def test_a_missed_limit_of_the_loop_that_never_runs_is_not_judged(tmp_path) -> N
     assert row.running < 0.5
     cells = [cell for line in text.table(verification) for cell in line]
     assert cells.count("MISSED") == 0
-    assert cells.count("met") == 2  # stable, and the overshoot
+    assert cells.count("met") == 2  # "stable" and the overshoot
 
 
 def test_the_norm_says_that_it_is_without_delay_as_the_synthesis_is_not() -> None:
@@ -245,10 +246,10 @@ def test_scenarios_are_judged_where_they_are_asked_for(tmp_path) -> None:
     verification = verify_paper(tmp_path, MODEST + scenarios.format(1.0))
     assert verification.meets_specification
     assert verification.scenarios is not None
-    worst_rows = {row.name: (row, worst) for row, worst in verification.scenarios.rows}
-    row, worst = worst_rows["overshoot_percent"]
-    assert worst.value >= (row.running or math.nan)
-    assert "resonance +1 %" in worst_rows["resonance_decay_ms"][1].plant
+    rows = {row.name: (row, worst_case) for row, worst_case in verification.scenarios.rows}
+    row, worst_case = rows["overshoot_percent"]
+    assert worst_case.value >= (row.running or math.nan)
+    assert "resonance +1 %" in rows["resonance_decay_ms"][1].plant
     verification = verify_paper(
         tmp_path, f"[specification]\novershoot_percent = 1.48\nmodulus_margin = 0.603\n{scenarios.format(1.0)}"
     )
@@ -266,6 +267,7 @@ def test_scenarios_are_judged_where_they_are_asked_for(tmp_path) -> None:
 
 
 def no_robustness() -> Robustness:
+    """Return an empty result of the search for robustness."""
     return Robustness({}, {}, 0.0, 0)
 
 
@@ -307,15 +309,15 @@ def test_what_trips_is_said(tmp_path) -> None:
 def test_what_cannot_be_simulated_is_said(tmp_path) -> None:
     """A second axis without a controller keeps the loop from closing."""
     config = PAPER_TEXT
-    for old, new in (('# mode = "closed_loop"', 'mode = "off"'), ("[[axis]]\n", CHANNEL), ("[recording]", SECOND)):
+    for old, new in (('# mode = "closed_loop"', 'mode = "off"'), ("[[axis]]\n", CHANNEL_Y), ("[recording]", AXIS_Y)):
         config = config.replace(old, new + ("" if old.startswith("#") else old), 1)
     verification = verify_paper(tmp_path, MODEST, config, simulated=True)
     assert verification.simulated is None
     assert any("steps are not simulated" in warning for warning in verification.warnings)
 
 
-CHANNEL = '[driver.channels.y]\ninput = "adc1"\noutput = "dac1"\num_per_v = 10.0\n'
-SECOND = '[[axis]]\nname = "y"\n[axis.feedforward]\nthresholds_v = [0.0]\nweights_um_per_v = [4.0]\n'
+CHANNEL_Y = '[driver.channels.y]\ninput = "adc1"\noutput = "dac1"\num_per_v = 10.0\n'
+AXIS_Y = '[[axis]]\nname = "y"\n[axis.feedforward]\nthresholds_v = [0.0]\nweights_um_per_v = [4.0]\n'
 
 
 def test_delay_and_prefilter_are_in_the_loop_as_it_runs(tmp_path) -> None:
