@@ -29,7 +29,7 @@ reference_um = 10.0
 command_um = 12.0
 [weights]
 disturbance_rule = "none"
-[weights.tracking]                 # 0.2 %, 300 rad/s, 5 %: stricter than [specification], because γ and reduction add errors
+[weights.tracking]                 # 0.2 %, 300 rad/s, 5 %: stricter than required: γ and reduction add errors
 form = "zpk"
 gain = 0.9523809523809523
 zeros = [[-315.0, 0.0]]

@@ -67,7 +67,7 @@ def test_the_bound_holds_on_drawn_rigs_stepped_one_by_one(seed: int) -> None:
 
 
 def test_eq_3_as_printed_is_no_bound_where_weights_have_both_signs() -> None:
-    """On the paper's rig a sine of 40 µm leaves 1.86 µm; |∫ r p(r) dr| is 1.52 µm and ξ is 2.28 µm."""
+    """A sine of 40 µm on the paper's rig leaves 1.86 µm; |∫ r p(r) dr| is 1.52 µm and ξ is 2.28 µm."""
     residual = residual_operator(RESIDUAL_RIG, INVERSE, COMMAND_UM)
     v = COMMAND_UM * np.sin(np.linspace(0, 5 * np.pi, 5001))
     error_um = np.abs(compensated_output(RESIDUAL_RIG, INVERSE, v) - residual.gain * v).max()

@@ -121,7 +121,7 @@ roots = st.tuples(st.lists(rates, max_size=3), st.lists(pairs, max_size=3)).map(
 @settings(max_examples=100, deadline=None)
 @given(poles=roots, zeros=roots, repeat=st.booleans(), integrator=st.booleans(), rule=st.sampled_from(METHODS))
 def test_any_controller(poles, zeros, repeat, integrator, rule) -> None:
-    """For any poles: state space = C(z), anti-windup stable and exact, steady state correct.
+    """The state space equals C(z), the anti-windup is stable and exact, the steady state correct, for any poles.
 
     The tolerance is 1e-7: zeros near 3 Hz among distant poles also cancel inside the cascade and cost digits (six zeros
     beside a triple pole gave 1.3e-8). Where eight zeros cancel, zI − A is nearly singular, and the tolerance is the
@@ -227,7 +227,7 @@ def test_refusals(controller, arguments, message) -> None:
 
 
 def test_a_zero_too_far_to_the_right_to_be_seen_leaves_its_gain() -> None:
-    """Beside exp(800), z rounds away: the controller becomes k/(z − p) with C(1) = C(0)."""
+    """The sum z − exp(800) rounds to −exp(800): the controller becomes k/(z − p) with C(1) = C(0)."""
     discrete = discretise_controller(Transfer.from_zpk([8e6], [-100.0], -1e-5), T, "matched")
     assert discrete.zeros.size == 0
     assert discrete.gain / (1 - math.exp(-100.0 * T)) == pytest.approx(0.8, rel=1e-12)

@@ -64,7 +64,7 @@ def test_a_scalar_plant_in_closed_form(a) -> None:
 
 
 def test_the_zero_on_the_right_bounds_the_sensitivity() -> None:
-    """With commands at no cost, min ‖W1 S‖∞ = |W1(z)| for a zero z on the right (Zames & Francis 1983)."""
+    """min ‖W1 S‖∞ = |W1(z)| for a zero z on the right, if commands have almost no weight (Zames & Francis 1983)."""
     plant = Transfer.from_zpk([20.0], [-5.0, -40.0], -1.0)
     w1 = Transfer.from_zpk([-9.0], [-0.01], 0.5)
     augmented = augment(plant, PAPER_WEIGHTS._replace(

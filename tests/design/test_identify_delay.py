@@ -112,7 +112,7 @@ def test_creep_is_not_taken_for_a_mode(criterion) -> None:
 
 
 def test_a_stage_that_has_not_settled_by_the_end_is_refused() -> None:
-    """With a lag of 2 s, a recording of 0.6 s does not determine the final position."""
+    """A recording of 0.6 s of a plant with a lag of 2 s does not determine the final position."""
     run = Excitation("rig", up_and_down_drive(), np.zeros(6000), PERIOD_S)
     decay = 1 - np.exp(-PERIOD_S / 2.0)
     position_um = lfilter([0.0, decay], [1.0, decay - 1.0], run.input) + np.random.default_rng(1).normal(

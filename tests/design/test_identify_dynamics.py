@@ -121,7 +121,7 @@ def test_sensitivities_are_the_derivatives_of_the_errors() -> None:
 
 
 def test_residues_are_fitted_under_the_noise_model() -> None:
-    """From zero residues the fit reaches the least squares found by scipy with numerical derivatives of the errors."""
+    """The fit from zero residues equals the least squares that scipy finds with numerical derivatives of the errors."""
     random = np.random.default_rng(3)
     u, noise = random.normal(size=400), 0.01 * random.normal(size=400)
     y = PAIR_AND_REAL.simulate_output(u) + noise

@@ -120,7 +120,7 @@ def loop_with_path(path) -> Loop:
 
 @pytest.mark.parametrize("path", PATHS)
 def test_figures_of_a_step_are_those_between_ticks(path) -> None:
-    """With an integrator, the path to the error alone decides the final value, and the path to the command does not.
+    """The path to the error alone decides the final value where the controller integrates.
 
     Where the final value is more than 5 % from the reference there is neither overshoot nor settling time.
     """

@@ -281,7 +281,7 @@ def test_a_linear_programme_that_no_solver_finishes_is_refused_in_a_sentence(tmp
 
 
 @pytest.mark.parametrize(
-    ("missed", "message"),
+    ("figures", "message"),
     [
         (
             {"overshoot": 0.02},
@@ -290,11 +290,11 @@ def test_a_linear_programme_that_no_solver_finishes_is_refused_in_a_sentence(tmp
         ({"excess": 0.01}, "fail the proof on 9 plants: .* and the command v exceeds its limits by 1 % of a step"),
     ],
 )
-def test_taps_that_their_proof_does_not_bear_out_are_refused(monkeypatch, excess, message) -> None:
+def test_taps_that_their_proof_does_not_bear_out_are_refused(monkeypatch, figures, message) -> None:
     """A plant outside the linear programme misses the designed figures in every round: an error, not a warning."""
     monkeypatch.setattr(shape_module, "MOST_ROUNDS", 2)
     measure_step = shape_module.measure_step
-    monkeypatch.setattr(shape_module, "measure_step", lambda *arguments: measure_step(*arguments)._replace(**excess))
+    monkeypatch.setattr(shape_module, "measure_step", lambda *arguments: measure_step(*arguments)._replace(**figures))
     with pytest.raises(NoDesign, match=message):
         design_taps(SUBJECT)
 

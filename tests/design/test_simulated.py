@@ -128,7 +128,7 @@ def test_a_disturbance_moves_it_between_ticks_too() -> None:
 
 
 def test_a_linear_rig_is_simulated_as_it_is_predicted() -> None:
-    """Without dead band and rounding, noise at rest and a large step have the figures of the linear loop."""
+    """Noise at rest and a large step have the figures of the linear loop: the rig has no dead band and no rounding."""
     configuration = linear_rig()
     check = prepare(configuration).checks[0]
     assert check.plant is not None
