@@ -43,7 +43,7 @@ def print_dynamics(out: Console, report: dict[str, Any]) -> None:
     out.print(f"delay {count_text(report['delay_ticks'], 'sample')}; fit {report['fit_percent']:.2f} %")
     out.print(
         f"prediction error, one step ahead: {report['rms_error_um']:.5f} µm rms over the whole recording. The table "
-        "of orders shows the error in the part that was held out of the fit; without input there, it shows none"
+        "of orders shows the error in the part that was held out of the fit, and none if the input is constant there"
     )
     if report["free_motion_s"]:
         out.print(

@@ -257,6 +257,7 @@ def test_a_measurement_in_another_mode_is_refused_before_it_moves_anything(bench
     assert bench.player().hold_um == bench.setpoint_of_loop()
     bench.set_mode(mode)
     bench.loop.run(10)
-    with pytest.raises(Refusal, match="response: the mode is not closed_loop"):
+    with pytest.raises(Refusal, match="response: the mode is not closed_loop") as caught:
         bench.player()
+    assert ("`rtloop ctl start`" in str(caught.value)) == (mode == Mode.OFF)
     assert bench.references.set_count(0) == 0

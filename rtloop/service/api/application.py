@@ -161,7 +161,12 @@ async def _answer_request(
         if isinstance(content, str):
             return PlainTextResponse(content, media_type=request.media_type)
         return JSONResponse(content)
-    except (asyncio.CancelledError, Exception) as error:  # Cancelled: the server ends while the client still waits.
-        if isinstance(error, asyncio.CancelledError) or (isinstance(error, Refusal) and service.is_ending):
-            return message_response(503, f"{request.name}: the service is ending and takes no more requests")
-        return error_response(error)
+    except asyncio.CancelledError:  # The server ends while the client still waits.
+        return _ending_response(request)
+    except Exception as error:
+        return _ending_response(request) if isinstance(error, Refusal) and service.is_ending else error_response(error)
+
+
+def _ending_response(request: ApiRequest) -> Response:
+    """Return the response, 503, to a request that the end of the service leaves without its result."""
+    return message_response(503, f"{request.name}: the service is ending and takes no more requests")
