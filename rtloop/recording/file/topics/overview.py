@@ -127,7 +127,7 @@ class OverviewLayout:
             raise ValueError("a summary of ticks that were left out is damaged: it has a wrong length")
         if not np.array_equal(np.frombuffer(payload, np.uint8)[self._fixed], self._tags):
             raise ValueError(
-                "a summary of ticks that were left out is damaged: its signals are not those of the recording"
+                "a summary of ticks that were left out is damaged: its fields are not those of the recording"
             )
 
     def parse_intervals(self, payloads: Sequence[bytes]) -> Intervals:
