@@ -116,7 +116,7 @@ def compensated_output(actuator: PlayModel, inverse: PlayModel, commands_um: npt
 def _inverse_loading_curve(inverse: PlayModel, drives: Real) -> Real:
     """Return the commands (k,) in µm at which the increasing loading curve of `inverse` reaches the drives (k,) in V.
 
-    Its last straight part goes on without an end.
+    Drives beyond its last threshold lie on its last straight part, extended.
     """
     levels = loading_curve(inverse, inverse.thresholds)
     part = np.clip(np.searchsorted(levels, drives, side="right") - 1, 0, None)
