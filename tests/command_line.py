@@ -18,7 +18,7 @@ def run(*arguments: Any) -> Result:
 
 
 def answer(*arguments: Any, code: int = 0) -> dict[str, Any]:
-    """Run `rtloop ARGUMENTS --json`, which must end with `code`; return its JSON object, without NaN and Infinity."""
+    """Run `rtloop ARGUMENTS --json`, which must end with `code`; return its JSON object. NaN fails the test."""
     result = run(*arguments, "--json")
     assert result.exit_code == code, result.output
     return json.loads(result.stdout, parse_constant=_refuse_constant)

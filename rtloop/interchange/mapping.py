@@ -120,7 +120,8 @@ def _product_unit(unit: str, sensitivity_unit: str) -> str:
 def _describe_mapping(name: str, unit: str, parts: dict[str, str | None]) -> str:
     """Return a column's mapping as text, such as "force [N] * 0.5 µm/N + 3 µm".
 
-    `name` and `unit` are those of the file's column; `parts` are the groups of _SOURCE, {} without factor and offset.
+    `name` and `unit` are those of the file's column; `parts` may have factor, by (its unit), sign, offset and
+    of (its unit), the groups of _SOURCE; {} for a mere name.
     """
     text = f"{name_without_unit(name)} [{unit}]" if unit else name
     if parts.get("factor"):

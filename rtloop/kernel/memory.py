@@ -129,8 +129,8 @@ class Layout:
     def require_allowed_axis(self, number: int, coefficients: Records, states: Records) -> None:
         """Raise ValueError if an integer field of axis `number` (from 0), or of its laws, is outside its allowed range.
 
-        `coefficients` and `states` are the records of all axes. Also raises it for a law in a slot for another number
-        of axes.
+        `coefficients` and `states` are the records of all axes. Also raises it for a law that controls another
+        number of axes than the axis's field `controller_axes` states.
         """
         axis, state, owner = coefficients[number], states[number], f"axis {number}"
         require_allowed(owner, axis, {**ALLOWED_COEFFICIENTS, **self._law_number_rules(number, len(coefficients))})

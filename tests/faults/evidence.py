@@ -131,8 +131,8 @@ class Evidence:
     def await_safe(self, bound_ms: float | None = None, by_request: bool = False) -> float:
         """Wait for 0 V; return the ms from the fault to the last movement of the output, by the card's time stamps.
 
-        Raises AssertionError if that takes longer than `bound_ms` plus the stalls of the host. `by_request`: the fault
-        is a request, on which several threads of the service and perhaps another process work.
+        Raises AssertionError if that takes longer than `bound_ms` plus the stalls of the host. With `by_request`, the
+        stalls of all threads and child processes count, because several of them work on a request.
         """
         waited_ns = dict(self._waited_ns)
 

@@ -35,7 +35,7 @@ def board() -> Bench:
 
 
 def end_board() -> None:
-    """End the board of the tries if it runs, for it takes a seventh of a processor; the next try starts another one."""
+    """End the board of the tries if it runs, for it takes a seventh of a processor; `board` then starts another."""
     if board.cache_info().currsize:
         board().__exit__()
         board.cache_clear()
