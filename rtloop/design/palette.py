@@ -5,9 +5,12 @@ from __future__ import annotations
 import io
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from rtloop.errors import MissingExtra
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 DPI = 130
 
@@ -60,15 +63,27 @@ def draw_pictures(
     except ImportError:
         raise MissingExtra("the report's pictures need matplotlib: pip install 'rtloop[plot]'") from None
     images: dict[str, bytes] = {}
+    first: Figure | None = None
     for name, ink in THEMES.items():
         with matplotlib.rc_context(_matplotlib_settings(ink)):
-            figure = Figure(figsize=size, layout="constrained")
+            figure = Figure(figsize=size, layout="constrained" if first is None else None)
             FigureCanvasAgg(figure)
             draw(figure, curves, ink)
+            if first is not None:
+                _copy_layout(first, figure)
             file = io.BytesIO()
             figure.savefig(file, format="png", dpi=DPI)
-        images[name] = file.getvalue()
+        images[name], first = file.getvalue(), figure
     return images
+
+
+def _copy_layout(source: Figure, target: Figure) -> None:
+    """Place the panels of `target` where those of `source` lie; both have the same panels.
+
+    Colours move no panel, and the search for places takes half of the time of a picture.
+    """
+    for source_panel, panel in zip(source.axes, target.axes, strict=True):
+        panel.set_position(source_panel.get_position())
 
 
 def _matplotlib_settings(ink: Palette) -> Any:
