@@ -308,3 +308,25 @@ def test_the_command_puts_the_controller_into_a_configuration_and_keeps_its_word
     missing = CliRunner().invoke(main, [*arguments, "--axis", "nowhere"])
     assert missing.exit_code == 78
     assert "axis: 'nowhere' is unknown; allowed: z" in missing.stderr
+
+
+def test_the_command_prints_the_section_and_beside_it_the_worst_figures(tmp_path, solution, monkeypatch) -> None:
+    """The section goes to stdout, the figures to stderr; with --out, a configuration that runs is written."""
+    monkeypatch.setattr("rtloop.design.robust.search.find_robust_controller", lambda design, progress: solution)
+    (tmp_path / "spec.toml").write_text(SPEC)
+    arguments = ["design", "robust", str(tmp_path / "spec.toml")]
+    result = CliRunner().invoke(main, arguments)
+    assert result.exit_code == 0, result.output
+    controller = tomllib.loads(result.stdout)["axis"]["controller"]
+    roots = {name: [complex(*pair) for pair in controller[name]] for name in ("zeros", "poles")}
+    written = matched_polynomials(Transfer.from_zpk(roots["zeros"], roots["poles"], controller["gain"]))
+    (sensitivity,) = (line for line in result.stderr.splitlines() if line.startswith("  max |S| "))
+    worst = float(sensitivity.split()[2])
+    peaks = [peak_sensitivity(written, sample_stage(gain, shift, factor, 0))
+             for gain in (-5.0, 0.0, 5.0) for shift in (-8.0, 0.0, 8.0) for factor in (0.5, 1.0, 2.0)]  # fmt: skip
+    assert max(peaks) == pytest.approx(worst, rel=0.02)
+    out = tmp_path / "made.toml"
+    written_too = CliRunner().invoke(main, [*arguments, "--out", str(out)])
+    assert written_too.exit_code == 0, written_too.output
+    assert f"{out} is written" in written_too.stdout
+    assert tomllib.loads(out.read_text())["axis"][0]["controller"] == controller

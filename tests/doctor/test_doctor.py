@@ -85,6 +85,26 @@ def test_refused_rights_are_reported():
     assert sum(reason.startswith("SCHED_FIFO: refused") for reason in report["reasons"]) == 1
 
 
+def test_the_text_has_every_condition_and_the_verdict():
+    """Each condition has a row; each bad one has its remedy; the ticks of the histogram are all there."""
+    report = doctor("deploy/paper.toml", "--seconds", "0.1")[1]
+    process = subprocess.run(
+        [sys.executable, "-m", "rtloop", "doctor", "deploy/paper.toml", "--seconds", "0.1"],
+        capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    text = " ".join(process.stdout.split())
+    bad = [finding for finding in report["findings"] if finding["good"] is False]
+    for finding in report["findings"]:
+        assert finding["condition"] in text
+    for finding in bad:
+        assert " ".join(finding["fix"].split()) in text, finding
+    verdicts = {0: "suitable for paper at 10 kHz", 1: "not suitable for paper at 10 kHz (period 100 µs), because:"}
+    assert verdicts[process.returncode] in text
+    assert ("not suitable" in text) == (process.returncode == 1)
+    assert "the loop's clock, 0.1 s at 10000 Hz" in text
+    assert "axis x: at the crossover with the least delay margin" in text
+
+
 def test_a_missing_configuration_ends_with_66():
     code, report, _ = doctor("no-such.toml")
     assert code == report["exit_code"] == 66
