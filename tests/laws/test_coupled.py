@@ -233,6 +233,21 @@ def test_it_is_verified_as_it_runs():
 
 
 @pytest.mark.usefixtures("few_simulated_steps")
+@pytest.mark.parametrize("command", [("check",), ("design", "verify")])
+def test_the_margins_of_all_axes_together_are_printed_once(command: tuple[str, ...]):
+    result = CliRunner().invoke(main, [*command, str(EXAMPLES["coupled"])])
+    assert result.exit_code == 0, result.output
+    margins = prepare_text(EXAMPLE).checks[0].together.margins
+    words = " ".join(result.stdout.split())
+    assert words.count("x and y together") + words.count("All axes of this controller together") == 1
+    assert words.count(f"largest σ(S) {margins.max_sensitivity:.3f} at {margins.max_sensitivity_hz:.1f} Hz") == 1
+    gain = (1 + margins.disk_margin / 2) / (1 - margins.disk_margin / 2)
+    phase_deg = np.degrees(2 * np.arctan(margins.disk_margin / 2))
+    assert f"disk margin, sensors {margins.disk_margin:.3f} at {margins.disk_margin_hz:.1f} Hz" in words
+    assert f"gains × {1 / gain:.2f} … {gain:.2f}, phases ± {phase_deg:.1f}°" in words
+
+
+@pytest.mark.usefixtures("few_simulated_steps")
 def test_a_law_of_one_axis_is_verified_too():
     result = CliRunner().invoke(main, ["design", "verify", str(EXAMPLES["pid"])])
     assert result.exit_code == 0
