@@ -11,7 +11,7 @@ import os
 import re
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -20,6 +20,9 @@ from rtloop.foundation.trusted import open_user_file
 from rtloop.interchange.formats.groups import FileColumns
 from rtloop.interchange.formats.table import UnreadableData
 from rtloop.interchange.hdf5_signals import descriptor_path
+
+if TYPE_CHECKING:
+    import h5py
 
 MAX_DEPTH = 32
 MAX_OBJECTS = 100_000
@@ -53,7 +56,7 @@ def collect_datasets(columns: FileColumns) -> None:
     h5py.
     """
     with open_hdf5(columns) as file:
-        datasets: dict[str, Any] = {}
+        datasets: dict[str, h5py.Dataset] = {}
         _collect_group(columns, datasets, file, "", set(), 0)
         for name, dataset in datasets.items():
             columns.require_room(name, dataset.shape)
@@ -62,7 +65,12 @@ def collect_datasets(columns: FileColumns) -> None:
 
 
 def _collect_group(
-    columns: FileColumns, datasets: dict[str, Any], group: Any, path: str, visited: set[Any], depth: int
+    columns: FileColumns,
+    datasets: dict[str, h5py.Dataset],
+    group: Any,
+    path: str,
+    visited: set[tuple[int, int]],
+    depth: int,
 ) -> None:
     """Collect into `datasets`, by path, the datasets of a group and of the groups in it, without text.
 
@@ -96,7 +104,7 @@ def _collect_group(
             datasets[name] = member
 
 
-def _resolve_member(columns: FileColumns, group: Any, key: str, name: str) -> Any:
+def _resolve_member(columns: FileColumns, group: h5py.Group, key: str, name: str) -> h5py.HLObject | None:
     """Return the object of a group under `key`; None where it is not in the file, which is then listed as `name`.
 
     It is listed in `columns.in_other_files` if a link leads into another file, else in `columns.left_out`.
@@ -110,7 +118,7 @@ def _resolve_member(columns: FileColumns, group: Any, key: str, name: str) -> An
     return None
 
 
-def _resolve_path(group: Any, path: str, links: int) -> Any:
+def _resolve_path(group: h5py.Group, path: str, links: int) -> h5py.HLObject:
     """Return the object at a path, reached by hard links and at most `links` soft ones within each other.
 
     Raises _OtherFileLink where the path leaves the file, KeyError without a target, and for more links.
@@ -135,7 +143,7 @@ def _resolve_path(group: Any, path: str, links: int) -> Any:
     return member
 
 
-def _is_in_other_files(columns: FileColumns, dataset: Any, name: str) -> bool:
+def _is_in_other_files(columns: FileColumns, dataset: h5py.Dataset, name: str) -> bool:
     """Whether the values of a dataset are in other files; it is then listed as `name` in `in_other_files`."""
     import h5py
 
@@ -158,7 +166,7 @@ class _OtherFileLink(Exception):
     """Error of a path that leaves the file."""
 
 
-def _read_dataset(columns: FileColumns, dataset: Any, name: str) -> None:
+def _read_dataset(columns: FileColumns, dataset: h5py.Dataset, name: str) -> None:
     """Add a dataset of numbers with its unit, or the fields of a dataset of records without units, to `columns`."""
     unit = next((_as_text(dataset.attrs[key]) for key in UNIT_ATTRIBUTES if key in dataset.attrs), None)
     values = dataset[()]
@@ -168,7 +176,7 @@ def _read_dataset(columns: FileColumns, dataset: Any, name: str) -> None:
         columns.add_column(name, values, unit)
 
 
-def _visit(member: Any, visited: set[Any]) -> bool:
+def _visit(member: h5py.HLObject, visited: set[tuple[int, int]]) -> bool:
     """Record an object as visited; return whether it was new."""
     import h5py
 
@@ -179,12 +187,12 @@ def _visit(member: Any, visited: set[Any]) -> bool:
     return is_new
 
 
-def _as_text(value: Any) -> str:
+def _as_text(value: object) -> str:
     """Return a value as text: bytes are decoded as UTF-8, invalid ones replaced, any other value is passed to `str`."""
     return value.decode("utf-8", "replace") if isinstance(value, bytes) else str(value)
 
 
-def matlab_variables(columns: FileColumns) -> dict[str, Any]:
+def matlab_variables(columns: FileColumns) -> dict[str, object]:
     """Return variables of a MAT file of version 7.3 by name: structures as dicts, arrays as in MATLAB, text as str.
 
     Raises UnreadableData if the file is damaged, nested too deeply or too large; MissingExtra without h5py.
@@ -193,7 +201,9 @@ def matlab_variables(columns: FileColumns) -> dict[str, Any]:
         return _group_values(columns, file, {key: key for key in file if not key.startswith("#")}, file, 0)
 
 
-def _group_values(columns: FileColumns, file: Any, names: dict[str, str], group: Any, depth: int) -> dict[str, Any]:
+def _group_values(
+    columns: FileColumns, file: h5py.File, names: dict[str, str], group: h5py.Group, depth: int
+) -> dict[str, Any]:
     """Return the values of a group's members by key, without those outside the file; see `_member_value`.
 
     `names` has the full name of each key; `depth` is the number of groups above. Raises UnreadableData for members
@@ -207,12 +217,12 @@ def _group_values(columns: FileColumns, file: Any, names: dict[str, str], group:
     }
 
 
-def _member_value(columns: FileColumns, file: Any, member: Any, name: str, depth: int) -> Any:
+def _member_value(columns: FileColumns, file: h5py.File, member: Any, name: str, depth: int) -> object:
     """Return a structure as dict, a structure array as list of dicts, text as str, numbers as an array.
 
     An array of object references, such as a cell array, is a list of the values that they refer to, in MATLAB's order.
-    Values in other files are an empty array. Raises UnreadableData for members nested too deeply, and beyond the memory
-    limit.
+    A named type and values in other files are an empty array. Raises UnreadableData for members nested too deeply, and
+    beyond the memory limit.
     """
     import h5py
 
@@ -226,7 +236,7 @@ def _member_value(columns: FileColumns, file: Any, member: Any, name: str, depth
         if fields and len(lengths) == 1 and all(isinstance(field, list) for field in fields.values()):
             return [dict(zip(fields, values, strict=True)) for values in zip(*fields.values(), strict=True)]
         return fields
-    if _is_in_other_files(columns, member, name):
+    if not isinstance(member, h5py.Dataset) or _is_in_other_files(columns, member, name):
         return np.empty(0)
     kind = _as_text(member.attrs.get("MATLAB_class", b"double"))
     if "MATLAB_empty" in member.attrs or member.shape is None:

@@ -13,7 +13,6 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 from rtloop.foundation.trusted import open_file
 from rtloop.kernel.layout import MAX_COUPLED
@@ -45,11 +44,10 @@ def recorded_laws(recording: Recording, trust: TrustedLaws = NO_TRUST) -> tuple[
     version lays out the records of the laws differently; ConfigError if a law's code ends or blocks its process.
     """
     require_law(recording)
-    described = recording.header.get("law", {}).get("laws")
-    entries = [entry for entry in described if isinstance(entry, dict)] if isinstance(described, list) else []
-    laws = tuple(_recorded_law(entry, recording, trust) for entry in entries)
-    if recording.header.get("law", {}).get("sha256") != law_layout(laws).description()["sha256"]:
-        version = recording.header.get("versions", {}).get("rtloop", "unknown")
+    description = recording.header["law"]
+    laws = tuple(_recorded_law(entry, recording, trust) for entry in description.get("laws", ()))
+    if description.get("sha256") != law_layout(laws).description()["sha256"]:
+        version = recording.header["versions"].get("rtloop") or "of an unknown version"
         raise RecordingError(
             f"{recording.paths[0]}: recorded by rtloop {version}, which stores a law's state differently; replay the "
             "recording with that version"
@@ -67,7 +65,7 @@ def require_law(recording: Recording) -> None:
         )
 
 
-def _recorded_law(entry: Mapping[str, Any], recording: Recording, trust: TrustedLaws) -> LawReference:
+def _recorded_law(entry: Mapping[str, object], recording: Recording, trust: TrustedLaws) -> LawReference:
     """Return the law of one header entry, for its recorded number of axes.
 
     Raises RecordingError if it is missing, differs from the recorded one, or has an invalid number of axes; ConfigError
@@ -81,7 +79,7 @@ def _recorded_law(entry: Mapping[str, Any], recording: Recording, trust: Trusted
     return replace(law, axes=axes)
 
 
-def _find_law(entry: Mapping[str, Any], recording: Recording, trust: TrustedLaws) -> LawReference:
+def _find_law(entry: Mapping[str, object], recording: Recording, trust: TrustedLaws) -> LawReference:
     """Return the trusted law of one header entry: a shipped one by name, any other one by name and SHA-256.
 
     Searched in this order: files that the user names, installed laws, the file that it ran from, and, if trusted, the
@@ -121,7 +119,7 @@ def _find_law(entry: Mapping[str, Any], recording: Recording, trust: TrustedLaws
     return law
 
 
-def _in_place(name: str, digest: str, file: Any) -> LawReference:
+def _in_place(name: str, digest: str, file: object) -> LawReference:
     """Read the law `name` from `file`, from which it ran; `digest` is the recorded SHA-256 of its text.
 
     Raises ValueError if the file is not recorded, unreadable or untrusted, has another SHA-256, or does not import

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import tomllib
 from collections import Counter, deque
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass
 from typing import Any
@@ -17,6 +17,7 @@ from rtloop.foundation.arrays import Real
 from rtloop.recording.file.reader import Reader
 from rtloop.recording.file.run_readers import RecordingPaths, ReportTicks, find_files, missing_parts, open_run
 from rtloop.recording.file.topics.events import COMMANDS, RECOVERED
+from rtloop.recording.file.topics.format import AroundEvents, CutOrigin, Header, ImportOrigin
 from rtloop.recording.file.topics.overview import MAXIMUM, MINIMUM, uncovered_ranges
 from rtloop.recording.views.histogram import TimeHistogram
 from rtloop.recording.views.motion import Motion
@@ -74,11 +75,11 @@ class Summary:
     parts: list[str]
     name: str | None
     ticks_expected: int | None
-    cut: dict[str, Any] | None
+    cut: CutOrigin | None
     """Origin of a cut recording: range (`first`, `end`) of the original `files`; None for an uncut one."""
     ticks_logged: int
     ticks_lost: int
-    around: dict[str, Any] | None
+    around: AroundEvents | None
     """Settings of a recording around events: `before_s`, `after_s`, `on`, `every_s`; None if it has every tick."""
     stretches: int
     """Number of tick ranges recorded at the full rate."""
@@ -96,7 +97,7 @@ class Summary:
     """Percentage of closed-loop ticks that limited a command or drive; None if the loop was never closed."""
     lateness_us: dict[str, float] | None
     """Quantiles and maximum {p50, p99, p999, max} in µs."""
-    lateness_histogram: list[dict[str, Any]]
+    lateness_histogram: list[dict[str, float | None]]
     """Number of ticks by lateness, as `TimeHistogram.class_counts`; [] without timing."""
     exec_us: dict[str, float] | None
     """Quantiles and maximum {p50, p99, p999, max} in µs."""
@@ -106,10 +107,10 @@ class Summary:
     result: str | None
     driver_error: str | None
     problems: list[str]
-    realtime: dict[str, Any] | None
-    host: dict[str, Any] | None
+    realtime: Mapping[str, object] | None
+    host: Mapping[str, object] | None
     axes: list[AxisSummary]
-    imported: dict[str, Any] | None
+    imported: ImportOrigin | None
     """Source file and import settings of signals from another program; None for a recording by rtloop."""
     ranges: list[ValueRange]
     """Least and largest value of each imported signal."""
@@ -120,7 +121,7 @@ class Summary:
     size_bytes: int
     bytes_per_tick: float | None
 
-    def as_dict(self) -> dict[str, Any]:
+    def as_dict(self) -> dict[str, object]:
         """Summary as a dict, keys as the fields; axes, ranges and trips are dicts. NaN and infinity stay floats."""
         return asdict(self)
 
@@ -256,12 +257,12 @@ def summarise(path: RecordingPaths, progress: ReportTicks | None = None) -> Summ
         return _make_summary(readers, totals)
 
 
-def _is_seamless(end: dict[str, Any] | None) -> bool:
-    """Whether the totals `end` of a file say that it ends without loss: complete, or recovered without gaps.
+def _is_seamless(end: Mapping[str, Any] | None) -> bool:
+    """Whether the totals `end` of a file say that it ends without loss: complete, or recovered with an empty `gaps`.
 
     False for None, an unfinished file.
     """
-    return end is not None and (end["complete"] or (end["result"] == RECOVERED and not end["gaps"]))
+    return end is not None and (end["complete"] or (end["result"] == RECOVERED and not end.get("gaps", True)))
 
 
 def _overview_span_s(readers: Sequence[Reader], totals: RecordingTotals) -> float:
@@ -339,7 +340,7 @@ def _make_summary(readers: Sequence[Reader], totals: RecordingTotals) -> Summary
     )
 
 
-def _bands_um(header: dict[str, Any]) -> dict[str, float | None]:
+def _bands_um(header: Header) -> dict[str, float | None]:
     """Map each axis to `settled_within_um` of the recorded configuration; None if it states none."""
     bands_um: dict[str, float | None] = dict.fromkeys(header["axes"])
     with suppress(tomllib.TOMLDecodeError, TypeError, AttributeError):

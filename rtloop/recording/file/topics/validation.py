@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Annotated, Any
+from typing import Annotated, Any, cast
 
 import pydantic_core
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
@@ -31,7 +31,7 @@ from rtloop.recording.file.topics.events import (
     is_member_name,
     name_problem,
 )
-from rtloop.recording.file.topics.format import FORMAT
+from rtloop.recording.file.topics.format import FORMAT, Header
 from rtloop.recording.file.topics.recovery_steps import Note
 from rtloop.signals import Mode
 
@@ -78,6 +78,13 @@ class _LawModel(_CheckedModel):
 
     sha256: Text | None = None
     revision: Annotated[int, Field(ge=1, le=1000)] = 1
+    laws: list[JsonObject] = []
+
+
+class _DriverModel(_CheckedModel):
+    """Header field `driver`."""
+
+    kind: Name
 
 
 class _VersionsModel(_CheckedModel):
@@ -167,6 +174,7 @@ class _RunHeader(_HeaderBase):
 
     axes: Annotated[list[Name], Field(min_length=1, max_length=64)]
     law: _LawModel
+    driver: _DriverModel
 
 
 class _ImportedModel(_CheckedModel):
@@ -252,7 +260,7 @@ class _MessageDetails(_CheckedModel):
     reason: Text | None = None
 
 
-def parse_header(payload: bytes) -> dict[str, Any]:
+def parse_header(payload: bytes) -> Header:
     """Parse the header in a message of `/configuration`.
 
     Raises MalformedText if it is no JSON object, its format is newer, a field is missing or wrong, or a name comes
@@ -268,10 +276,10 @@ def parse_header(payload: bytes) -> dict[str, Any]:
     for key in ("axes", "observed", "columns"):
         if len(set(header[key])) < len(header[key]):
             raise MalformedText(f"{key}: {_shorten(header[key])}; allowed: each name once")
-    return header
+    return cast(Header, header)
 
 
-def require_columns(header: dict[str, Any]) -> None:
+def require_columns(header: Header) -> None:
     """Raise MalformedText unless the columns follow from the axes, the extras and the observed signals.
 
     Of imported signals, the first two columns must be tick and deadline_ns, and units must belong to columns.
@@ -294,7 +302,7 @@ def require_columns(header: dict[str, Any]) -> None:
         )
 
 
-def header_extras(header: Mapping[str, Any]) -> Extras:
+def header_extras(header: Header) -> Extras:
     """Return the recorded inputs (names) and outputs (ExtraOutput) besides sensors and drives.
 
     Both are empty if there were none.
@@ -307,7 +315,7 @@ def header_extras(header: Mapping[str, Any]) -> Extras:
     return Extras(tuple(entry["name"] for entry in entries.get("inputs", ())), tuple(outputs))
 
 
-def header_extra_channels(header: Mapping[str, Any]) -> dict[str, str]:
+def header_extra_channels(header: Header) -> dict[str, str]:
     """Return the channel of each recorded extra input and output, by its name."""
     entries = header.get("extras", {})
     return {entry["name"]: entry["channel"] for kind in ("inputs", "outputs") for entry in entries.get(kind, ())}
@@ -372,7 +380,7 @@ def _require_command(kind: str, axis: str | None, values: list[float]) -> None:
             )
 
 
-def _command_value(value: Any) -> float:
+def _command_value(value: object) -> float:
     """Number of a JSON value, which may be 'nan', 'inf' or '-inf'. Raises MalformedText for any other value."""
     if value in ("nan", "inf", "-inf"):
         return float(value)
@@ -397,7 +405,7 @@ def _parse_object(payload: bytes) -> dict[str, Any]:
     return value
 
 
-def _validate(model: type[BaseModel], values: dict[str, Any], place: str = "") -> None:
+def _validate(model: type[BaseModel], values: Mapping[str, object], place: str = "") -> None:
     """Raise MalformedText for the first of `values` that does not fit `model`.
 
     `place`, such as "what.", precedes the value's name in the message.
@@ -410,7 +418,7 @@ def _validate(model: type[BaseModel], values: dict[str, Any], place: str = "") -
         raise MalformedText(f"{location}: {_shorten(first['input'])}; {first['msg'].lower()}") from None
 
 
-def _shorten(value: Any) -> str:
+def _shorten(value: object) -> str:
     """Return a value as text of at most MAX_SHOWN_CHARACTERS characters, in ASCII but for the ellipsis."""
     text = ascii(value)
     return text if len(text) <= MAX_SHOWN_CHARACTERS else f"{text[: MAX_SHOWN_CHARACTERS - 1]}…"
