@@ -9,10 +9,12 @@ from __future__ import annotations
 
 import ctypes
 import re
-from collections.abc import Iterable, Mapping
-from typing import Annotated, Any, ClassVar, Literal, Self
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from types import ModuleType
+from typing import TYPE_CHECKING, Annotated, ClassVar, Literal, Self
 
 import numpy as np
+import numpy.typing as npt
 from pydantic import Field, model_validator
 
 from rtloop.drivers.base import Channel, Driver, Facts, Pointers, Wiring
@@ -22,6 +24,12 @@ from rtloop.drivers.volt_ranges import Volts, require_ranges
 from rtloop.foundation.native.compiled import cfunc, intrinsic_like
 from rtloop.foundation.native.pointers import SIGNATURE, address_pointer, carray
 from rtloop.foundation.options import Options
+
+if TYPE_CHECKING:
+    from llvmlite.ir import IRBuilder, Value
+    from numba.core.base import BaseContext
+    from numba.core.types.abstract import Type
+    from numba.core.typing.templates import Signature
 
 LINE = np.dtype(
     [(name, np.uint32) for name in ("subdevice", "channel", "range", "aref")]
@@ -65,7 +73,7 @@ class ComediOptions(Options):
         return self
 
 
-def _call_in_python(function: int, device: int, line: tuple[int, ...], final_argument: Any) -> int:
+def _call_in_python(function: int, device: int, line: tuple[int, ...], final_argument: int | np.uint32) -> int:
     """Call the function at address `function` of libcomedi like `_call`, without the compiler; return its int.
 
     `line` is (subdevice, channel, range, aref). `final_argument` is a code to write if its type is uint32, else an
@@ -77,7 +85,9 @@ def _call_in_python(function: int, device: int, line: tuple[int, ...], final_arg
 
 
 @intrinsic_like(_call_in_python)
-def _call(compiler: Any, function: Any, device: Any, line: Any, final_argument: Any) -> Any:
+def _call(
+    compiler: ModuleType, function: Type, device: Type, line: Type, final_argument: Type
+) -> tuple[Signature, Callable[..., Value]]:
     """Call `int function(comedi_t *, subdevice, channel, range, aref, final_argument)`; return its int.
 
     In kernels: _call(function, device, line, final_argument) with addresses as integers and `line` = (subdevice,
@@ -86,7 +96,7 @@ def _call(compiler: Any, function: Any, device: Any, line: Any, final_argument: 
     types, ir = compiler.types, compiler.ir
     last_type = ir.IntType(32) if final_argument == types.uint32 else ir.IntType(64)
 
-    def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+    def codegen(context: BaseContext, builder: IRBuilder, signature: Signature, arguments: Sequence[Value]) -> Value:
         """Emit the LLVM call of the function at the address `arguments[0]`; return its int32.
 
         The function receives the device `arguments[1]`, the four numbers of the line `arguments[2]` and the final
@@ -162,7 +172,7 @@ class ComediDriver(Driver):
         self._options = options
         self._board: Board | None = None
         self._context = np.zeros(1, CONTEXT)
-        self._arrays: tuple[np.ndarray[Any, Any], ...] = ()
+        self._arrays: tuple[npt.NDArray[np.generic], ...] = ()
         self._outputs_v: list[float] | None = None
         for axis, wire in wiring.items():
             _require_name(f"channels.{axis}.input", wire.input, Kind.INPUT)
@@ -231,7 +241,7 @@ class ComediDriver(Driver):
             finally:
                 self._close_board()
 
-    def _lines(self, board: Board, kind: Kind, subdevice: int | None, names: Iterable[str]) -> np.ndarray[Any, Any]:
+    def _lines(self, board: Board, kind: Kind, subdevice: int | None, names: Iterable[str]) -> npt.NDArray[np.void]:
         """Reserve a subdevice (None: the first of its kind) and return records of LINE, one per name.
 
         Raises DriverError if the subdevice is in use, or the board lacks it, a channel or the range.
@@ -269,7 +279,7 @@ class ComediDriver(Driver):
             self._board = None
 
 
-def _read_back(board: Board, outputs: np.ndarray[Any, Any]) -> list[float] | None:
+def _read_back(board: Board, outputs: npt.NDArray[np.void]) -> list[float] | None:
     """Return the volts at the outputs, given as records of LINE; None if one of them cannot be read back."""
     codes = [board.output_code(tuple(line.tolist())) for line in outputs]
     if None in codes:

@@ -10,7 +10,6 @@ import ctypes
 import errno
 from ctypes import c_char_p, c_double, c_int, c_uint, c_void_p
 from enum import IntEnum
-from typing import Any
 
 from rtloop.drivers.errors import DriverError, MissingLibrary
 
@@ -35,7 +34,7 @@ class _Range(ctypes.Structure):
 
 AREFS = {"ground": 0, "common": 1, "diff": 2, "other": 3}
 UNIT_VOLT = 0
-_FUNCTIONS: dict[str, tuple[Any, list[Any]]] = {
+_FUNCTIONS: dict[str, tuple[type[ctypes._CDataType], list[type[ctypes._CDataType]]]] = {
     "comedi_open": (c_void_p, [c_char_p]),
     "comedi_close": (c_int, [c_void_p]),
     "comedi_errno": (c_int, []),

@@ -14,9 +14,9 @@ import struct
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from rtloop.foundation.native.atomics import fence_acquire, fence_release, load_acquire, store_release
 from rtloop.foundation.native.compiled import jit, python_entry
@@ -92,7 +92,7 @@ class BoardMemory:
         self._arrays = tuple(arrays.values())
 
     @property
-    def dac_codes(self) -> np.ndarray[Any, Any]:
+    def dac_codes(self) -> npt.NDArray[np.int64]:
         """Codes of the newest write (MAX_CHANNELS,), a copy; zeros before the first write.
 
         The converters have these codes unless the fault STUCK_OUTPUT holds them.

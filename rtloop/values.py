@@ -6,10 +6,13 @@ import base64
 import math
 from dataclasses import is_dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
 
 
-def dataclass_fields(value: Any) -> dict[str, Any]:
+def dataclass_fields(value: DataclassInstance) -> dict[str, Any]:
     """Return {name: value} of the fields of a dataclass instance; the values are neither converted nor copied."""
     return {name: getattr(value, name) for name in value.__dataclass_fields__}
 
@@ -48,7 +51,7 @@ def count_text(number: int, singular: str, plural: str = "") -> str:
     return f"{number:,} {singular if number == 1 else plural or f'{singular}s'}"
 
 
-def render_page(package: str | None, **values: Any) -> str:
+def render_page(package: str | None, **values: object) -> str:
     """Return the jinja2 template `page.html` in the folder of `package` (its `__package__`), filled in with `values`.
 
     Text is escaped for HTML; the template's filter `png` turns PNG bytes into a data URL. Raises jinja2's

@@ -5,11 +5,15 @@ from __future__ import annotations
 import struct
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 from rtloop.drivers.can.bits import FD_LENGTHS, frame_duration_s
 from rtloop.drivers.can.extra import UnsupportedDatabaseFormatError, can, load_file
 from rtloop.drivers.can.options import BusOptions
+
+if TYPE_CHECKING:
+    from cantools.database.can.message import Message
+    from cantools.database.can.signal import Signal
 
 DBC = Path(__file__).with_name("rtloop.dbc")
 _CODES = {(8, False): "B", (8, True): "b", (16, False): "H", (16, True): "h", (32, False): "I", (32, True): "i"}
@@ -18,7 +22,7 @@ _CODES = {(8, False): "B", (8, True): "b", (16, False): "H", (16, True): "h", (3
 class Frame:
     """A message of the DBC with signals of whole bytes, little-endian: one `struct` packs it. Values are physical."""
 
-    def __init__(self, message: Any) -> None:
+    def __init__(self, message: Message) -> None:
         """Read the layout of a cantools message.
 
         Raises ValueError for an extended identifier, for a length that CAN does not have, and for a signal that is not
@@ -164,7 +168,7 @@ def require_signals(frame: Frame, names: Sequence[str], options: BusOptions) -> 
         )
 
 
-def _raw_range(signal: Any) -> tuple[int, int]:
+def _raw_range(signal: Signal) -> tuple[int, int]:
     """Return the smallest and the largest raw integer that a signal's bits can hold."""
     half = signal.is_signed and 1
     return -half * 2 ** (signal.length - 1), 2 ** (signal.length - half) - 1

@@ -57,7 +57,7 @@ class BusOptions(Options):
     @property
     def keywords(self) -> dict[str, Any]:
         """Keyword arguments of `can.Bus`: interface, channel, bitrate, fd, with CAN FD data_bitrate, and `settings`."""
-        rates: dict[str, Any] = {"bitrate": self.bitrate, "fd": self.fd}
+        rates: dict[str, int] = {"bitrate": self.bitrate, "fd": self.fd}
         if self.fd:
             rates["data_bitrate"] = self.data_phase_bitrate
         return {"interface": self.interface, "channel": self.channel, **rates, **self.settings}

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from rtloop.drivers.node.frames import MAX_FRAME_BYTES, Scale
 
@@ -71,7 +72,7 @@ SCALE = np.dtype(
 
 def make_card(
     fd: int, strangers_fd: int | None, **values: Any
-) -> tuple[np.ndarray[Any, Any], dict[str, np.ndarray[Any, Any]]]:
+) -> tuple[npt.NDArray[np.void], dict[str, npt.NDArray[np.generic]]]:
     """Return a record CARD, shape (1,), and a dict of the arrays whose addresses it holds, by the names of these
     fields.
 
@@ -80,7 +81,7 @@ def make_card(
     of Scale.
     """
     inputs, outputs = (_scale_array(values.pop(name)) for name in ("in_scales", "out_scales"))
-    arrays: dict[str, np.ndarray[Any, Any]] = {
+    arrays: dict[str, npt.NDArray[np.generic]] = {
         **{name: np.zeros(ROOM_BYTES // 8, np.uint64) for name in ("sent", "received", "coded", "partial")},
         "raw": np.zeros(RAW_BYTES, np.uint8),
         "crc_table": crc_table(),
@@ -102,13 +103,13 @@ def make_card(
     return card, arrays
 
 
-def _scale_array(scales: tuple[Scale, ...]) -> np.ndarray[Any, Any]:
+def _scale_array(scales: tuple[Scale, ...]) -> npt.NDArray[np.void]:
     """Return the scales as records SCALE (channels,), which have no safe value and no change per ms."""
     rows = [(s.lowest, s.highest, s.volts_per_code, s.offset_v) for s in scales]
     return np.array(rows, SCALE)
 
 
-def crc_table() -> np.ndarray[Any, Any]:
+def crc_table() -> npt.NDArray[np.uint32]:
     """Return the 256 values, uint32, by which CRC-32 takes a byte at a time (polynomial 0xEDB88320, bits reflected)."""
     table = np.arange(256, dtype=np.uint32)
     for _ in range(8):

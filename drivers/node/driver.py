@@ -7,10 +7,10 @@ from __future__ import annotations
 
 import secrets
 import time
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Iterator, Mapping
 
 import numpy as np
+import numpy.typing as npt
 
 from rtloop.drivers.base import Channel, Driver, Exchanges, Facts, Pointers, Wiring, require_channels
 from rtloop.drivers.errors import DriverError
@@ -42,8 +42,8 @@ class NodeDriver(Driver):
         super().__init__(options, wiring, rate_hz)
         self._options = options
         self._link: Link | None = None
-        self._card: np.ndarray[Any, Any] | None = None
-        self._arrays: dict[str, np.ndarray[Any, Any]] = {}
+        self._card: npt.NDArray[np.void] | None = None
+        self._arrays: dict[str, npt.NDArray[np.generic]] = {}
         require_channels(wiring, self.facts)
 
     @property
@@ -146,7 +146,7 @@ class NodeDriver(Driver):
         return Exchanges(tuple(durations_us), lost)
 
     @property
-    def _opened_card(self) -> np.ndarray[Any, Any]:
+    def _opened_card(self) -> npt.NDArray[np.void]:
         """Memory of the open exchange. Raises DriverError if the driver is not open."""
         if self._card is None:
             raise DriverError(f"{self._options.label}: the driver is not open; call open() first")
@@ -375,7 +375,7 @@ def _digital_channels(prefix: str, count: int) -> list[Channel]:
     return [Channel(f"{prefix}{i}", 0.0, HIGH_V) for i in range(count)]
 
 
-def _receive_for(link: Link, duration_s: float) -> Any:
+def _receive_for(link: Link, duration_s: float) -> Iterator[tuple[frames.Header, bytes]]:
     """Yield each valid frame that comes within `duration_s` as (Header, bytes of the whole frame).
 
     Raises OSError if the line is broken.

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import ctypes
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 
@@ -20,13 +19,15 @@ EINTR, EAGAIN = 4, 11
 COBS_RUN = 254
 
 
-def _library_call(name: str, result: Any, *types: Any) -> Callable[..., Any]:
+def _library_call(
+    name: str, result: type[ctypes._SimpleCData[int]], *types: type[ctypes._SimpleCData[int]]
+) -> Callable[..., int]:
     """Return a Python function that calls the C library's function `name`, for kernels that run uncompiled.
 
     `result` and `types` are the ctypes types of its result and its arguments.
     """
 
-    def call(*arguments: Any) -> Any:
+    def call(*arguments: int) -> int:
         """Call the C function with integers and return its result."""
         function = getattr(ctypes.CDLL(None, use_errno=True), name)
         function.restype, function.argtypes = result, types

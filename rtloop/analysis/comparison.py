@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 
@@ -53,7 +53,7 @@ class ControllerComparison:
     shifts: tuple[RootShift, ...]
     warnings: list[str]
 
-    def as_dict(self) -> dict[str, Any]:
+    def as_dict(self) -> dict[str, object]:
         """Return the fields by name as values for JSON, null for numbers that are not finite; `shifts` is a list of
         {kind, frequency_hz, discrete_hz, damping}.
         """

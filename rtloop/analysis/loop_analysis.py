@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -48,7 +47,7 @@ class LoopAnalysis:
     step_position: tuple[float, ...]
     poles: tuple[complex, ...]
 
-    def as_dict(self) -> dict[str, Any]:
+    def as_dict(self) -> dict[str, object]:
         """Return the fields by name for JSON: poles as [real, imaginary], null for undefined and infinite values."""
         return to_jsonable(self)
 

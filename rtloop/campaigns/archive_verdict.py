@@ -94,7 +94,7 @@ def _examine(paths: Sequence[str], version: str, judge: Callable[[list[Path]], R
     return row
 
 
-def _row(verdict: str, reason: str = "", **values: Any) -> Row:
+def _row(verdict: str, reason: str = "", **values: object) -> Row:
     """Return the row {verdict, **values, reason}; `values` are columns of the examination."""
     return {"verdict": verdict, **values, "reason": reason}
 

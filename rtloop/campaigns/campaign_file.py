@@ -7,7 +7,7 @@ import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Self
+from typing import Annotated, Self
 
 from pydantic import Field, ValidationError, model_validator
 
@@ -173,6 +173,6 @@ def _limits(options: CampaignOptions, path: Path, configuration: Configuration) 
 
 def _collect_keys() -> set[str]:
     """Return all keys of the file, for suggestions where one is unknown."""
-    schema: dict[str, Any] = CampaignOptions.model_json_schema()
+    schema = CampaignOptions.model_json_schema()
     parts = [schema, *schema.get("$defs", {}).values()]
     return set().union(*(part.get("properties", {}) for part in parts))

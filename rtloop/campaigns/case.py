@@ -46,7 +46,7 @@ class CaseResult:
     """
 
     rig: int
-    values: Mapping[str, Any]
+    values: Mapping[str, object]
     figures: Mapping[str, float]
     trips: Mapping[str, str]
     missed: tuple[str, ...]
@@ -92,7 +92,7 @@ class CaseRunner:
         shares = unit_samples(options.sampling, self.keys, rig - 1, 1, options.rigs, options.seed)[0]
         return self.quantile_values(rig, shares)
 
-    def quantile_values(self, rig: int, shares: Real) -> dict[str, Any]:
+    def quantile_values(self, rig: int, shares: Real) -> dict[str, object]:
         """Return the values of rig number `rig`, by key, at `shares` (keys,), in (0, 1), of the keys' distributions.
 
         Under "driver.seed" is the seed of its noise, unless this key is uncertain itself. Raises as `quantile_value`.
@@ -117,7 +117,7 @@ class CaseRunner:
             )
         return nominal * value
 
-    def run(self, rig: int, values: Mapping[str, Any] | None = None) -> CaseResult:
+    def run(self, rig: int, values: Mapping[str, object] | None = None) -> CaseResult:
         """Run all experiments of a rig; return its figures and verdict, with a `refusal` for a rig that cannot run.
 
         `values` by key replace all drawn ones; of a key that they lack, also of "driver.seed", the configured value
@@ -135,7 +135,7 @@ class CaseRunner:
         trips = dict(zip(labels, (outcome.trip for outcome in outcomes), strict=True))
         return CaseResult(rig, outcomes[-1].values, figures, trips, *_judge(figures, trips, self.campaign.limits))
 
-    def configuration_text(self, values: Mapping[str, Any], experiment: Experiment, heading: str) -> str:
+    def configuration_text(self, values: Mapping[str, object], experiment: Experiment, heading: str) -> str:
         """Return the configuration of a rig with `values` in one experiment as TOML, for a run that is recorded.
 
         Its first line is `heading` as a comment, after "# ". Raises ValueError for values that the configuration has no
@@ -143,7 +143,7 @@ class CaseRunner:
         """
         return self._builder.text(values, experiment, heading)
 
-    def _run_experiment(self, loop: Loop, drawn: Mapping[str, Any], experiment: Experiment) -> _Outcome:
+    def _run_experiment(self, loop: Loop, drawn: Mapping[str, object], experiment: Experiment) -> _Outcome:
         """Run one experiment on a rig; return its outcome, with infinite figures if the loop ended early.
 
         Raises ValueError for an impossible rig, and where ticks were so late that the motion between them is unknown;
@@ -240,7 +240,7 @@ class _Outcome(NamedTuple):
 
     figures: tuple[float, ...]
     trip: str
-    values: dict[str, Any]
+    values: dict[str, object]
 
 
 def _require_equal(computed_um: Real, recorded_um: Real) -> None:

@@ -10,9 +10,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 
 from rtloop.campaigns.store import PASSED, read_columns, read_manifest
 from rtloop.campaigns.summary import CONFIDENCE, Yield, clopper_pearson, independent_rigs
@@ -126,7 +127,7 @@ def paired_difference(first: Real, second: Real, seed: int = 0) -> FigureDiffere
     return FigureDifference(int(differences.size), median, float(interval.low), float(interval.high))
 
 
-def _columns(folder: Path) -> dict[str, Any]:
+def _columns(folder: Path) -> dict[str, np.ndarray]:
     """Return the columns of all sampled rigs in a folder that could run and are independent, by name.
 
     Raises as `read_columns`.
@@ -136,6 +137,6 @@ def _columns(folder: Path) -> dict[str, Any]:
     return {name: values[counted] for name, values in columns.items()}
 
 
-def _yield(passed: Any) -> Yield:
+def _yield(passed: npt.NDArray[np.bool_]) -> Yield:
     """Return the yield of rigs, with its interval (95 %); `passed` (n,) are truth values."""
     return clopper_pearson(int(np.count_nonzero(passed)), len(passed))

@@ -8,10 +8,13 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, CancelledError, Future, wait
-from typing import Any, NamedTuple, Protocol
+from typing import Generic, NamedTuple, Protocol, TypeVar
 
 from rtloop.campaigns.workers import WorkerDied, Workers
 
+Item = TypeVar("Item")
+TakenItem = TypeVar("TakenItem", contravariant=True)
+Result = TypeVar("Result")
 WAITING_FOR_EACH = 2
 """Tasks submitted for each worker: one runs, one waits."""
 TRIES_ALONE = 2
@@ -20,29 +23,29 @@ POLL_S = 0.5
 """Time between looks at a request to stop."""
 
 
-class Task(NamedTuple):
+class Task(NamedTuple, Generic[Item]):
     """Items that one worker handles, one after the other. With `alone`, no further task starts until it has ended.
 
     `deaths` counts the workers that died while they ran it alone.
     """
 
-    items: tuple[Any, ...]
+    items: tuple[Item, ...]
     alone: bool = False
     deaths: int = 0
 
 
-class Job(Protocol):
+class Job(Protocol[TakenItem, Result]):
     """Work on items: its start in a worker, and the storage of its results."""
 
-    def submit(self, items: tuple[Any, ...]) -> Future[Any]:
+    def submit(self, items: tuple[TakenItem, ...]) -> Future[Result]:
         """Start the work on the items of a task in a worker; return the future of its result, which `store` takes."""
         ...
 
-    def store(self, items: tuple[Any, ...], result: Any) -> None:
+    def store(self, items: tuple[TakenItem, ...], result: Result) -> None:
         """Store the result of a task. Raises OutputError if the system refuses."""
         ...
 
-    def set_aside(self, item: Any) -> None:
+    def set_aside(self, item: TakenItem) -> None:
         """Store that an item has no result, as each worker that ran it died.
 
         Raises OutputError if the system refuses.
@@ -50,16 +53,16 @@ class Job(Protocol):
         ...
 
 
-class Dispatcher:
+class Dispatcher(Generic[Item, Result]):
     """Runs the tasks of a job on workers."""
 
-    def __init__(self, workers: Workers, job: Job) -> None:
+    def __init__(self, workers: Workers, job: Job[Item, Result]) -> None:
         self._workers, self._job = workers, job
-        self._suspects: deque[Task] = deque()
-        self._running: dict[Future[Any], Task] = {}
+        self._suspects: deque[Task[Item]] = deque()
+        self._running: dict[Future[Result], Task[Item]] = {}
 
     def run(
-        self, tasks: Iterable[Task], on_progress: Callable[[int], None], is_stop_requested: Callable[[], bool]
+        self, tasks: Iterable[Task[Item]], on_progress: Callable[[int], None], is_stop_requested: Callable[[], bool]
     ) -> int:
         """Run the tasks; return the number of items that are stored or set aside.
 
@@ -75,7 +78,7 @@ class Dispatcher:
                 on_progress(done)
         return done
 
-    def _fill(self, tasks: Iterator[Task], is_stopping: bool) -> int:
+    def _fill(self, tasks: Iterator[Task[Item]], is_stopping: bool) -> int:
         """Submit the next tasks; return the number of submitted tasks that have not ended, 0 at the end.
 
         Each worker gets up to WAITING_FOR_EACH. Items whose worker died go first, alone, once no other task runs. While
@@ -98,14 +101,14 @@ class Dispatcher:
                 self._workers.recover()
         return len(self._running)
 
-    def _collect(self, completed: Iterable[Future[Any]]) -> int:
+    def _collect(self, completed: Iterable[Future[Result]]) -> int:
         """Store the results of tasks that ended; return the number of items that this call stored or set aside.
 
         If a worker died, all other tasks are awaited and stored, since some workers die together. The workers are then
         replaced, and the items of the dead ones run again, each alone, or are set aside. Raises the error of a task,
         UnavailableError if the scheduler is gone, and the errors of the job.
         """
-        died: list[Task] = []
+        died: list[Task[Item]] = []
         done = sum(self._store_result(future, died) for future in completed)
         if died:
             wait(self._running)
@@ -114,7 +117,7 @@ class Dispatcher:
             done += sum(self._repeat(task) for task in died)
         return done
 
-    def _store_result(self, future: Future[Any], died: list[Task]) -> int:
+    def _store_result(self, future: Future[Result], died: list[Task[Item]]) -> int:
         """Store the result of the task of `future`, which ended; return its number of items.
 
         If the worker died, append the task to `died` and return 0. Raises any other error of the task, and the errors
@@ -132,7 +135,7 @@ class Dispatcher:
         self._job.store(task.items, result)
         return len(task.items)
 
-    def _repeat(self, task: Task) -> int:
+    def _repeat(self, task: Task[Item]) -> int:
         """Queue the items of a task whose worker died, to run again each alone; return the number of items set aside.
 
         An item is set aside in place of queueing once TRIES_ALONE workers died while they ran it alone.

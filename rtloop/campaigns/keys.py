@@ -23,7 +23,7 @@ def is_rig_key(key: str) -> bool:
     return key.startswith(DRIVER) and not key.startswith(FIXED_KEYS)
 
 
-def replace_values(tables: Mapping[str, Any], values: Mapping[str, Any]) -> dict[str, Any]:
+def replace_values(tables: Mapping[str, object], values: Mapping[str, object]) -> dict[str, object]:
     """Return a deep copy of a configuration's tables in which each dotted key of `values` has its value.
 
     Missing tables are made. Raises ValueError for a path through a value that is neither a table nor a list, and for an
@@ -35,9 +35,9 @@ def replace_values(tables: Mapping[str, Any], values: Mapping[str, Any]) -> dict
     return changed
 
 
-def _set_value(tables: dict[str, Any], key: str, value: Any) -> None:
+def _set_value(tables: dict[str, object], key: str, value: object) -> None:
     """Set the value of one key in place; raises ValueError as `replace_values` does."""
-    node: Any = tables
+    node: object = tables
     *parents, last = key.split(".")
     for part in parents:
         if isinstance(node, dict) and part not in node:
@@ -54,7 +54,7 @@ def _set_value(tables: dict[str, Any], key: str, value: Any) -> None:
         )
 
 
-def _step(node: Any, part: str, key: str) -> Any:
+def _step(node: object, part: str, key: str) -> object:
     """Return the entry `part` of a table, which must have it, or of a list, by name or number, on the path `key`.
 
     Raises ValueError for a list without it, and for a node that is neither a table nor a list.
@@ -68,7 +68,7 @@ def _step(node: Any, part: str, key: str) -> Any:
     )
 
 
-def _list_index(entries: list[Any], part: str, key: str) -> int:
+def _list_index(entries: list[object], part: str, key: str) -> int:
     """Return the index of an entry, by its name or by its number, from 0. Raises ValueError where there is none."""
     names = [entry.get("name") for entry in entries if isinstance(entry, dict)]
     if part in names:
@@ -99,7 +99,7 @@ def option_value(configuration: Configuration, driver_options: Options, key: str
     return _attribute(sections[section], path, key)
 
 
-def _attribute(options: Any, path: str, key: str) -> Any:
+def _attribute(options: object, path: str, key: str) -> object:
     """Return the value at the dotted `path` below an options object; `key` is the whole key, for messages.
 
     Raises ValueError for a part that does not exist.
@@ -117,7 +117,7 @@ def _attribute(options: Any, path: str, key: str) -> Any:
     return value
 
 
-def _choices_text(value: Any) -> str:
+def _choices_text(value: object) -> str:
     """Return "; allowed: …" with the fields of Options, the keys of a table or the places of a tuple; else ""."""
     names = list(type(value).model_fields) if isinstance(value, Options) else []
     names = list(value) if isinstance(value, Mapping) else names

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 from urllib.parse import quote
 
 import numpy as np
+import numpy.typing as npt
 
 from rtloop.campaigns.campaign_file import SEPARATOR
 from rtloop.campaigns.case import NOMINAL
@@ -34,7 +35,7 @@ from rtloop.recording.file.run_readers import run_files
 from rtloop.recording.load import load
 from rtloop.values import count_text, render_page
 
-Columns = Mapping[str, Any]
+Columns = Mapping[str, np.ndarray]
 """Columns of results, (rigs,) each, by name."""
 Link = Callable[[Path], str]
 """Function that returns the path of a file relative to the folder of the page."""
@@ -74,7 +75,7 @@ def render_comparison(
     return _render(f"{' and '.join(comparison.names)}: campaigns on the same rigs", sections, compared)
 
 
-def _render(title: str, sections: Sequence[Mapping[str, Any]], comparison: Mapping[str, Any] | None) -> str:
+def _render(title: str, sections: Sequence[Mapping[str, object]], comparison: Mapping[str, object] | None) -> str:
     """Return the HTML page of campaigns, given by `sections` as `_campaign_section` returns them.
 
     `comparison` has the result of a comparison and its picture: {result, picture}; None without a comparison.
@@ -93,7 +94,7 @@ def _render(title: str, sections: Sequence[Mapping[str, Any]], comparison: Mappi
     )
 
 
-def value_text(value: Any) -> str:
+def value_text(value: object) -> str:
     """Return a value of a key or figure as text: a float with four significant digits, "–" for None and NaN.
 
     An infinite number is "∞" or "−∞", a truth value "true" or "false"; whole numbers and texts stay as they are.
@@ -150,7 +151,7 @@ def _estimate_text(sampling: str, estimate: Yield, rigs: int) -> str:
     return f'{text}. With sampling = "{sampling}" rigs depend on each other: the interval is only a guide.{independent}'
 
 
-def _campaign_section(folder: Path, summary: CampaignSummary, link: Link) -> dict[str, Any]:
+def _campaign_section(folder: Path, summary: CampaignSummary, link: Link) -> dict[str, object]:
     """Return the template's values for one campaign by name, its pictures included; raises as `render_campaign`."""
     manifest, columns = read_manifest(folder), read_columns(folder)
     sampled = _select(columns, columns["rig"] != NOMINAL)
@@ -203,7 +204,7 @@ def _address(path: str) -> str:
     return quote(os.fsencode(path))
 
 
-def _select(columns: Columns, is_selected: Any) -> dict[str, Any]:
+def _select(columns: Columns, is_selected: npt.NDArray[np.bool_ | np.intp]) -> dict[str, np.ndarray]:
     """Return the columns of the rigs at which `is_selected`, (rigs,) truth values, is true."""
     return {name: values[is_selected] for name, values in columns.items()}
 
@@ -214,7 +215,7 @@ def _figure_values(columns: Columns, name: str, limit: float, nominal: Mapping[s
     return FigureValues(name, columns[name].astype(float), limit, np.nan if value is None else value)
 
 
-def _range_text(values: Any) -> str:
+def _range_text(values: np.ndarray) -> str:
     """Return the least, the largest and the median of numbers (rigs,) as text, or all different values of other ones.
 
     Returns "–" without a value.
@@ -268,12 +269,12 @@ def _distribution_distance(first: Real, second: Real) -> float:
     return float(np.max(np.abs(np.subtract(*shares))))
 
 
-def _is_numeric(values: Any) -> bool:
+def _is_numeric(values: npt.NDArray[np.generic]) -> bool:
     """Whether values (rigs,) of a key are numbers, and neither texts nor truth values."""
     return values.dtype.kind in "iuf"
 
 
-def _key_numbers(values: Any) -> tuple[Real, tuple[str, ...]]:
+def _key_numbers(values: npt.NDArray[np.generic]) -> tuple[Real, tuple[str, ...]]:
     """Return values (rigs,) of a key as floats, and the texts for which the numbers 0, 1 … stand.
 
     The texts are sorted; there are none, (), if the values are numbers.

@@ -6,7 +6,7 @@ The themes are "light" and "dark". Every function that returns pictures raises M
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -17,6 +17,11 @@ from rtloop.foundation.arrays import Real
 from rtloop.recording.load import Recording
 from rtloop.recording.views.bands import Band, Mark, event_marks, read_bands
 from rtloop.values import count_text
+
+if TYPE_CHECKING:
+    from matplotlib.artist import Artist
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 FEWEST_BINS, MOST_BINS = 10, 40
 """Bins of a histogram between the least and the largest value, by the number of values."""
@@ -117,13 +122,13 @@ def draw_pairs(pairs: Sequence[tuple[FigureValues, FigureValues]]) -> dict[str, 
     return draw_pictures(_draw_pairs, pairs, (11.0, 0.4 + 3.6 * rows))
 
 
-def _panels(figure: Any, count: int) -> list[Any]:
+def _panels(figure: Figure, count: int) -> list[Any]:
     """Add `count` panels to a figure of matplotlib, in rows of COLUMNS; return them."""
     grid = figure.add_gridspec(-(-count // COLUMNS), min(count, COLUMNS))
     return [figure.add_subplot(grid[divmod(number, COLUMNS)]) for number in range(count)]
 
 
-def _add_legend(figure: Any, ink: Palette, entries: Mapping[str, Any] | None = None) -> None:
+def _add_legend(figure: Figure, ink: Palette, entries: Mapping[str, Artist] | None = None) -> None:
     """Add a legend below all panels; `entries` has the line or bar of each label, by default from the first panel."""
     if entries is None:
         handles, labels = figure.axes[0].get_legend_handles_labels()
@@ -145,7 +150,7 @@ def _finite(*numbers: float) -> Real:
     return np.array([number for number in numbers if np.isfinite(number)])
 
 
-def _scale_axis(panel: Any, name: str, values: Real) -> bool:
+def _scale_axis(panel: Axes, name: str, values: Real) -> bool:
     """Scale the axis `name`, "x" or "y", of a panel for finite values (n,); return whether it is logarithmic.
 
     It is if all are positive and differ by LOGARITHMIC_RATIO or more. An axis of whole numbers has no other ticks.
@@ -219,7 +224,7 @@ def histogram_title(curves: FigureValues) -> str:
     return "; ".join(parts)
 
 
-def _draw_rigs(figure: Any, plane: RigPlane, ink: Palette) -> None:
+def _draw_rigs(figure: Figure, plane: RigPlane, ink: Palette) -> None:
     """Draw the first DRAWN_RIGS rigs over two keys on a figure of matplotlib, and the nominal rig as a star."""
     panel, passed = figure.subplots(), plane.passed[:DRAWN_RIGS]
     styles: dict[str, Any] = {
@@ -244,7 +249,7 @@ def _draw_rigs(figure: Any, plane: RigPlane, ink: Palette) -> None:
     _add_legend(figure, ink)
 
 
-def _draw_sensitivity(figure: Any, indices: Mapping[str, Mapping[str, SensitivityIndex]], ink: Palette) -> None:
+def _draw_sensitivity(figure: Figure, indices: Mapping[str, Mapping[str, SensitivityIndex]], ink: Palette) -> None:
     """Draw two bars for each key: first index above, total index below, and their intervals as lines.
 
     `figure` is matplotlib's, with a panel for each quantity; `indices` are by quantity and by key.
@@ -275,7 +280,7 @@ def _draw_sensitivity(figure: Any, indices: Mapping[str, Mapping[str, Sensitivit
     _add_legend(figure, ink, {label: entries[label] for label in [*labels[1:], *labels[:1]]})
 
 
-def _draw_motions(figure: Any, motions: Mapping[str, RecordedMotion], ink: Palette) -> None:
+def _draw_motions(figure: Figure, motions: Mapping[str, RecordedMotion], ink: Palette) -> None:
     """Draw reference and true position of each motion, with a line at each fault, on a figure of matplotlib."""
     panels, entries, fault_entries = _panels(figure, len(motions)), {}, {}
     for number, (panel, (name, motion)) in enumerate(zip(panels, motions.items(), strict=True)):
@@ -300,7 +305,7 @@ def _motion_title(name: str, motion: RecordedMotion) -> str:
     return _escape_math(f"{name}, {motion.faults[0].label}" if motion.faults else name)
 
 
-def _draw_pairs(figure: Any, pairs: Sequence[tuple[FigureValues, FigureValues]], ink: Palette) -> None:
+def _draw_pairs(figure: Figure, pairs: Sequence[tuple[FigureValues, FigureValues]], ink: Palette) -> None:
     """Draw a panel for each pair, on a figure of matplotlib: a dot for each rig, the line of equal values, both limits.
 
     At most DRAWN_RIGS rigs are drawn, of those with finite values in both campaigns.

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 from rtloop.campaigns.case import CaseRunner
 from rtloop.campaigns.rig_experiments import Experiment
@@ -24,7 +23,7 @@ def record_rig(runner: CaseRunner, rig: int, folder: Path) -> list[Path]:
     return record_values(runner, runner.sample_values(rig), f"rig-{rig:09d}", folder)
 
 
-def record_values(runner: CaseRunner, values: Mapping[str, Any], name: str, folder: Path) -> list[Path]:
+def record_values(runner: CaseRunner, values: Mapping[str, object], name: str, folder: Path) -> list[Path]:
     """Record a rig with `values` by key, as `record_rig` does, to NAME-EXPERIMENT.mcap for each experiment.
 
     Keys that `values` lacks have their configured values.
@@ -37,7 +36,7 @@ def record_values(runner: CaseRunner, values: Mapping[str, Any], name: str, fold
     ]
 
 
-def _record(runner: CaseRunner, values: Mapping[str, Any], experiment: Experiment, path: Path) -> Path:
+def _record(runner: CaseRunner, values: Mapping[str, object], experiment: Experiment, path: Path) -> Path:
     """Record one experiment of a rig to `path`, unless that exists; return the path."""
     if path.exists():
         return path

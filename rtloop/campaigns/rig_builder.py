@@ -65,7 +65,7 @@ class RigBuilder:
         """
         return option_value(self._nominal.configuration, self._nominal.configuration.driver_options, key)
 
-    def loop(self, values: Mapping[str, Any]) -> Loop:
+    def loop(self, values: Mapping[str, object]) -> Loop:
         """Return the loop of a rig with `values` by key; the nominal one if all uncertain keys are the driver's.
 
         Values that are None are left out. Raises ConfigError, ValueError for values that cannot run.
@@ -74,7 +74,7 @@ class RigBuilder:
             self._nominal if self._varies_rig_only else self._build_loop(replace_values(self._tables, _present(values)))
         )
 
-    def driver(self, loop: Loop, values: Mapping[str, Any], experiment: Experiment) -> SimDriver:
+    def driver(self, loop: Loop, values: Mapping[str, object], experiment: Experiment) -> SimDriver:
         """Return the driver, not opened, of a rig with `values` and with the disturbance of one experiment.
 
         Of `values`, keys of the driver alone count. Raises ValueError for options that no rig fits.
@@ -86,7 +86,7 @@ class RigBuilder:
         model = kind.options_model.model_validate(options)
         return cast("SimDriver", kind(model, loop.plan.wiring, loop.plan.pacing.rate_hz))
 
-    def text(self, values: Mapping[str, Any], experiment: Experiment, heading: str) -> str:
+    def text(self, values: Mapping[str, object], experiment: Experiment, heading: str) -> str:
         """Return the configuration of a rig in one experiment as TOML, whose first line is the comment `heading`.
 
         `values` are by key; a value None is left out. Raises ValueError for a key for which the tables have no place.
@@ -97,7 +97,7 @@ class RigBuilder:
                 axis["reference"] = experiment.reference.model_dump(mode="json", exclude_unset=True)
         return write_section("", tables, [heading])
 
-    def fingerprint(self, values: Mapping[str, Any]) -> bytes:
+    def fingerprint(self, values: Mapping[str, object]) -> bytes:
         """Return bytes that are equal for two sets of values with equal records and plans in every experiment.
 
         Raises as `loop` and `driver`.
@@ -108,7 +108,7 @@ class RigBuilder:
             parts += [records.tobytes() for records in self.driver(loop, values, experiment).rig]
         return b"".join(parts)
 
-    def _build_loop(self, tables: Mapping[str, Any]) -> Loop:
+    def _build_loop(self, tables: Mapping[str, object]) -> Loop:
         """Return configuration and plan of a configuration's tables, for virtual time and with mode closed_loop.
 
         Raises ConfigError where they cannot run on a simulated rig.
@@ -138,12 +138,12 @@ class RigBuilder:
         return {**tables, "driver": driver}
 
 
-def _present(values: Mapping[str, Any]) -> dict[str, Any]:
+def _present(values: Mapping[str, object]) -> dict[str, object]:
     """Return the values that are not None: a configuration has no key for a value None."""
     return {key: value for key, value in values.items() if value is not None}
 
 
-def _rig_values(values: Mapping[str, Any]) -> dict[str, Any]:
+def _rig_values(values: Mapping[str, object]) -> dict[str, object]:
     """Return the entries whose dotted keys belong to the rig (`is_rig_key`), with unchanged keys."""
     return {key: value for key, value in values.items() if is_rig_key(key)}
 

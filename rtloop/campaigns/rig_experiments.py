@@ -6,7 +6,7 @@ Figures are computed from the true position, without the sensor's noise, at POIN
 from __future__ import annotations
 
 import math
-from typing import Annotated, Any, Literal, NamedTuple, Self
+from typing import Annotated, Literal, NamedTuple, Self
 
 import numpy as np
 from pydantic import Field, model_validator
@@ -68,7 +68,7 @@ class ExperimentOptions(Options):
         raise NotImplementedError
 
     @property
-    def disturbance(self) -> dict[str, Any] | None:
+    def disturbance(self) -> dict[str, float] | None:
         """Disturbance of the axis's plant, as the keys of `driver.plant.disturbance`; None for the configured one."""
         return None
 
@@ -232,7 +232,7 @@ class DisturbanceExperiment(ExperimentOptions):
         return HoldOptions(kind="hold", value=self.hold_um)
 
     @property
-    def disturbance(self) -> dict[str, Any]:
+    def disturbance(self) -> dict[str, float]:
         """Step and sine from `start_s` on: {step_um, sine_um, sine_hz, start_s}."""
         return {"step_um": self.step_um, "sine_um": self.sine_um, "sine_hz": self.sine_hz, "start_s": self.start_s}
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from rtloop.campaigns.campaign_file import Campaign, load_campaign
 from rtloop.campaigns.case import NOMINAL, CaseRunner
@@ -15,6 +15,9 @@ from rtloop.campaigns.summary import summarise_campaign
 from rtloop.campaigns.unit import split_into_units
 from rtloop.campaigns.workers import DaskWorkers, ProcessWorkers, Workers
 
+if TYPE_CHECKING:
+    from distributed import Client
+
 
 def campaign(
     file: str | Path,
@@ -23,7 +26,7 @@ def campaign(
     out: str | Path | None = None,
     rigs: int | None = None,
     jobs: int | None = None,
-    scheduler: Any = None,
+    scheduler: str | Client | None = None,
 ) -> Any:
     """Run a campaign and return its results, a row for each rig in rising order; the nominal rig has number 0.
 

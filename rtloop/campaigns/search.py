@@ -7,7 +7,7 @@ uncertain keys. The boundary lies along one key: steps from the nominal value to
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import CancelledError
 from typing import Any, NamedTuple
 
@@ -19,6 +19,7 @@ from rtloop.campaigns.samples import unit_samples
 from rtloop.campaigns.unit import WorkerFacts, run_values
 from rtloop.campaigns.workers import WorkerDied, Workers
 from rtloop.errors import ConfigError, LoopFault
+from rtloop.foundation.arrays import Real
 
 POPULATION_PER_KEY, SMALLEST_POPULATION = 8, 16
 """Rigs of a generation for each key, and at least."""
@@ -27,7 +28,7 @@ TRIP_RATIO = 1e6
 BOUNDARY_STEPS, BISECTIONS = 32, 20
 """Steps from the nominal value to an end of the range, and halvings of the step in which a failure was found."""
 
-Evaluate = Callable[[Sequence[tuple[int, dict[str, Any]]]], Sequence[CaseResult]]
+Evaluate = Callable[[Sequence[tuple[int, Mapping[str, object]]]], Sequence[CaseResult]]
 """Runs rigs, each with a number and values by key, and returns their results in the same order."""
 
 
@@ -65,7 +66,7 @@ def evaluate_on(workers: Workers, campaign: Campaign) -> Evaluate:
     """
     facts = WorkerFacts.of_this_process()
 
-    def evaluate(rigs: Sequence[tuple[int, dict[str, Any]]]) -> list[CaseResult]:
+    def evaluate(rigs: Sequence[tuple[int, Mapping[str, object]]]) -> list[CaseResult]:
         """Run the rigs and return their results in the same order."""
         size = max(math.ceil(len(rigs) / workers.count), 1)
         parts = [rigs[first : first + size] for first in range(0, len(rigs), size)]
@@ -99,7 +100,7 @@ def find_worst(
     worst_cases: list[tuple[float, CaseResult]] = []  # one, the worst so far; none before the first generation
     count = 0
 
-    def run_generation(_: Any, candidates: Any) -> list[float]:
+    def run_generation(_: object, candidates: Real) -> list[float]:
         """Run the rigs at `candidates` (rigs, keys), shares of the distributions; return the negative figures.
 
         Stores the worst rig so far in `worst_cases`.

@@ -45,7 +45,7 @@ def sensitivity_indices(figure: Real, keys: Sequence[str]) -> Mapping[str, Sensi
         return dict.fromkeys(keys, SensitivityIndex(*6 * (float("nan"),)))
     values: Any = {"f_A": blocks[:, :1].T, "f_B": blocks[:, 1:2].T, "f_AB": blocks[:, 2:].T[:, None, :]}
     indices = sobol_indices(func=values, n=count)
-    intervals: Any = indices.bootstrap(n_resamples=RESAMPLES)
+    intervals = indices.bootstrap(n_resamples=RESAMPLES)
     columns = []
     for values, interval in (
         (indices.first_order, intervals.first_order),

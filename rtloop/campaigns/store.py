@@ -17,7 +17,8 @@ import re
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from types import ModuleType
+from typing import TYPE_CHECKING, Any, TypedDict
 
 import numpy as np
 
@@ -39,7 +40,20 @@ DAMAGED = ".damaged"
 PASSED, FAILED, REFUSED, CRASHED = "passed", "failed", "refused", "crashed"
 
 
-def arrow() -> Any:
+class Manifest(TypedDict):
+    """Content of campaign.json: the campaign, and the versions of packages by name."""
+
+    campaign: str
+    digest: str
+    versions: dict[str, str]
+    experiments: list[dict[str, object]]
+    sampling: str
+    keys: list[str]
+    figures: list[str]
+    limits: dict[str, float]
+
+
+def arrow() -> ModuleType:
     """Return pyarrow. Raises MissingExtra without it."""
     try:
         import pyarrow
@@ -49,7 +63,7 @@ def arrow() -> Any:
     return pyarrow
 
 
-def crashed_case(rig: int, values: Mapping[str, Any]) -> CaseResult:
+def crashed_case(rig: int, values: Mapping[str, object]) -> CaseResult:
     """Return the result of a rig whose worker died each time it ran the rig.
 
     It has no figures and no trips, `missed` is (CRASHED,), and the ratio infinite.
@@ -72,7 +86,7 @@ class Store:
     pyarrow.
     """
 
-    def __init__(self, folder: Path, campaign: Campaign, nominal: Mapping[str, Any]) -> None:
+    def __init__(self, folder: Path, campaign: Campaign, nominal: Mapping[str, object]) -> None:
         """Open or make the folder of a campaign; `nominal` has the values of its keys, for the columns' types.
 
         Of two files of one unit, as a killed process leaves them, the shorter one is removed. Raises as the class
@@ -100,7 +114,7 @@ class Store:
                 self._paths[first].unlink(missing_ok=True)
             self._paths[first] = path
 
-    def _check_manifest(self, manifest: dict[str, Any]) -> None:
+    def _check_manifest(self, manifest: Manifest) -> None:
         """Write the manifest to a folder without one.
 
         Raises ConfigError if the folder has another one, InputFileError if that cannot be read, OutputError.
@@ -187,7 +201,7 @@ class Store:
             return []
         return table.to_pylist()
 
-    def _row(self, case: CaseResult) -> dict[str, Any]:
+    def _row(self, case: CaseResult) -> dict[str, object]:
         """Return the row of a result by column, with None in columns for which it has no value."""
         verdict = {"rig": case.rig, "status": status(case), "ratio": case.ratio}
         missed = case.refusal or "; ".join(case.missed)
@@ -217,7 +231,7 @@ class Store:
                 raise
 
 
-def _manifest(campaign: Campaign) -> dict[str, Any]:
+def _manifest(campaign: Campaign) -> Manifest:
     """Return the content of campaign.json: _MANIFEST_KEYS with the campaign's values, and the versions of packages."""
     return {
         "campaign": campaign.name,
@@ -231,7 +245,7 @@ def _manifest(campaign: Campaign) -> dict[str, Any]:
     }
 
 
-def read_manifest(folder: Path) -> dict[str, Any]:
+def read_manifest(folder: Path) -> Manifest:
     """Return the manifest of a campaign's folder, with _MANIFEST_KEYS at least.
 
     Raises InputFileError where there is none that can be read.
@@ -239,7 +253,7 @@ def read_manifest(folder: Path) -> dict[str, Any]:
     path = folder / MANIFEST
     try:
         with os.fdopen(open_own(path), "rb") as file:
-            manifest = json.load(file)
+            manifest: Manifest = json.load(file)
     except OSError as error:
         raise InputFileError(f"{path}: {error.strerror or error}; choose the folder of a campaign's results") from None
     except ValueError:
@@ -271,7 +285,7 @@ def read_tables(folder: Path) -> Iterator[pa.Table]:
             ) from None
 
 
-def read_columns(folder: Path) -> dict[str, Any]:
+def read_columns(folder: Path) -> dict[str, np.ndarray]:
     """Return the columns of all results in a campaign's folder by name, (rigs,); equal texts are one object.
 
     A missing text is "", a missing number NaN. Raises InputFileError for a folder without results, for a damaged file
@@ -288,7 +302,7 @@ def read_columns(folder: Path) -> dict[str, Any]:
     return {name: _values(library, table.column(name)) for name in table.column_names}
 
 
-def _values(library: Any, column: Any) -> Any:
+def _values(library: ModuleType, column: pa.ChunkedArray) -> np.ndarray:
     """Return a column as an array (rigs,), of objects for texts; `library` is pyarrow. A missing text is ""."""
     if not library.types.is_string(column.type):
         return column.to_numpy(zero_copy_only=False)
@@ -296,7 +310,7 @@ def _values(library: Any, column: Any) -> Any:
     return np.array(encoded.dictionary.to_pylist(), object)[encoded.indices.to_numpy()]
 
 
-def _read_table(library: Any, path: Path) -> Any:
+def _read_table(library: ModuleType, path: Path) -> pa.Table:
     """Return the Arrow table of a file; `library` is pyarrow.
 
     Raises OSError for a file that cannot be read, ValueError for one that is damaged.
@@ -305,7 +319,7 @@ def _read_table(library: Any, path: Path) -> Any:
         return library.parquet.read_table(io.BytesIO(file.read()), use_threads=False, pre_buffer=False)
 
 
-def _schema(library: Any, campaign: Campaign, nominal: Mapping[str, Any]) -> Any:
+def _schema(library: ModuleType, campaign: Campaign, nominal: Mapping[str, object]) -> pa.Schema:
     """Return the Arrow schema of the columns: rig, status, missed, ratio, values of keys, figures, causes of trips.
 
     `library` is pyarrow; `nominal` has a value of each key, for its column's type.
@@ -318,7 +332,7 @@ def _schema(library: Any, campaign: Campaign, nominal: Mapping[str, Any]) -> Any
     return library.schema(columns)
 
 
-def _column_type(library: Any, value: Any) -> Any:
+def _column_type(library: ModuleType, value: object) -> pa.DataType:
     """Return the Arrow type of a column whose nominal value is `value`: truth value, integer, text, or else a float."""
     if isinstance(value, bool):
         return library.bool_()
@@ -347,7 +361,7 @@ def _first_rig(path: Path) -> int:
 
 
 @contextmanager
-def open_store(folder: Path, campaign: Campaign, nominal: Mapping[str, Any]) -> Iterator[Store]:
+def open_store(folder: Path, campaign: Campaign, nominal: Mapping[str, object]) -> Iterator[Store]:
     """Open the store of a campaign's results in `folder` for a block, and close it.
 
     `nominal` has the configured value of each uncertain key. Raises UnavailableError while another process uses the

@@ -9,11 +9,12 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 
 from rtloop.campaigns.case import NOMINAL
 from rtloop.campaigns.samples import block_size
 from rtloop.campaigns.sensitivity import SensitivityIndex, sensitivity_indices
-from rtloop.campaigns.store import CRASHED, FAILED, PASSED, REFUSED, read_columns, read_manifest
+from rtloop.campaigns.store import CRASHED, FAILED, PASSED, REFUSED, Manifest, read_columns, read_manifest
 
 CONFIDENCE = 0.95
 INDEPENDENT_ROWS = 2
@@ -51,7 +52,7 @@ class WorstRig(NamedTuple):
     rig: int
     ratio: float
     missed: str
-    values: Mapping[str, Any]
+    values: Mapping[str, object]
 
 
 @dataclass(frozen=True)
@@ -125,7 +126,7 @@ def summarise_campaign(folder: Path, worst_count: int = 5) -> CampaignSummary:
     )
 
 
-def independent_rigs(columns: Mapping[str, Any], manifest: Mapping[str, Any]) -> Any:
+def independent_rigs(columns: Mapping[str, np.ndarray], manifest: Manifest) -> npt.NDArray[np.bool_]:
     """Return for each row, (rigs,), whether it counts for a yield: sampled, not refused, and drawn independently."""
     counted = (columns["rig"] != NOMINAL) & (columns["status"] != REFUSED)
     if manifest["sampling"] == "saltelli":
@@ -133,13 +134,13 @@ def independent_rigs(columns: Mapping[str, Any], manifest: Mapping[str, Any]) ->
     return counted
 
 
-def _yield(columns: Mapping[str, Any], manifest: Mapping[str, Any]) -> Yield:
+def _yield(columns: Mapping[str, np.ndarray], manifest: Manifest) -> Yield:
     """Return the yield of the sampled rigs that could run; of Saltelli's design the independent rows alone count."""
     states = columns["status"][independent_rigs(columns, manifest)]
     return clopper_pearson(int(np.count_nonzero(states == PASSED)), states.size)
 
 
-def _sensitivity(columns: Mapping[str, Any], manifest: Mapping[str, Any]) -> dict[str, Mapping[str, SensitivityIndex]]:
+def _sensitivity(columns: Mapping[str, np.ndarray], manifest: Manifest) -> dict[str, Mapping[str, SensitivityIndex]]:
     """Return Sobol's indices of "passed" and of each figure, by this quantity and then by uncertain key.
 
     {} unless the sampled rigs follow Saltelli's design without a gap.
@@ -155,7 +156,9 @@ def _sensitivity(columns: Mapping[str, Any], manifest: Mapping[str, Any]) -> dic
     return {name: sensitivity_indices(values[sampled], manifest["keys"]) for name, values in quantities.items()}
 
 
-def _figures(columns: Mapping[str, Any], names: Sequence[str], limits: Mapping[str, float]) -> dict[str, FigureSummary]:
+def _figures(
+    columns: Mapping[str, np.ndarray], names: Sequence[str], limits: Mapping[str, float]
+) -> dict[str, FigureSummary]:
     """Return the summary of each figure by name, over all rigs that have it; a figure that no rig has is left out."""
     summaries = {}
     for name in names:
@@ -168,7 +171,7 @@ def _figures(columns: Mapping[str, Any], names: Sequence[str], limits: Mapping[s
     return summaries
 
 
-def _worst_rigs(columns: Mapping[str, Any], keys: Sequence[str], count: int) -> tuple[WorstRig, ...]:
+def _worst_rigs(columns: Mapping[str, np.ndarray], keys: Sequence[str], count: int) -> tuple[WorstRig, ...]:
     """Return the `count` rigs of the largest ratio that did not crash, the largest first; there may be fewer.
 
     Where ratios are equal, the lower number is first.

@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from importlib.metadata import version
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from rtloop.campaigns.campaign_file import Campaign
 from rtloop.campaigns.case import NOMINAL, CaseResult, CaseRunner
@@ -82,7 +82,7 @@ def run_unit(campaign: Campaign, rigs: Sequence[int], expected: WorkerFacts) -> 
 
 
 def run_values(
-    campaign: Campaign, rigs: Sequence[tuple[int, Mapping[str, Any]]], expected: WorkerFacts
+    campaign: Campaign, rigs: Sequence[tuple[int, Mapping[str, object]]], expected: WorkerFacts
 ) -> list[CaseResult]:
     """Run rigs, (number, values by key) each, and return their results in the same order; raises as `run_unit`."""
     _require_versions(expected)
@@ -112,7 +112,7 @@ class _Hashed:
         """Return the hash of digest and number of rigs."""
         return hash(self.key)
 
-    def __eq__(self, other: Any) -> bool:
+    def __eq__(self, other: object) -> bool:
         """Whether `other` has a campaign with the same digest and the same number of rigs."""
         return isinstance(other, _Hashed) and self.key == other.key
 

@@ -12,12 +12,13 @@ import threading
 from collections.abc import Callable
 from concurrent.futures import Executor, Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
-from typing import Any, Literal, Protocol
+from typing import Any, Literal, Protocol, TypeVar
 
 from rtloop.errors import MissingExtra, UnavailableError
 from rtloop.foundation.heap import keep_freed_memory
 from rtloop.version import __version__
 
+Result = TypeVar("Result")
 StartMethod = Literal["forkserver", "spawn"]
 CONNECT_S = 10.0
 """Time after which a scheduler that does not answer counts as unreachable."""
@@ -39,7 +40,7 @@ class Workers(Protocol):
     name: str
     """Kind, number and address of the workers, for messages."""
 
-    def submit(self, function: Callable[..., Any], *arguments: Any) -> Future[Any]:
+    def submit(self, function: Callable[..., Result], *arguments: object) -> Future[Result]:
         """Start a function of a module in a worker; return the future of its result.
 
         `explain` converts the errors of the future, and of this call where the workers have died before it.
@@ -74,12 +75,12 @@ class ProcessWorkers:
         """
         self.count = count or len(os.sched_getaffinity(0))
         self.name = f"{self.count} worker process{'es' if self.count > 1 else ''}"
-        self._context: Any = multiprocessing.get_context(start_method)
+        self._context = multiprocessing.get_context(start_method)
         if start_method == "forkserver":
             self._context.set_forkserver_preload([preload])
         self._executor = self._start()
 
-    def submit(self, function: Callable[..., Any], *arguments: Any) -> Future[Any]:
+    def submit(self, function: Callable[..., Result], *arguments: object) -> Future[Result]:
         """Start a function of a module in one of the processes; return the future of its result.
 
         Raises BrokenProcessPool if a process of the pool has died.
@@ -186,7 +187,7 @@ class DaskWorkers:
             self.close()
             raise UnavailableError(f"{self.name}: {'; '.join(mismatches)}; install rtloop {__version__} there")
 
-    def submit(self, function: Callable[..., Any], *arguments: Any) -> Future[Any]:
+    def submit(self, function: Callable[..., Result], *arguments: object) -> Future[Result]:
         """Start a function of a module in one of the scheduler's workers; return the future of its result."""
         return self._executor.submit(function, *arguments)
 

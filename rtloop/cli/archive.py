@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -28,7 +29,7 @@ WORDS = ("column", "trips")
 """Columns of text, which are aligned to the left."""
 
 
-def _add_options(command: Any) -> Any:
+def _add_options(command: Callable[..., object]) -> Callable[..., object]:
     """Add the patterns and the options of all commands of this group. Returns the command."""
     for option in (
         JSON,
@@ -120,7 +121,7 @@ def _examine(
     return LoopFault.exit_code if set(report["counts"]) - {examination.good_verdict} else 0
 
 
-def _print_report(report: dict[str, Any], columns: tuple[str, ...], good_verdict: str) -> None:
+def _print_report(report: Mapping[str, Any], columns: tuple[str, ...], good_verdict: str) -> None:
     """Print a row for each recording, then the number of recordings by verdict, the duration and the rate.
 
     For a replay, whose `columns` include "tick", a recording with `good_verdict` and without a reason has no row.
@@ -144,7 +145,7 @@ def _print_report(report: dict[str, Any], columns: tuple[str, ...], good_verdict
     out.print(f"{done:,} in {report['duration_s']:.1f} s, {report['rate_per_s']:.1f} recordings/s{stored}")
 
 
-def _path_text(row: dict[str, Any]) -> str:
+def _path_text(row: Mapping[str, Any]) -> str:
     """Return the path of a row's recording as text for rich, with its number of files if there are several.
 
     The path is relative if it lies below the present folder.
@@ -155,7 +156,7 @@ def _path_text(row: dict[str, Any]) -> str:
     return escape(path) + (f" ({row['files']} files)" if row["files"] > 1 else "")
 
 
-def _cell(value: Any) -> str:
+def _cell(value: object) -> str:
     """Return a value of a row as text for rich: a list of trips as `tick 5: causes; …`, "" for None."""
     if isinstance(value, list):
         return "; ".join(f"tick {trip['tick']}: {', '.join(trip['causes'])}" for trip in value)

@@ -6,7 +6,7 @@ import sys
 import time
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import click
 
@@ -245,6 +245,6 @@ def _print_summary(summary: CampaignSummary, folder: Path) -> None:
         out.print(f"[yellow]and {len(summary.refused) - 5} more rigs that cannot run[/]")
 
 
-def value_text(value: Any) -> str:
+def value_text(value: object) -> str:
     """Return the value of a configuration's key as text for rich: a float with four digits, brackets escaped."""
     return f"{value:.4g}" if isinstance(value, float) else escape(value)

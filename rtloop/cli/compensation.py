@@ -52,7 +52,7 @@ def compensation_report(
     axis: str | None = None,
     command_um: float | None = None,
     plot: Path | None = None,
-) -> dict[str, Any]:
+) -> dict[str, object]:
     """Bound and simulate the hysteresis that the inverse in `config` leaves in the identified `actuator`.
 
     Returns the JSON report. Its `bounds` have a row for each choice of the gain ρ: {gain ("eq_2", "best" or "unity"),

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import wraps
 from pathlib import Path
-from typing import Any
+from typing import IO, TYPE_CHECKING, Any
 
 import click
 
@@ -14,6 +14,9 @@ from rtloop.cli.exit_codes import report_errors
 from rtloop.cli.options import JSON, OUTPUT, InputFile
 from rtloop.cli.output import echo_json
 from rtloop.workbench.tables import console, format_number, print_problems, table
+
+if TYPE_CHECKING:
+    from rtloop.client import Client
 
 FIGURES = (
     ("crossover", "crossover_hz", "Hz"),
@@ -47,7 +50,7 @@ def ctl(context: click.Context, name: str | None, socket_path: Path | None, as_n
     context.obj = (name, socket_path, as_name)
 
 
-def make_client(context: click.Context) -> Any:
+def make_client(context: click.Context) -> Client:
     """Return a client of the service that the options of `ctl` name; no request is sent yet.
 
     Raises UnavailableError if no control socket has that name; without a name, if there is none or more than one.
@@ -59,7 +62,7 @@ def make_client(context: click.Context) -> Any:
     return Client(path or find_control_socket(name), as_name)
 
 
-def print_response(response: Any, sentence: str) -> None:
+def print_response(response: object, sentence: str) -> None:
     """Print a response as JSON; on a terminal, an empty response {} as `sentence`, unless that is empty."""
     if response == {} and sentence and sys.stdout.isatty():
         click.echo(sentence)
@@ -67,20 +70,22 @@ def print_response(response: Any, sentence: str) -> None:
         echo_json(response)
 
 
-def post(resource: str, sentence: str = "") -> Callable[[Callable[..., Any]], Callable[..., None]]:
+def post(
+    resource: str, sentence: str = ""
+) -> Callable[[Callable[..., Mapping[str, object] | None]], Callable[..., None]]:
     """Return a decorator: it turns a function that makes a request's body from a command's options into a command that
     posts this body to `resource` and prints the response.
 
     `sentence` is printed for an empty response, as in `print_response`.
     """
 
-    def decorate(make_body: Callable[..., Any]) -> Callable[..., None]:
+    def decorate(make_body: Callable[..., Mapping[str, object] | None]) -> Callable[..., None]:
         """Return the command that posts the body that `make_body` returns for the command's options."""
 
         @click.pass_context
         @report_errors
         @wraps(make_body)
-        def command(context: click.Context, **options: Any) -> None:
+        def command(context: click.Context, **options: object) -> None:
             """Post the body that belongs to the options, and print the response."""
             body = make_body(**options)
             print_response(make_client(context).post(resource, body), sentence)
@@ -161,7 +166,7 @@ def watch(context: click.Context, count: int | None) -> None:
 @ctl.command()
 @click.argument("mode", type=click.Choice(["off", "raw", "feedforward", "closed_loop"]))
 @post("/mode")
-def mode(mode: str) -> dict[str, Any]:
+def mode(mode: str) -> dict[str, object]:
     """Change the mode of all axes, bumplessly."""
     return {"mode": mode}
 
@@ -170,7 +175,7 @@ def mode(mode: str) -> dict[str, Any]:
 @AXIS
 @click.argument("value", type=float)
 @post("/setpoint")
-def setpoint(axis: str, value: float) -> dict[str, Any]:
+def setpoint(axis: str, value: float) -> dict[str, object]:
     """Hold the reference of AXIS at VALUE, in µm (V in raw mode)."""
     return {"axis": axis, "value": value}
 
@@ -179,7 +184,7 @@ def setpoint(axis: str, value: float) -> dict[str, Any]:
 @AXIS
 @click.argument("reference")
 @post("/reference")
-def reference(axis: str, reference: str) -> dict[str, Any]:
+def reference(axis: str, reference: str) -> dict[str, object]:
     """Change the reference of AXIS.
 
     REFERENCE has the keys of [axis.reference]: 'kind = "sine", amplitude = 5.0, frequency_hz = 2.0'.
@@ -195,14 +200,14 @@ def reference(axis: str, reference: str) -> dict[str, Any]:
 )
 @click.option("--repeat", is_flag=True, help="Play FILE again and again.")
 @post("/waveform")
-def waveform(axis: str, file: Any, hold_ticks: int, repeat: bool) -> dict[str, Any]:
+def waveform(axis: str, file: IO[str], hold_ticks: int, repeat: bool) -> dict[str, object]:
     """Play the numbers in FILE as the reference of AXIS.
 
     FILE has one number a line, in µm (V in raw mode). A second column, in µm, is added to the command. The last number
     is held, unless --repeat is used.
     """
     columns = [list(column) for column in zip(*read_numbers(file), strict=True)] or [[]]
-    body = {"axis": axis, "samples": columns[0], "hold_ticks": hold_ticks, "repeat": repeat}
+    body: dict[str, object] = {"axis": axis, "samples": columns[0], "hold_ticks": hold_ticks, "repeat": repeat}
     return body if len(columns) == 1 else {**body, "command_um": columns[1]}
 
 
@@ -211,7 +216,7 @@ def waveform(axis: str, file: Any, hold_ticks: int, repeat: bool) -> dict[str, A
 @SECTION
 @click.argument("values")
 @post("/tune")
-def tune(axis: str, section: str, values: str) -> dict[str, Any]:
+def tune(axis: str, section: str, values: str) -> dict[str, object]:
     """Change keys of [axis.SECTION] of AXIS.
 
     For example 'gain = 0.012' or 'position_um = 50.0, sensor_max_v = 9.0'.
@@ -242,7 +247,7 @@ def preview(context: click.Context, axis: str, section: str, values: str, as_jso
 @ctl.command()
 @AXIS
 @post("/undo")
-def undo(axis: str) -> dict[str, Any]:
+def undo(axis: str) -> dict[str, object]:
     """Undo the last change of AXIS by tune or controller."""
     return {"axis": axis}
 
@@ -251,7 +256,7 @@ def undo(axis: str) -> dict[str, Any]:
 @AXIS
 @click.argument("config", type=OUTPUT)
 @post("/controller")
-def controller(axis: str, config: Path) -> dict[str, Any]:
+def controller(axis: str, config: Path) -> dict[str, object]:
     """Swap in the controller of another configuration.
 
     The [axis.controller] of AXIS in CONFIG is verified first.
@@ -261,7 +266,7 @@ def controller(axis: str, config: Path) -> dict[str, Any]:
     return {"axis": axis, "controller": read_controller(config, axis)}
 
 
-def read_numbers(file: Any) -> list[list[float]]:
+def read_numbers(file: IO[str]) -> list[list[float]]:
     """Return the rows of an open file: one number each, or two each (comma or spaces); empty lines are skipped.
 
     Returns [] for a file without numbers. Raises click.UsageError for other text, and for rows of different lengths.
@@ -279,7 +284,7 @@ def read_numbers(file: Any) -> list[list[float]]:
     return rows
 
 
-def _parse_inline_table(text: str) -> dict[str, Any]:
+def _parse_inline_table(text: str) -> dict[str, object]:
     """Return `key = value, key = value`, the inside of a TOML inline table, as a dict.
 
     Raises click.UsageError for any other text.

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import click
 
@@ -156,7 +157,7 @@ def _print_latency(latency: Latency) -> None:
     out.print(histogram_table(_histogram_classes(latency), "late by µs"))
 
 
-def _histogram_classes(latency: Latency) -> list[dict[str, Any]]:
+def _histogram_classes(latency: Latency) -> Sequence[Mapping[str, float | None]]:
     """Return the number of ticks in each class of lateness, [{below_us, count}, …], ascending by the upper limit, which
     is None for the last class.
     """
@@ -174,7 +175,7 @@ def _format_time(time_us: float) -> str:
 
 def _report(
     examination: Examination, delays: list[AxisDelay], objections: list[str], writes: list[SettingWrite]
-) -> dict[str, Any]:
+) -> dict[str, object]:
     """Return the JSON report of an examination, as `rtloop doctor --json` prints it.
 
     `objections` are the reasons why the host is not suitable. Keys: suitable, reasons, rate_hz, spin_us, findings,

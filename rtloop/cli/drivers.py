@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -76,7 +77,7 @@ def drivers(
     return 1 if report["passed"] is False else 0
 
 
-def list_drivers() -> list[dict[str, Any]]:
+def list_drivers() -> Sequence[Mapping[str, object]]:
     """Return a dict for each registered kind of driver: kind, defined_in, real, max_rate_hz, problem.
 
     `defined_in` is its module. With default options, `real` is whether it moves hardware, `max_rate_hz` its highest
@@ -99,7 +100,7 @@ def list_drivers() -> list[dict[str, Any]]:
     return entries
 
 
-def _print_drivers(entries: list[dict[str, Any]]) -> None:
+def _print_drivers(entries: Sequence[Mapping[str, Any]]) -> None:
     """Print the entries of `list_drivers` as a table."""
     rows = table("kind", "moves hardware", "clock", "highest rate", "defined in")
     for entry in entries:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import ipaddress
 from pathlib import Path
-from typing import Any
 
 import click
 
@@ -20,7 +19,7 @@ class Address(click.ParamType):
 
     name = "address"
 
-    def convert(self, value: Any, param: Any, ctx: Any) -> str:
+    def convert(self, value: object, param: click.Parameter | None, ctx: click.Context | None) -> str:
         """Return the IPv4 address, such as "192.168.1.2". Fails with a usage error for any other text."""
         try:
             return str(ipaddress.IPv4Address(value))

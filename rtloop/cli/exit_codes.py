@@ -6,11 +6,14 @@ import sys
 from collections.abc import Callable
 from functools import wraps
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 import click
 
 from rtloop.cli.output import echo_json
+
+if TYPE_CHECKING:
+    from rtloop.errors import ConfigError
 
 
 def report_errors(command: Callable[..., int | None]) -> Callable[..., None]:
@@ -23,7 +26,7 @@ def report_errors(command: Callable[..., int | None]) -> Callable[..., None]:
     """
 
     @wraps(command)
-    def wrapped(*args: Any, **kwargs: Any) -> None:
+    def wrapped(*args: object, **kwargs: object) -> None:
         """Run the command, print an error of the project, and end the process with the exit code."""
         from rtloop.drivers.errors import DriverError
         from rtloop.errors import ConfigError, RtloopError, UnavailableError
@@ -48,7 +51,7 @@ def require_readable(file: Path) -> None:
     read_text(file)
 
 
-def _message_with_lines(error: Any) -> str:
+def _message_with_lines(error: ConfigError) -> str:
     """Return a text that lists the faults of a ConfigError, each with its line in the file if that can be found."""
     from rtloop.configuration.toml_lines import numbered
     from rtloop.errors import fault_list

@@ -9,7 +9,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import IO, TYPE_CHECKING, Any
+from typing import IO, TYPE_CHECKING, Any, TypedDict, Unpack
 
 import click
 
@@ -61,6 +61,18 @@ RUN_OPTIONS = (
 )
 
 
+class RunOptions(TypedDict):
+    """Values of RUN_OPTIONS, with the names that `run_experiments` gives them."""
+
+    config: Path
+    settings: Sequence[str]
+    axis: str | None
+    paced: bool
+    comparison: Path | None
+    out: Path | None
+    as_json: bool
+
+
 def run_options(command: Callable[..., None]) -> Callable[..., None]:
     """Add the parameters of `run_experiments`, except for the first, to a command. Returns the command."""
     for option in reversed(RUN_OPTIONS):
@@ -96,7 +108,7 @@ def list_experiments() -> None:
 @click.argument("names", metavar="NAME...", nargs=-1, required=True)
 @run_options
 @report_errors
-def run(names: tuple[str, ...], **options: Any) -> int:
+def run(names: tuple[str, ...], **options: Unpack[RunOptions]) -> int:
     """Run experiments on the driver of CONFIG, and report.
 
     Each experiment is recorded. It changes only mode, reference and schedule, and the simulated rig if its subject is
@@ -109,7 +121,7 @@ def run(names: tuple[str, ...], **options: Any) -> int:
 @experiment.command(name="all")
 @run_options
 @report_errors
-def run_all(**options: Any) -> int:
+def run_all(**options: Unpack[RunOptions]) -> int:
     """Run every experiment that the driver of CONFIG allows.
 
     Records and reports as `rtloop experiment run`. Exit 1 where an experiment could not be finished.
@@ -275,7 +287,7 @@ def _record(
 
 
 def _report_recordings(
-    paths: Sequence[Path], folder: Path, skipped: Mapping[str, str], as_json: bool, extra: dict[str, Any]
+    paths: Sequence[Path], folder: Path, skipped: Mapping[str, str], as_json: bool, extra: Mapping[str, object]
 ) -> bool:
     """Write the report of recordings to `folder`; print it, in JSON with `extra`. Returns whether it is complete.
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 import errno
 import shlex
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypedDict
 
 import click
 
@@ -32,7 +32,22 @@ MAX_COLUMNS = 60
 EXAMPLE_SIGNALS = (("x_drive_v", "V"), ("x_position_um", "µm"))
 
 
-class ColumnListing(dict[str, Any]):
+class Extremes(TypedDict):
+    """Least and largest finite value of a column or signal; None without one."""
+
+    least: float | None
+    largest: float | None
+
+
+class Column(Extremes):
+    """A column of a `ColumnListing`."""
+
+    name: str
+    unit: str | None
+    grows_evenly: bool
+
+
+class ColumnListing(dict[str, object]):
     """Report on the columns of a file, for which neither options nor a mapping name a signal."""
 
 
@@ -203,7 +218,7 @@ def _print_listing(report: Mapping[str, Any]) -> None:
     out.print("\nTo import every column unchanged, use --all. For all options: rtloop import --help")
 
 
-def _suggest_mapping(columns: list[dict[str, Any]], time: str | None) -> list[tuple[str, str]]:
+def _suggest_mapping(columns: Sequence[Column], time: str | None) -> list[tuple[str, str]]:
     """Return (signal, `COLUMN [UNIT]`) for each of EXAMPLE_SIGNALS, with another column each; fewer without columns.
 
     The column is the first whose unit converts to the signal's, else the first of the others; the column `time` and
@@ -220,7 +235,7 @@ def _suggest_mapping(columns: list[dict[str, Any]], time: str | None) -> list[tu
     return suggestions
 
 
-def _is_clock(column: dict[str, Any]) -> bool:
+def _is_clock(column: Column) -> bool:
     """Whether a column of a `ColumnListing` has a unit of time, or no unit and values that grow evenly."""
     return _converts(column["unit"], "s") or (not column["unit"] and column["grows_evenly"])
 
@@ -235,7 +250,7 @@ def _converts(unit: str | None, target: str) -> bool:
         return False
 
 
-def _range_cells(column: Mapping[str, Any]) -> tuple[str, str]:
+def _range_cells(column: Extremes) -> tuple[str, str]:
     """Return the texts of a column's least and largest value; "–" for a value that is None."""
     return format_number(column["least"], ".6g"), format_number(column["largest"], ".6g")
 

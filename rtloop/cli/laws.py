@@ -52,7 +52,7 @@ def new(name: str, out: Path) -> None:
     click.echo(f"next: rtloop check {out / name}.toml")
 
 
-def list_laws() -> list[dict[str, Any]]:
+def list_laws() -> list[dict[str, object]]:
     """Return for each registered kind {kind, slot, about (the docstring's first line), shipped, problem, defined_in}.
 
     `slot` is "controller" or "feedforward", `defined_in` the module; `about` is None without a docstring. `problem` is
@@ -65,7 +65,7 @@ def list_laws() -> list[dict[str, Any]]:
     entries = []
     for kind, module in kinds().items():
         is_shipped = kind in BUILT_IN
-        entry: dict[str, Any] = {"kind": kind, "slot": None, "about": None, "shipped": is_shipped, "problem": None}
+        entry: dict[str, object] = {"kind": kind, "slot": None, "about": None, "shipped": is_shipped, "problem": None}
         try:
             if not is_shipped:
                 try_limited(f"law {kind!r}", find_law, kind)

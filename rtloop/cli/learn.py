@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import IO
 
 import click
 
@@ -34,7 +34,8 @@ from rtloop.workbench.tables import console, table
 @click.pass_context
 @report_errors
 def learn(
-    context: click.Context, axis: str, file: Any, cycles: int, resonance_percent: float, out: Path | None, as_json: bool
+    context: click.Context, axis: str, file: IO[str], cycles: int, resonance_percent: float, out: Path | None,
+    as_json: bool,
 ) -> None:  # fmt: skip
     """Learn the scan of AXIS whose period is in FILE.
 

@@ -5,9 +5,12 @@ from __future__ import annotations
 import math
 import re
 from pathlib import Path
-from typing import Any
+from typing import IO, TYPE_CHECKING, Any
 
 import click
+
+if TYPE_CHECKING:
+    from os import PathLike
 
 OUTPUT = click.Path(path_type=Path, readable=False)
 """A path; a file that cannot be read is reported by its reader, with exit code 66, as a missing one is."""
@@ -33,7 +36,9 @@ class InputFile(click.File):
     def __init__(self) -> None:
         super().__init__(encoding="utf-8", errors="replace")
 
-    def convert(self, value: Any, param: Any, ctx: Any) -> Any:
+    def convert(
+        self, value: str | PathLike[str] | IO[str], param: click.Parameter | None, ctx: click.Context | None
+    ) -> IO[str]:
         """Return the file at the path `value`, for "-" stdin, open for reading text.
 
         Raises UnreadableInput if it cannot be opened.
@@ -53,7 +58,7 @@ class Seconds(click.ParamType):
         """Allow numbers above 0, with `allows_zero` also 0."""
         self._allows_zero = allows_zero
 
-    def convert(self, value: Any, param: Any, ctx: Any) -> float:
+    def convert(self, value: str | float, param: click.Parameter | None, ctx: click.Context | None) -> float:
         """Return `value` as seconds. Fails with a usage error unless it is finite and above 0, or 0 where allowed."""
         try:
             seconds = float(value)
@@ -72,7 +77,7 @@ class MatchingText(click.ParamType):
         """Allow texts that match `pattern` as a whole; `name` is the type in the help, `rule` the pattern in words."""
         self.name, self._pattern, self._rule = name, pattern, rule
 
-    def convert(self, value: Any, param: Any, ctx: Any) -> str:
+    def convert(self, value: str, param: click.Parameter | None, ctx: click.Context | None) -> str:
         """Return the text. Fails with a usage error where it does not match."""
         if not re.fullmatch(self._pattern, value):
             self.fail(f"value is {value!r}; allowed: {self._rule}", param, ctx)
@@ -84,7 +89,9 @@ class NumberList(click.ParamType):
 
     name = "numbers"
 
-    def convert(self, value: Any, param: Any, ctx: Any) -> tuple[float, ...]:
+    def convert(
+        self, value: str | tuple[float, ...], param: click.Parameter | None, ctx: click.Context | None
+    ) -> tuple[float, ...]:
         """Return the comma-separated numbers of a text; a tuple unchanged. Fails with a usage error for other texts."""
         if isinstance(value, tuple):
             return value
@@ -97,7 +104,7 @@ class NumberList(click.ParamType):
 class PositiveFloat(click.FloatRange):
     """A number above 0; NaN is refused."""
 
-    def convert(self, value: Any, param: Any, ctx: Any) -> float:
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float:
         """Return `value` as a float. Fails with a usage error for NaN, a number outside the range that the constructor
         got, and a text that is no number.
         """

@@ -8,7 +8,6 @@ import threading
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
-from typing import Any
 
 import click
 
@@ -19,7 +18,7 @@ from rtloop.errors import RtloopError
 PORT = 8321
 
 
-def port_option(name: str) -> Callable[[Any], Any]:
+def port_option(name: str) -> Callable[[Callable[..., object]], Callable[..., object]]:
     """Return a decorator that adds the option `name` to a command: the TCP port of the panel, PORT by default."""
     return click.option(
         name,
@@ -30,7 +29,7 @@ def port_option(name: str) -> Callable[[Any], Any]:
     )
 
 
-def panel_options(command: Any) -> Any:
+def panel_options(command: Callable[..., object]) -> Callable[..., object]:
     """Add --panel and --panel-port to a command that can start the panel as a second process. Returns the command."""
     return click.option("--panel", is_flag=True, help="Start `rtloop panel` as well, to show the loop in the browser.")(
         port_option("--panel-port")(command)

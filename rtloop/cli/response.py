@@ -77,7 +77,7 @@ OUT = click.option("--out", type=OUTPUT, help="JSON file to write; an existing f
 @click.pass_context
 @report_errors
 def service_response(
-    context: click.Context, out: Path | None, plot: Path | None, as_json: bool, **request: Any
+    context: click.Context, out: Path | None, plot: Path | None, as_json: bool, **request: object
 ) -> None:
     """Measure the closed loop of AXIS: L, S, margins.
 
@@ -98,7 +98,7 @@ def service_response(
 @JSON
 @click.pass_context
 @report_errors
-def service_resonance(context: click.Context, as_json: bool, **request: Any) -> None:
+def service_resonance(context: click.Context, as_json: bool, **request: object) -> None:
     """Measure frequency and damping of the mode of AXIS.
 
     The loop stays closed.
@@ -146,7 +146,7 @@ def recording_resonance(run: Path, axis: str | None, near_hz: float | None, as_j
     _report_resonance(recorded_measurement(run, axis, near_hz).for_json(), as_json)
 
 
-def _measure(context: click.Context, request: Mapping[str, Any]) -> dict[str, Any]:
+def _measure(context: click.Context, request: Mapping[str, Any]) -> dict[str, object]:
     """Let the service measure a closed loop by POST /response; return its answer, as `LoopMeasurement.for_json`.
 
     `request` are the command's options; options that are None are left out. After Ctrl-C the reference is restored and
@@ -156,7 +156,7 @@ def _measure(context: click.Context, request: Mapping[str, Any]) -> dict[str, An
     return make_client(context).measure("/response", body, TIMEOUT_FACTOR * body["duration_s"] + TIMEOUT_EXTRA_S)
 
 
-def _report_response(content: dict[str, Any], out: Path | None, plot: Path | None, as_json: bool) -> None:
+def _report_response(content: Mapping[str, object], out: Path | None, plot: Path | None, as_json: bool) -> None:
     """Print a measured closed loop, write it as JSON to the new file `out`, draw it to `plot`.
 
     The files are written first. Raises OutputError for an existing `out`, or if the system refuses; MissingExtra for
@@ -175,7 +175,7 @@ def _report_response(content: dict[str, Any], out: Path | None, plot: Path | Non
         _print_response(content, [file for file in (out, plot) if file])
 
 
-def _report_resonance(content: dict[str, Any], as_json: bool) -> None:
+def _report_resonance(content: Mapping[str, object], as_json: bool) -> None:
     """Print the lightly damped mode of a measured closed loop, `content`, as text or as JSON {resonance}.
 
     Raises UnsuitableData where it shows none.
@@ -189,7 +189,7 @@ def _report_resonance(content: dict[str, Any], as_json: bool) -> None:
     echo_json({"resonance": content["resonance"]}) if as_json else _print_resonance(content)
 
 
-def _print_response(content: dict[str, Any], files: Sequence[Path]) -> None:
+def _print_response(content: Mapping[str, Any], files: Sequence[Path]) -> None:
     """Print measured margins, the model's and the mode if `content` has them, the excitation, and written files."""
     out, model = console(), content["model"]
     rows = table("margin", "measured", "± (1σ)", "model", "")
@@ -211,7 +211,7 @@ def _print_response(content: dict[str, Any], files: Sequence[Path]) -> None:
         out.print(file, markup=False)
 
 
-def _print_resonance(content: dict[str, Any]) -> None:
+def _print_resonance(content: Mapping[str, Any]) -> None:
     """Print frequency and damping of the lightly damped mode with their uncertainty; warn of a large misfit."""
     from rtloop.analysis.measured.mode import LARGEST_MISFIT, NOT_LINEAR
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from typing import TYPE_CHECKING, Any
+from typing import IO, TYPE_CHECKING, Any
 
 import click
 
@@ -59,7 +59,9 @@ if TYPE_CHECKING:
 @JSON
 @click.pass_context
 @report_errors
-def retune(context: click.Context, axis: str, proposal: Any, yes: bool, as_json: bool, **options: Any) -> int:
+def retune(
+    context: click.Context, axis: str, proposal: IO[str] | None, yes: bool, as_json: bool, **options: Any
+) -> int:
     """Make new taps of AXIS for its present resonance and gain.
 
     Resonance and gain are measured in closed loop around the held reference. The taps are computed outside the loop;

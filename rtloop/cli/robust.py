@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import click
 
@@ -130,7 +130,7 @@ def shape(config: Path, spec: Path | None, out: Path | None, axis: str, plot: Pa
         click.echo(plot, err=True)
 
 
-def _robust_as_dict(robust: RobustDesign, out: Path | None) -> dict[str, Any]:
+def _robust_as_dict(robust: RobustDesign, out: Path | None) -> dict[str, object]:
     """Return the JSON report of a controller with its worst figures over all certified plants: {gain, zeros, poles,
     plants: their number, worst: {figure: {value, scenario: text}}, output: `out` as text}.
 
@@ -150,7 +150,7 @@ def _robust_as_dict(robust: RobustDesign, out: Path | None) -> dict[str, Any]:
     }
 
 
-def _taps_as_dict(tap_design: TapDesign, files: list[Path]) -> dict[str, Any]:
+def _taps_as_dict(tap_design: TapDesign, files: list[Path]) -> dict[str, object]:
     """Return the JSON report of both rows of taps: {taps, command_taps, settling_ms, fastest_ms: the least possible,
     variation, plants: number of proved ones, worst: figures over them, trade_off: [[settling ms, overshoot], …],
     files}.

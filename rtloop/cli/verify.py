@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import click
 
@@ -70,7 +70,7 @@ def verify_configuration(config: Path, spec: Path | None, out: Path | None, as_j
     _require_second_opinion(configuration, checks, verifications)
     verifications = add_simulation(configuration, verifications)
     meets_all = all(verification.meets_specification for verification, _ in verifications.values())
-    report: dict[str, Any] = {
+    report: dict[str, object] = {
         "name": configuration.name,
         "meets": meets_all,
         "axes": [{"name": name, **as_dict(verification)} for name, (verification, _) in verifications.items()],
@@ -104,7 +104,7 @@ def _require_second_opinion(
         raise ConfigError(configuration.source, faults)
 
 
-def _write_report(folder: Path, name: str, verifications: Verifications, report: dict[str, Any]) -> list[Path]:
+def _write_report(folder: Path, name: str, verifications: Verifications, report: Mapping[str, object]) -> list[Path]:
     """Write verify.json (`report`), verify.html and the pictures of each axis to `folder`, also over existing files.
 
     A missing folder is made. `name` is the configuration's name in headings. Returns the paths: verify.json,

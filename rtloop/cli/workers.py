@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import click
 
@@ -23,7 +23,7 @@ WORKERS = (
 )
 
 
-def worker_options(command: Callable[..., Any]) -> Callable[..., Any]:
+def worker_options(command: Callable[..., object]) -> Callable[..., object]:
     """Add the options --jobs and --scheduler to a command. Returns the command."""
     for option in reversed(WORKERS):
         command = option(command)

@@ -111,7 +111,7 @@ class Connection:
         """Clear latched trips; the outputs stay off. Returns the tick of the reset; refused unless tripped."""
         return self._command("/reset")
 
-    def reload(self) -> dict[str, Any]:
+    def reload(self) -> dict[str, list[str]]:
         """Let the service read its configuration file again and apply it to the running loop.
 
         Returns {changed: ["axis.NAME", …]}, the axes that changed; [] if none did. If the loop refuses one axis after
@@ -126,7 +126,7 @@ class Connection:
         """
         return self._command("/setpoint", axis=axis, value=um)
 
-    def reference(self, axis: str, **settings: Any) -> int:
+    def reference(self, axis: str, **settings: object) -> int:
         """Change the reference of an axis, as in [axis.reference]: `kind="sine", amplitude=5.0, frequency_hz=2.0`.
 
         Keys that are left out have their defaults. Returns the first tick of the new reference. Refused beyond
@@ -151,14 +151,14 @@ class Connection:
         body = {"axis": axis, "samples": _floats(samples), "hold_ticks": hold_ticks, "repeat": repeat}
         return self._command("/waveform", **body, command_um=_floats(command_um))
 
-    def tune(self, axis: str, section: str, **values: Any) -> int:
+    def tune(self, axis: str, section: str, **values: object) -> int:
         """Change keys of [axis.SECTION], as in `"controller", gain=0.012`; verified first, then swapped bumplessly.
 
         `section` is "controller", "limits", "interlocks", "prefilter" or "model". Returns the tick of the swap.
         """
         return self._command("/tune", axis=axis, section=section, values=values)
 
-    def preview(self, axis: str, section: str, **values: Any) -> dict[str, Any]:
+    def preview(self, axis: str, section: str, **values: object) -> dict[str, Any]:
         """Return {before, after}: figures of the axis's loop without and with a `tune`; changes nothing.
 
         Keys of each: crossover_hz, phase_margin_deg, gain_margin_db, modulus_margin, overshoot_percent, settling_ms,
@@ -175,7 +175,7 @@ class Connection:
         """
         return self._client.post("/undo", {"axis": axis})
 
-    def controller(self, axis: str, controller: Mapping[str, Any] | Path | str) -> int:
+    def controller(self, axis: str, controller: Mapping[str, object] | Path | str) -> int:
         """Swap in another controller: an [axis.controller] as a mapping, or a configuration file that has one.
 
         The service verifies it, then swaps bumplessly. Returns the tick of the swap. Raises InputFileError for a file
@@ -184,7 +184,7 @@ class Connection:
         section = controller if isinstance(controller, Mapping) else read_controller(Path(controller), axis)
         return self._command("/controller", axis=axis, controller=dict(section))
 
-    def response(self, axis: str, *, duration_s: float = 6.0, **options: Any) -> dict[str, Any]:
+    def response(self, axis: str, *, duration_s: float = 6.0, **options: object) -> dict[str, Any]:
         """Measure the closed loop of an axis with multisines about the reference that it holds.
 
         Options: `amplitude_um` (largest added motion), `from_hz`, `to_hz`, `period_s`, `near_hz` (expected lightly
@@ -264,7 +264,7 @@ class Connection:
 
         return capture_span(self._client, seconds, trigger, at, pre_percent, timeout_s, folder)
 
-    def _command(self, resource: str, **body: Any) -> int:
+    def _command(self, resource: str, **body: object) -> int:
         """Post a command, JSON fields `body`, to `resource`. Returns its tick of effect; raises as `Client.post`."""
         return int(self._client.post(resource, body)["tick"])
 
@@ -284,7 +284,7 @@ def connect(service: str | Path | None = None, *, as_: str | None = None) -> Con
     return connection
 
 
-def read_controller(config: Path, axis: str) -> dict[str, Any]:
+def read_controller(config: Path, axis: str) -> dict[str, object]:
     """Return as a dict the keys that a configuration file sets in [axis.controller] of an axis; defaults are left out.
 
     Raises InputFileError for a file that cannot be read, ConfigError for an invalid one or one without this section.

@@ -139,7 +139,7 @@ class Client:
         """Send GET and return the response: decoded JSON, or text if it is not JSON. Raises the errors of `post`."""
         return self._request("GET", resource, None)
 
-    def post(self, resource: str, body: Mapping[str, Any] | None = None, timeout_s: float | None = None) -> Any:
+    def post(self, resource: str, body: Mapping[str, object] | None = None, timeout_s: float | None = None) -> Any:
         """Send POST with a JSON body, {} for None, and return the response: decoded JSON, or text if it is not JSON.
 
         Without `timeout_s` it waits TIMEOUT_S for the response, BUILD_TIMEOUT_S where the service builds a law. Raises
@@ -150,7 +150,7 @@ class Client:
             timeout_s = BUILD_TIMEOUT_S if resource in BUILD_RESOURCES else TIMEOUT_S
         return self._request("POST", resource, json.dumps(body or {}), timeout_s)
 
-    def delete(self, resource: str) -> Any:
+    def delete(self, resource: str) -> object:
         """Send DELETE and return the response, decoded as by `post`. Raises the errors of `post`."""
         return self._request("DELETE", resource, None)
 
@@ -161,7 +161,7 @@ class Client:
         """
         return self.post("/lock", {} if emergency_key is None else {"emergency_key": emergency_key})
 
-    def measure(self, resource: str, body: Mapping[str, Any], timeout_s: float = LONGEST_MEASUREMENT_S) -> Any:
+    def measure(self, resource: str, body: Mapping[str, object], timeout_s: float = LONGEST_MEASUREMENT_S) -> Any:
         """Post a measurement that moves `body["axis"]` and return the response.
 
         After Ctrl-C the axis is set to the constant reference, µm, that it had at the call, and LoopFault is raised,

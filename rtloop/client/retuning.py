@@ -49,11 +49,11 @@ class RetuneRequest(NamedTuple):
 class MeasuredStage(NamedTuple):
     """Resonance and gain of the running loop, and their distances from the model's in percent."""
 
-    resonance: dict[str, Any]
+    resonance: dict[str, object]
     """Measured mode: hz, hz_std, damping, damping_std, from_hz, to_hz, misfit."""
     percent: float
     """Distance of the resonance's frequency; above 0 if it is higher than the model's."""
-    gain: dict[str, Any] | None
+    gain: dict[str, float] | None
     """Measured gain in µm of position per µm of command: value, std, from_um, to_um; None if it was not measured."""
     gain_percent: float | None
     """Distance of the gain, above 0 if it is larger than the model's; None if the model's gain is used instead."""
@@ -76,7 +76,7 @@ class Proposal(NamedTuple):
     replaced: Taps
     taps: Taps
 
-    def for_json(self) -> dict[str, Any]:
+    def for_json(self) -> dict[str, object]:
         """Return the proposal as plain values, as `rtloop ctl retune --json` prints it and `swap_in` takes it.
 
         Keys: resonance, percent_from_model, gain, gain_percent_from_model (fields of `stage`, the last two may be

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any, Literal, Self
+from typing import Literal, Self
 
 from pydantic import model_validator
 
 from rtloop import signals
 from rtloop.configuration.axis import AxisOptions
-from rtloop.drivers.base import Facts, Wiring, channel_index
+from rtloop.drivers.base import Channel, Facts, Wiring, channel_index
 from rtloop.foundation.options import Options
 from rtloop.kernel.extras import ExtraOutput, Extras, Mark
 from rtloop.kernel.layout import MAX_EXTRAS
@@ -119,7 +119,7 @@ def build_extras(
     return Extras(tuple(inputs), tuple(extra_outputs))
 
 
-def _require_channel(key: str, channels: Any, name: str) -> int:
+def _require_channel(key: str, channels: Sequence[Channel], name: str) -> int:
     """Return the index of the channel `name`. Raises ValueError, with its `key`, if the driver lacks it."""
     try:
         return channel_index(channels, name)

@@ -238,7 +238,7 @@ def _laws(sections: FileOptions, library: Library, faults: list[str]) -> tuple[L
     return laws
 
 
-def _driver(raw: Any, faults: list[str]) -> tuple[str, Options | None, dict[str, ChannelOptions]]:
+def _driver(raw: object, faults: list[str]) -> tuple[str, Options | None, dict[str, ChannelOptions]]:
     """Return kind, options and channels of [driver]; where it is wrong, faults are appended.
 
     Options that are wrong or of an unknown kind are None, a missing kind is "". Wrong channels are returned as the
@@ -269,7 +269,7 @@ def type_adapter(kind: Any) -> TypeAdapter[Any]:
     return TypeAdapter(kind)
 
 
-def _validated(kind: Any, raw: Any, prefix: str, faults: list[str], context: dict[str, Any] | None = None) -> Any:
+def _validated(kind: Any, raw: object, prefix: str, faults: list[str], context: dict[str, object] | None = None) -> Any:
     """Return the value `raw` of key `prefix`, validated as type `kind`; None, with faults appended, if invalid."""
     adapter = type_adapter(kind)
     try:
@@ -279,7 +279,7 @@ def _validated(kind: Any, raw: Any, prefix: str, faults: list[str], context: dic
         return None
 
 
-def describe(error: ValidationError, prefix: str, raw: Any, known_keys: set[str] | None = None) -> list[str]:
+def describe(error: ValidationError, prefix: str, raw: object, known_keys: set[str] | None = None) -> list[str]:
     """Return a line for each fault of `raw`, the value of key `prefix`; `raw` None: not available.
 
     Beyond MAX_FAULTS, a last line says how many more there are. `known_keys` are suggested for an unknown key that
@@ -297,7 +297,7 @@ def describe(error: ValidationError, prefix: str, raw: Any, known_keys: set[str]
     return faults + omission
 
 
-def _keys(schema: Any) -> set[str]:
+def _keys(schema: object) -> set[str]:
     """Return all keys that a JSON schema knows, at any depth."""
     if isinstance(schema, list):
         return set().union(*map(_keys, schema))
@@ -306,7 +306,7 @@ def _keys(schema: Any) -> set[str]:
     return set(schema.get("properties", ())).union(*map(_keys, schema.values()))
 
 
-def _fault(detail: Any, prefix: str, raw: Any, known_keys: set[str], missing_beside: Sequence[str]) -> str:
+def _fault(detail: Any, prefix: str, raw: object, known_keys: set[str], missing_beside: Sequence[str]) -> str:
     """Return one error of pydantic, `detail`, as key, value and allowed values; other parameters as in `describe`.
 
     `missing_beside` are required keys that the table of the faulty key lacks; an unknown key is compared with these
@@ -348,7 +348,7 @@ def _fault(detail: Any, prefix: str, raw: Any, known_keys: set[str], missing_bes
     return f"{key}:{value_text} {message if value_text else message[0].lower() + message[1:]}"
 
 
-def _format_value(value: Any) -> str:
+def _format_value(value: object) -> str:
     """Return the value as Python writes it, True for true, or a note in place of a very long integer."""
     return "a very long integer" if isinstance(value, int) and abs(value) > LARGEST_INTEGER else repr(value)
 

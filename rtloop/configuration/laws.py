@@ -63,7 +63,7 @@ class Library:
         return matches[0]
 
 
-def names_own_laws(raw: Mapping[str, Any]) -> bool:
+def names_own_laws(raw: Mapping[str, object]) -> bool:
     """Whether a configuration's plain values name a law that is not shipped: a file, or an installed kind."""
     axes, loop = raw.get("axis"), raw.get("loop")
     tables = [table for axis in (axes if isinstance(axes, list) else ()) if isinstance(axis, Mapping)
@@ -89,7 +89,7 @@ def _text(path: Path) -> str:
         raise ValueError(str(error)) from None
 
 
-def select_options(value: Any, info: ValidationInfo, base: type[Law], default: str) -> Any:
+def select_options(value: object, info: ValidationInfo, base: type[Law], default: str) -> object:
     """Return a table as options of the law that it names, bound to it; a value that is no table unchanged.
 
     Raises ValueError for a law that is missing, no `base`, not for so many axes, or not loaded by the running loop;
@@ -132,12 +132,12 @@ def _axes(law: LawReference, kind: type[Law], options: Any) -> int:
     return count if kind.axes == ANY_NUMBER else 0
 
 
-def _controller(value: Any, info: ValidationInfo) -> Any:
+def _controller(value: object, info: ValidationInfo) -> object:
     """Return a table [axis.controller] as options of its law, as `select_options`."""
     return select_options(value, info, Controller, CONTROLLER)
 
 
-def _feedforward(value: Any, info: ValidationInfo) -> Any:
+def _feedforward(value: object, info: ValidationInfo) -> object:
     """Return a table [axis.feedforward] as options of its law, as `select_options`."""
     return select_options(value, info, Feedforward, FEEDFORWARD)
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from rtloop.configuration.axis import AxisOptions
 from rtloop.configuration.checks import AxisCheck, Findings, check_axes
@@ -219,7 +219,7 @@ def _coefficients(
 
 def _generators(
     configuration: Configuration, facts: Facts, table: TableOfSamples, findings: Findings
-) -> np.ndarray[Any, Any]:
+) -> npt.NDArray[np.void]:
     """Return the reference generators that the axes begin with, (axes,) of GENERATOR; samples go to `table`.
 
     A faulty reference stays all zeros, and its fault goes to `findings`.
@@ -238,7 +238,7 @@ def _generators(
 
 def _schedule(
     configuration: Configuration, facts: Facts, table: TableOfSamples, findings: Findings
-) -> np.ndarray[Any, Any]:
+) -> npt.NDArray[np.void]:
     """Return the commands, (n,) of MESSAGE, in the order of their ticks; entries of one tick keep the file's order.
 
     Samples go to `table`. A faulty entry is left out, and its fault goes to `findings`.
@@ -254,7 +254,7 @@ def _schedule(
 
 def _command(
     entry: ScheduleOptions, names: list[str], configuration: Configuration, facts: Facts, table: TableOfSamples
-) -> np.ndarray[Any, Any]:
+) -> npt.NDArray[np.void]:
     """Return the message (1,) of one entry of the schedule. Raises ValueError for a wrong reference."""
     if entry.mode is not None:
         kind, values = Kind.SET_MODE, (float(Mode[entry.mode.upper()]),)

@@ -46,7 +46,7 @@ def configuration_schema() -> Schema:
     definitions = shared["$defs"]
     for model in _models_within(models):
         _add_descriptions(definitions.get(model.__name__, {}), model)
-    references = {model: schemas[model, "validation"] for model in models}
+    references: dict[type[BaseModel], Schema] = {model: schemas[model, "validation"] for model in models}
     definitions["ControllerOptions"] = _law_table(laws, references, Controller, CONTROLLER)
     definitions["FeedforwardOptions"] = _law_table(laws, references, Feedforward, FEEDFORWARD)
     definitions["Driver"] = _driver_table(drivers, references, definitions)
@@ -56,7 +56,9 @@ def configuration_schema() -> Schema:
     return {"$schema": DIALECT, **file, "title": "Configuration of rtloop", "$defs": definitions}
 
 
-def _law_table(laws: dict[str, type[Law]], references: dict[Any, Schema], base: type[Law], default: str) -> Schema:
+def _law_table(
+    laws: dict[str, type[Law]], references: Mapping[type[BaseModel], Schema], base: type[Law], default: str
+) -> Schema:
     """Return the schema of a table that chooses a law derived from `base`, by `kind` or by the `file` that defines it.
 
     Any of `laws` by its kind and options, a file, or a kind that does not ship. A table without `kind` and `file` has
@@ -69,7 +71,7 @@ def _law_table(laws: dict[str, type[Law]], references: dict[Any, Schema], base: 
 
 
 def _driver_table(
-    drivers: Mapping[str, type[BaseModel]], references: dict[Any, Schema], definitions: dict[str, Schema]
+    drivers: Mapping[str, type[BaseModel]], references: Mapping[type[BaseModel], Schema], definitions: dict[str, Schema]
 ) -> Schema:
     """Return the schema of [driver].
 
@@ -114,7 +116,7 @@ def _models_within(models: Iterable[type[BaseModel]]) -> Iterator[type[BaseModel
             pending += [part for field in model.model_fields.values() for part in _models_in(field.annotation)]
 
 
-def _models_in(annotation: Any) -> Iterator[type[BaseModel]]:
+def _models_in(annotation: object) -> Iterator[type[BaseModel]]:
     """Yield the models that a type names, alone or as the parameter of another type."""
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         yield annotation

@@ -31,7 +31,7 @@ from rtloop.laws.contract import build_record
 from rtloop.laws.shipped.transfer import TransferController
 from rtloop.linear.options import TransferOptions
 
-Matrices = tuple[Any, Any, Any, Any]
+Matrices = tuple[Real, Real, Real, Real | float]
 """Matrices A, B, C and D of a state space."""
 library: Any = control  # its annotations do not describe its functions
 POLE_TOLERANCE, STEP_TOLERANCE, MARGIN_TOLERANCE = 1e-6, 1e-6, 1e-3
@@ -124,7 +124,7 @@ def axis_faults(
     loop: Loop,
     delay_ticks: int,
     sensor_hz: float | None = None,
-    record: Any = None,
+    record: npt.NDArray[np.uint8] | None = None,
 ) -> list[str]:
     """Return a sentence for each quantity of `loop` for which python-control computes another value; [] if none.
 
@@ -148,7 +148,7 @@ def _axis_sentences(name: str, faults: list[str]) -> list[str]:
     return [f"axis.{name}: {fault}{f'; {REMEDY}' if fault is faults[-1] else ''}" for fault in faults]
 
 
-def controller_matrices(check: AxisCheck, record: Any = None) -> Matrices:
+def controller_matrices(check: AxisCheck, record: npt.NDArray[np.uint8] | None = None) -> Matrices:
     """Return (A, b, c, d) of the controller per tick.
 
     For a transfer function, they come from the coefficients that the kernels read, `record` (bytes,) uint8 or, if that
@@ -258,17 +258,17 @@ def _margins(open_loop: Any, poles: Complex) -> dict[str, float]:
     max_sensitivity.
     """
     period_s = float(open_loop.dt)
-    rates: Any = np.log(poles[np.abs(poles) > LEAST_POLE].astype(complex))
+    rates: Complex = np.log(poles[np.abs(poles) > LEAST_POLE].astype(complex))
     light = rates[(rates.imag > 0) & (rates.imag < math.pi)]
     near = np.abs(light.imag)[:, None] + np.outer(np.maximum(np.abs(light.real), 1e-6), WIDTHS)
     grid = np.unique(np.concatenate([np.geomspace(1e-6, 1.0, GRID_POINTS) * math.pi, np.abs(near).ravel()]))
     grid = grid[(grid > 0) & (grid < math.pi)] / period_s
 
-    def respond(rad_s: Any) -> Any:
+    def respond(rad_s: npt.ArrayLike) -> Complex:
         """Return L at angular frequencies, by python-control."""
         return open_loop(np.exp(1j * period_s * np.asarray(rad_s)))
 
-    def crossings(value: Callable[[Any], Any], is_near: npt.NDArray[np.bool_]) -> list[Any]:
+    def crossings(value: Callable[[Complex], Real], is_near: npt.NDArray[np.bool_]) -> list[Any]:
         """Return the angular frequencies at which `value` of L changes sign, where `is_near` (grid,) says so."""
         at = lambda rad_s: float(value(respond(rad_s)))
         cells = [(grid[k], grid[k + 1]) for k in np.flatnonzero((np.diff(value(response) > 0)) & is_near[:-1])]
@@ -282,7 +282,7 @@ def _margins(open_loop: Any, poles: Complex) -> dict[str, float]:
     factors = [-1 / value for value in (*np.real(respond(phase_crossings)), *ends) if -1 < value < 0]
     lowest = int(np.argmin(np.abs(1 + response)))
     bounds = grid[max(lowest - 1, 0)], grid[min(lowest + 1, grid.size - 1)]
-    nearest: Any = minimize_scalar(lambda rad_s: np.abs(1 + respond(rad_s)), bounds=bounds, method="bounded")
+    nearest = minimize_scalar(lambda rad_s: np.abs(1 + respond(rad_s)), bounds=bounds, method="bounded")
     return {
         "crossover_hz": min(gain_crossings, default=math.nan) / (2 * math.pi),
         "phase_margin_deg": min(np.abs(np.angle(-respond(gain_crossings), deg=True)), default=math.inf),
@@ -311,7 +311,9 @@ def _sampled_plant(numbers: LoopNumbers) -> Any:
     return plant
 
 
-def _factors(model: TransferOptions, period_s: float) -> list[tuple[Any, Any]]:
+def _factors(
+    model: TransferOptions, period_s: float
+) -> list[tuple[npt.NDArray[np.floating], npt.NDArray[np.floating]]]:
     """Return (numerator, denominator) in s·T of factors whose product is the model without its delay.
 
     Highest power first. The first factor is the gain, the others are of second order or less. Not for the form
@@ -335,7 +337,7 @@ def _factors(model: TransferOptions, period_s: float) -> list[tuple[Any, Any]]:
     return [(np.array([gain * period_s ** (len(poles) - len(zeros))]), np.ones(1)), *sections]
 
 
-def _real_polynomials(roots: Any) -> list[Any]:
+def _real_polynomials(roots: Real | npt.NDArray[np.complexfloating]) -> list[npt.NDArray[np.floating]]:
     """Return real polynomials, highest power first, of second order for pairs of `roots`, and of first order for a
     remaining real root.
     """
@@ -347,6 +349,6 @@ def _real_polynomials(roots: Any) -> list[Any]:
     return sorted((np.poly(pair).real for pair in pairs), key=len, reverse=True)
 
 
-def _state_space(a: Any, b: Any, c: Any, d: float, dt: float) -> Any:
+def _state_space(a: npt.ArrayLike, b: npt.ArrayLike, c: npt.ArrayLike, d: float | Real, dt: float) -> Any:
     """Return a python-control system with one input and one output; `dt` is the period in s, 0 if continuous."""
     return library.ss(a, np.reshape(b, (-1, 1)), np.reshape(c, (1, -1)), [[d]], dt)

@@ -7,20 +7,20 @@ once a module of the room is imported; so the room can be called, and passes the
 from __future__ import annotations
 
 import sys
+from collections.abc import Callable
 from importlib import import_module
 from types import ModuleType
-from typing import Any
 
 
 class CallableRoom(ModuleType):
     """The package `rtloop.design` as a module that can be called as the function of the same name."""
 
-    def __call__(self, *arguments: Any, **options: Any) -> Any:
+    def __call__(self, *arguments: object, **options: object) -> object:
         """Call `rtloop.workbench.design.design`, with its arguments, result and errors."""
         return self.__wrapped__(*arguments, **options)
 
     @property
-    def __wrapped__(self) -> Any:
+    def __wrapped__(self) -> Callable[..., object]:
         """Public function `rtloop.workbench.design.design`, whose signature `help` and notebooks show."""
         return import_module("rtloop.workbench.design").design
 

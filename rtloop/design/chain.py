@@ -35,7 +35,7 @@ from rtloop.design.synthesis.section import controller_values, provenance
 from rtloop.design.synthesis.specification import DesignOptions
 from rtloop.design.synthesis.synthesise import Synthesis, synthesise_design
 from rtloop.design.toml_text import edit_text
-from rtloop.design.written_reference import steps_reference
+from rtloop.design.written_reference import StepsReference, steps_reference
 from rtloop.hysteresis.play_model import PlayModel
 from rtloop.hysteresis.plays import model_output
 from rtloop.values import count_text
@@ -160,7 +160,7 @@ def configuration_text(chain: Chain, axis: str | None, spec_name: str, spec_text
 
 
 def stage_configuration(
-    stage: Stage, parts: Mapping[str, Any], comments: list[str], axis: str | None, spec_name: str
+    stage: Stage, parts: Mapping[str, object], comments: list[str], axis: str | None, spec_name: str
 ) -> str:
     """Return as TOML the step recording's configuration in closed loop, with the stage in `axis`.
 
@@ -191,7 +191,7 @@ def stage_configuration(
     return edit_text(remove_first_comments(stage.fast.configuration), configuration, heading, rewritten)
 
 
-def reference_values(stage: Stage, axis: str | None) -> dict[str, Any]:
+def reference_values(stage: Stage, axis: str | None) -> StepsReference:
     """Return the table [axis.reference], a square wave as `steps_reference` makes, for the step recording's axis.
 
     It is {"kind": "steps", "levels": two in µm, "dwell_s": the duration of each}. `axis` is the name of one of the
@@ -207,7 +207,7 @@ def _axis_table(configuration: Mapping[str, Any], axis: str | None) -> dict[str,
     return next(table for table in configuration["axis"] if axis in (None, table["name"]))
 
 
-def _enable_oscillation(interlocks: Mapping[str, Any], dynamics: DynamicsFit, period_s: float) -> dict[str, Any]:
+def _enable_oscillation(interlocks: Mapping[str, object], dynamics: DynamicsFit, period_s: float) -> dict[str, object]:
     """Return the interlocks with the one against a growing resonance enabled, by `oscillation_swings` and
     `swing_ticks`; the identification runs without it.
 

@@ -5,14 +5,17 @@ from __future__ import annotations
 import io
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, TypeVar
 
 from rtloop.errors import MissingExtra
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+    from matplotlib.typing import LegendLocType, RcKeyType
 
 DPI = 130
+Curves = TypeVar("Curves")
 
 
 @dataclass(frozen=True)
@@ -29,7 +32,7 @@ class Palette:
     comparison: str
     limit: str
 
-    def label(self, panel: Any, x: str, y: str, title: str = "", legend: str | None = None) -> None:
+    def label(self, panel: Axes, x: str, y: str, title: str = "", legend: LegendLocType | None = None) -> None:
         """Label the axes of a panel, give it a title, and a transparent legend at the location `legend`, matplotlib's
         name for it; None: no legend.
         """
@@ -39,7 +42,7 @@ class Palette:
         if legend is not None:
             self.add_legend(panel, legend)
 
-    def add_legend(self, panel: Any, loc: str = "best") -> None:
+    def add_legend(self, panel: Axes, loc: LegendLocType = "best") -> None:
         """Add a transparent legend to a panel at `loc`, matplotlib's name of the location."""
         panel.legend(loc=loc, fontsize=8, framealpha=0.85, edgecolor="none", facecolor=self.background)
 
@@ -50,7 +53,7 @@ THEMES: Mapping[str, Palette] = {"light": LIGHT, "dark": DARK}
 
 
 def draw_pictures(
-    draw: Callable[[Any, Any, Palette], None], curves: Any, size: tuple[float, float]
+    draw: Callable[[Figure, Curves, Palette], None], curves: Curves, size: tuple[float, float]
 ) -> dict[str, bytes]:
     """Return a picture as PNG bytes for each theme, "light" and "dark"; `size` in inches.
 
@@ -86,7 +89,7 @@ def _copy_layout(source: Figure, target: Figure) -> None:
         panel.set_position(source_panel.get_position())
 
 
-def _matplotlib_settings(ink: Palette) -> Any:
+def _matplotlib_settings(ink: Palette) -> dict[RcKeyType, object]:
     """Return matplotlib's settings (rcParams) for a palette as a dictionary."""
     return {
         "figure.facecolor": ink.background,

@@ -29,7 +29,7 @@ def remove_first_comments(text: str) -> str:
     return schema_line + (remainder if gap and is_comment else text)
 
 
-def remove_stale_comments(text: str, values: Mapping[str, Any], rewritten: Collection[str]) -> str:
+def remove_stale_comments(text: str, values: Mapping[str, object], rewritten: Collection[str]) -> str:
     """Return `text` without the comments of sections that `values` lacks, or that differ and are named in `rewritten`.
 
     Comments of a section are those directly above its heading, without an empty line between, and those above its keys.
@@ -58,7 +58,7 @@ def remove_stale_comments(text: str, values: Mapping[str, Any], rewritten: Colle
     return cleaned if _has_values(cleaned, old_values) else text
 
 
-def _heading(line: str, values: Mapping[str, Any], counts: dict[str, int]) -> list[str | int] | None:
+def _heading(line: str, values: Mapping[str, object], counts: dict[str, int]) -> list[str | int] | None:
     """Return the path of the section that a line begins, with indices of tables in lists, such as ["axis", 0, "model"];
     None for another line.
 
@@ -79,14 +79,14 @@ def _heading(line: str, values: Mapping[str, Any], counts: dict[str, int]) -> li
 
 
 def _is_rewritten(
-    path: list[str | int], old: Mapping[str, Any], new: Mapping[str, Any], rewritten: Collection[str]
+    path: list[str | int], old: Mapping[str, object], new: Mapping[str, object], rewritten: Collection[str]
 ) -> bool:
     """Whether the section at a path is missing in `new`, or differs and lies in a table named in `rewritten`."""
     old_table, new_table = _find_value(old, path), _find_value(new, path)
     return new_table is None or (old_table != new_table and not set(rewritten).isdisjoint(map(str, path)))
 
 
-def _find_value(values: Any, path: list[str | int]) -> Any:
+def _find_value(values: Any, path: list[str | int]) -> object:
     """Return the value at a path of keys and indices, or None where there is none."""
     for part in path:
         try:
@@ -96,7 +96,7 @@ def _find_value(values: Any, path: list[str | int]) -> Any:
     return values
 
 
-def _has_values(text: str, values: Mapping[str, Any]) -> bool:
+def _has_values(text: str, values: Mapping[str, object]) -> bool:
     """Whether a text is TOML of exactly these values."""
     try:
         return tomllib.loads(text) == values

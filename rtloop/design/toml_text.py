@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import tomllib
 from collections.abc import Collection, Mapping, MutableMapping, Sequence
-from typing import Any
+from typing import Any, TypeGuard
 
 import numpy as np
 import numpy.typing as npt
 import tomlkit
 from tomlkit.exceptions import TOMLKitError
-from tomlkit.items import AoT, Array, Item, Table
+from tomlkit.items import AoT, Array, Item, Key, Table
 
 from rtloop.design.stale_comments import remove_stale_comments, split_schema_line
 from rtloop.linear.transfer import Transfer
@@ -19,7 +19,7 @@ LIST_WIDTH = 90
 """Longest list in characters that is written in one line."""
 
 
-def write_section(name: str, values: Mapping[str, Any], comments: Sequence[str] = ()) -> str:
+def write_section(name: str, values: Mapping[str, object], comments: Sequence[str] = ()) -> str:
     """Return TOML of `[name]` with its keys, below `comments`, lines without #; nested tables become sections, lists of
     tables [[…]].
 
@@ -28,7 +28,7 @@ def write_section(name: str, values: Mapping[str, Any], comments: Sequence[str] 
     document = tomlkit.document()
     for comment in comments:
         document.add(tomlkit.comment(comment))
-    nested: Mapping[str, Any] = values
+    nested: Mapping[str, object] = values
     for part in reversed(name.split(".") if name else []):
         nested = {part: nested}
     for key, value in _order_values(nested):
@@ -37,7 +37,7 @@ def write_section(name: str, values: Mapping[str, Any], comments: Sequence[str] 
 
 
 def edit_text(
-    text: str, values: Mapping[str, Any], comments: Sequence[str] = (), rewritten: Collection[str] = ()
+    text: str, values: Mapping[str, object], comments: Sequence[str] = (), rewritten: Collection[str] = ()
 ) -> str:
     """Return `text` changed to hold `values` and no other keys, with its old comments, below new `comments`.
 
@@ -58,7 +58,7 @@ def edit_text(
     return "\n".join(filter(None, (schema_line, write_section("", values, comments))))
 
 
-def _update_table(table: Any, values: Mapping[str, Any]) -> None:
+def _update_table(table: Any, values: Mapping[str, object]) -> None:
     """Change a parsed table in place so that it holds `values` and no other keys.
 
     Comments stay, but for one behind a value that changes. Those at the end of the table stay there: they describe what
@@ -84,7 +84,7 @@ def _update_table(table: Any, values: Mapping[str, Any]) -> None:
     _find_last_entries(table).extend(last_lines)
 
 
-def _take_last_lines(table: Any) -> list[Any]:
+def _take_last_lines(table: object) -> list[tuple[Key | None, Item]]:
     """Remove comments and empty lines behind the last key of a table and its tables; return them."""
     body = _find_last_entries(table)
     first = next((i for i in range(len(body), 0, -1) if body[i - 1][0] is not None), 0)
@@ -93,21 +93,23 @@ def _take_last_lines(table: Any) -> list[Any]:
     return lines
 
 
-def _find_last_entries(table: Any) -> list[Any]:
+def _find_last_entries(table: object) -> list[tuple[Key | None, Item]]:
     """Return the list of entries, (key or None, item), of the last table within a table or document, or its own if it
     contains none. It is tomlkit's own list: changes of it change the document.
     """
     while True:
         if isinstance(table, AoT):
             table = table.body[-1]
-        body: list[Any] = table.value.body if isinstance(table, Table) else getattr(table, "body", [])
+        body: list[tuple[Key | None, Item]] = (
+            table.value.body if isinstance(table, Table) else getattr(table, "body", [])
+        )
         last = next((item for key, item in reversed(body) if key is not None), None)
         if not isinstance(last, Table | AoT) or not last:
             return body
         table = last
 
 
-def toml_item(value: Any) -> Item:
+def toml_item(value: object) -> Item:
     """Return a value as TOML item: a list of mappings as tables [[…]], a mapping within another list as inline
     table.
     """
@@ -123,7 +125,7 @@ def toml_item(value: Any) -> Item:
     return tomlkit.item(value.item() if isinstance(value, np.generic) else value)
 
 
-def zpk_values(transfer: Transfer) -> dict[str, Any]:
+def zpk_values(transfer: Transfer) -> dict[str, object]:
     """Return a transfer function as {"form": "zpk", "gain", "zeros", "poles"}, roots in rad/s as pairs [real,
     imaginary].
     """
@@ -133,7 +135,7 @@ def zpk_values(transfer: Transfer) -> dict[str, Any]:
     return {"form": "zpk", "gain": transfer.gain, "zeros": zeros, "poles": poles}
 
 
-def _table(values: Mapping[str, Any], holds_tables_alone: bool = False) -> Table:
+def _table(values: Mapping[str, object], holds_tables_alone: bool = False) -> Table:
     """Return a mapping as TOML table; `holds_tables_alone` leaves out its own heading."""
     table = tomlkit.table(is_super_table=holds_tables_alone)
     for key, value in _order_values(values):
@@ -141,7 +143,7 @@ def _table(values: Mapping[str, Any], holds_tables_alone: bool = False) -> Table
     return table
 
 
-def _array(values: Sequence[Any] | npt.NDArray[Any]) -> Array:
+def _array(values: Sequence[object] | npt.NDArray[np.generic]) -> Array:
     """Return a list as TOML array, with a line for each entry if it is longer than LIST_WIDTH characters."""
     items = [_inline_item(value) for value in values]
     array = tomlkit.array()
@@ -153,7 +155,7 @@ def _array(values: Sequence[Any] | npt.NDArray[Any]) -> Array:
     return array.multiline(len(array.as_string()) > LIST_WIDTH)
 
 
-def _inline_item(value: Any) -> Item:
+def _inline_item(value: object) -> Item:
     """Return a value in a list or an inline table as TOML item: mappings inline."""
     if isinstance(value, Mapping):
         table = tomlkit.inline_table()
@@ -163,16 +165,16 @@ def _inline_item(value: Any) -> Item:
     return _array(value) if isinstance(value, list | tuple | np.ndarray) else toml_item(value)
 
 
-def _order_values(values: Mapping[str, Any]) -> list[tuple[str, Any]]:
+def _order_values(values: Mapping[str, object]) -> list[tuple[str, object]]:
     """Return (key, value) pairs with plain values before tables: TOML cannot return from a table to its parent."""
     return sorted(values.items(), key=lambda entry: _is_table(entry[1]))
 
 
-def _is_table(value: Any) -> bool:
+def _is_table(value: object) -> bool:
     """Whether a value is written as one or more tables with headings."""
     return isinstance(value, Mapping | AoT) or _is_tables(value)
 
 
-def _is_tables(value: Any) -> bool:
+def _is_tables(value: object) -> TypeGuard[Sequence[Mapping[str, object]]]:
     """Whether a value is a non-empty list of mappings."""
     return isinstance(value, list | tuple) and bool(value) and all(isinstance(entry, Mapping) for entry in value)

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from typing import Any
+from typing import TypedDict
 
 from rtloop.configuration.axis import LimitsOptions
 from rtloop.hysteresis.play_model import PlayModel
@@ -16,7 +15,15 @@ mode.
 """
 
 
-def steps_reference(limits: LimitsOptions, actuator: PlayModel, slowest_hz: float, period_s: float) -> dict[str, Any]:
+class StepsReference(TypedDict):
+    """Table [axis.reference] of a square wave: two levels in µm, the farther from rest first, and their duration."""
+
+    kind: str
+    levels: list[float]
+    dwell_s: float
+
+
+def steps_reference(limits: LimitsOptions, actuator: PlayModel, slowest_hz: float, period_s: float) -> StepsReference:
     """Return [axis.reference]: a square wave of STEP_PART of the largest command, to one significant digit, and 0.
 
     An actuator that does not come back to 0 within the drive's limits gets a square wave within the positions that it
@@ -30,7 +37,7 @@ def steps_reference(limits: LimitsOptions, actuator: PlayModel, slowest_hz: floa
     return {"kind": "steps", "levels": levels_um, "dwell_s": round(dwell_s, 9)}
 
 
-def describe_reference(values: Mapping[str, Any]) -> str:
+def describe_reference(values: StepsReference) -> str:
     """Return `values`, as of `steps_reference`, as words: both levels in µm, and the duration of each."""
     levels = " and ".join(f"{level:g}" for level in values["levels"])
     return f"steps between {levels} µm, {values['dwell_s']:g} s each"

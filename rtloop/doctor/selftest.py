@@ -12,7 +12,6 @@ import tempfile
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -92,7 +91,7 @@ class SelfTest:
                 f"{axis.limits.slew_v_per_s:g} V/s, for {staircase.duration_s:.1f} s; reads {channel.input}"
             )
 
-    def run(self, tolerances: Tolerances | None, progress: Callable[[str], None]) -> dict[str, Any]:
+    def run(self, tolerances: Tolerances | None, progress: Callable[[str], None]) -> dict[str, object]:
         """Drive the outputs, measure, and return the report of `_report` as JSON values, with `realtime` (the host's
         grants), `real` (whether the hardware is no simulation), and `exchange` as `_measure_exchanges` returns it.
 
@@ -117,7 +116,7 @@ class SelfTest:
             store_host_delay(configuration, exchange_us=exchange["added_us"])
         return report | {"realtime": realtime, "real": self._facts.real, "exchange": exchange}
 
-    def _measure_exchanges(self, progress: Callable[[str], None]) -> dict[str, Any] | None:
+    def _measure_exchanges(self, progress: Callable[[str], None]) -> dict[str, float] | None:
         """Measure EXCHANGES exchanges with a node; return {count, p50_us, p99_us, max_us, lost, late, added_us}.
 
         None for a driver without such exchanges. `lost` were not answered, `late` took longer than a period. `added_us`
@@ -183,7 +182,7 @@ class SelfTest:
 
     def _report(
         self, pairs: dict[str, ChannelPair], rates: list[tuple[float, float]], tolerances: Tolerances | None
-    ) -> dict[str, Any]:
+    ) -> dict[str, object]:
         """Return the report, one JSON object, of measured pairs and of rates with their fractions of missed periods.
 
         Keys: configuration, driver, rate_hz, axes, highest_rate_hz (None if all rates miss too many periods), rates
@@ -244,7 +243,7 @@ def _open_loop(configuration: Configuration, mode: ModeName, rate_hz: float) -> 
     return replace(configuration, loop=loop, axes=axes, schedule=())
 
 
-def _run_and_load(prepared: Prepared) -> tuple[Recording, dict[str, Any]]:
+def _run_and_load(prepared: Prepared) -> tuple[Recording, dict[str, object]]:
     """Run once. Returns (the recording, all in memory; the host's real-time grants). Its file is deleted.
 
     Raises LoopFault for a run that trips or ends early, as by Ctrl-C or SIGTERM; RtloopError or DriverError for a run

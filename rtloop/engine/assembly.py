@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from rtloop.drivers.base import Channel, Facts, Pointers, Wiring, channel_index
 from rtloop.engine.clock import Clock, clock_context, paced_clock
@@ -14,6 +15,7 @@ from rtloop.engine.loop import Outcome, run_ticks
 from rtloop.engine.memory import SharedBlock
 from rtloop.engine.messages import MESSAGE
 from rtloop.engine.plan import Pacing, Plan
+from rtloop.foundation.arrays import Real
 from rtloop.foundation.native.compiled import python_entry
 from rtloop.foundation.native.pointers import address_pointer, carray
 from rtloop.kernel.layout import CONDITIONS, LAW
@@ -59,7 +61,7 @@ class Assembly:
         """
         self._loops = np.zeros(1, LOOP).view(np.recarray)
         self.loop = self._loops[0]
-        self._arrays: dict[str, np.ndarray[Any, Any]] = {}
+        self._arrays: dict[str, npt.NDArray[Any]] = {}
         self._law = law
         self._add_array("law", law.records)
         self._wire_channels(plan, facts)
@@ -72,12 +74,12 @@ class Assembly:
         self.loop.record_limit = UNLIMITED if plan.ticks is None else plan.ticks
 
     @property
-    def generators(self) -> np.ndarray[Any, Any]:
+    def generators(self) -> npt.NDArray[np.void]:
         """The reference generators that the loop reads, one GENERATOR record an axis."""
         return self._arrays["generators"]
 
     @property
-    def outputs_v(self) -> np.ndarray[Any, Any]:
+    def outputs_v(self) -> Real:
         """Values of the outputs in V after the last successful write, before one those at rest: a copy (outputs,)."""
         outputs_v = self._arrays["outputs"].copy()
         outputs_v[self._arrays["output_index"]] = self._arrays["last_drive_v"]
@@ -90,7 +92,7 @@ class Assembly:
         """
         return Outcome(run_ticks(self._loops.ctypes.data, until_tick))
 
-    def _add_array(self, name: str, array: np.ndarray[Any, Any]) -> None:
+    def _add_array(self, name: str, array: npt.NDArray[np.generic]) -> None:
         """Store `array` under `name`, which keeps it alive, and write its address to the context's field `name`."""
         self._arrays[name] = array
         self._loops[name] = array.ctypes.data

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 
 from rtloop.drivers.base import Driver
 from rtloop.engine.assembly import Assembly, law_at_rest
@@ -26,10 +27,10 @@ UNLIMITED_SLACK = 1 << 62
 class _LawAtRest(NamedTuple):
     """Memory of laws, copies of its arrays at rest, and the plan that it was made for, which keeps `key` unique."""
 
-    key: tuple[Any, ...]
+    key: tuple[object, ...]
     plan: Plan
     memory: LawMemory
-    arrays: dict[str, Any]
+    arrays: dict[str, npt.NDArray[np.generic]]
 
 
 class LoopsInProcess:

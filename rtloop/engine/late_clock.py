@@ -11,9 +11,10 @@ rest of the lateness reaches the record and the interlocks alone. The table's nu
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 
 from rtloop.drivers.base import Facts, Pointers
 from rtloop.drivers.sim import CONTEXT as RIG_CONTEXT
@@ -40,7 +41,7 @@ class VirtualClock(NamedTuple):
     """A clock of virtual time and the arrays that it points to, which must outlive it."""
 
     clock: Clock
-    arrays: tuple[np.ndarray[Any, Any], ...]
+    arrays: tuple[npt.NDArray[np.generic], ...]
 
 
 @cfunc(SIGNATURE)

@@ -261,11 +261,11 @@ def ring_ticks(rate_hz: float) -> int:
     return 1 << int(np.ceil(np.log2(max(MIN_RING_TICKS, RING_SECONDS * rate_hz))))
 
 
-def _array_specification(sizes: Sizes) -> dict[str, tuple[np.dtype[Any], tuple[int, ...]]]:
+def _array_specification(sizes: Sizes) -> dict[str, tuple[np.dtype[np.generic], tuple[int, ...]]]:
     """Return type and shape of each array of the block by name."""
     word, real = np.dtype(np.uint64), np.dtype(np.float64)
     ticks = ring_ticks(sizes.rate_hz)
-    arrays: dict[str, tuple[np.dtype[Any], tuple[int, ...]]] = {
+    arrays: dict[str, tuple[np.dtype[np.generic], tuple[int, ...]]] = {
         "words": (word, (64,)),
         "last_drive_v": (real, (sizes.axes,)),
         "table": (real, (max(sizes.table_samples, 1),)),
@@ -274,7 +274,7 @@ def _array_specification(sizes: Sizes) -> dict[str, tuple[np.dtype[Any], tuple[i
         "commands": (MESSAGE, (COMMAND_SLOTS + URGENT_SLOTS,)),
         "commands_marks": (word, (COMMAND_SLOTS + URGENT_SLOTS,)),
     }
-    slots: Sequence[tuple[str, np.dtype[Any], tuple[int, ...]]] = (
+    slots: Sequence[tuple[str, np.dtype[np.generic], tuple[int, ...]]] = (
         ("ticks", real, (ticks, sizes.columns)),
         ("events", MESSAGE, (EVENT_SLOTS,)),
         ("snapshots", np.dtype(np.uint8), (SNAPSHOT_SLOTS, sizes.snapshot_bytes)),
@@ -286,7 +286,7 @@ def _array_specification(sizes: Sizes) -> dict[str, tuple[np.dtype[Any], tuple[i
     return arrays
 
 
-def _restore_tuples(descr: Any) -> Any:
+def _restore_tuples(descr: str | list[list[object]]) -> Any:
     """Return a numpy dtype description from JSON with tuples in place of its inner lists; a text is unchanged."""
     if isinstance(descr, str):
         return descr

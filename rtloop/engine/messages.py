@@ -6,10 +6,11 @@ loop alone decides at which tick it takes effect, and acknowledges it by an even
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from enum import IntEnum
-from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 MESSAGE_VALUES = 12
 MESSAGE = np.dtype(
@@ -65,8 +66,8 @@ class Origin(IntEnum):
 
 
 def message(
-    kind: Kind, *, tick: int = 0, axis: int = ALL_AXES, origin: Origin = Origin.OPERATOR, values: Any = ()
-) -> np.ndarray[Any, Any]:
+    kind: Kind, *, tick: int = 0, axis: int = ALL_AXES, origin: Origin = Origin.OPERATOR, values: Sequence[float] = ()
+) -> npt.NDArray[np.void]:
     """Return one MESSAGE record, shape (1,); its identity and its other values are 0.
 
     A command of the schedule takes effect from `tick` on, one of the queue at once, whatever its `tick`.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -57,18 +57,18 @@ class Plan:
     pacing: Pacing
     ticks: int | None
     driver_kind: str
-    driver_options: Mapping[str, Any]
+    driver_options: Mapping[str, object]
     wiring: Mapping[str, Wiring]
     laws: tuple[LawReference, ...]
     """Laws available to the loop; the coefficients refer to them by index."""
-    coefficients: npt.NDArray[Any]
+    coefficients: npt.NDArray[np.void]
     """Coefficients of each axis and its laws, (axes,), records of `layout.coefficients`."""
     mode: Mode
-    generators: npt.NDArray[Any]
+    generators: npt.NDArray[np.void]
     """Reference generators at the start, (axes,), GENERATOR records."""
     table: npt.NDArray[np.float64]
     """Samples of all tables that generators play, one table after the other, in µm (V in mode raw)."""
-    schedule: npt.NDArray[Any]
+    schedule: npt.NDArray[np.void]
     """Commands, MESSAGE records in the order of their ticks."""
     observed: tuple[str, ...]
     """Names of the signals that the driver observes; they are recorded and never passed to a law."""

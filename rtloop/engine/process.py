@@ -15,7 +15,7 @@ import pickle
 import signal
 import sys
 import time
-from typing import Any
+from typing import TYPE_CHECKING
 
 from rtloop.drivers.base import Driver, Facts, Pointers
 from rtloop.drivers.errors import DriverError
@@ -29,6 +29,9 @@ from rtloop.engine.ramp import ramp_to_safe, starting_outputs_v
 from rtloop.engine.realtime import die_with_parent, freeze_garbage_collection, prepare_realtime
 from rtloop.errors import ConfigError, HostRefusal, LoopFault, RtloopError, UnavailableError, one_line_error
 
+if TYPE_CHECKING:
+    import numpy as np
+
 EXIT_CODES = {
     Outcome.DONE: 0,
     Outcome.STOPPED: 0,
@@ -41,7 +44,7 @@ START_DELAY_NS = 20_000_000
 GO_POLL_S = 0.001
 
 
-def report(kind: str, **facts: Any) -> None:
+def report(kind: str, **facts: object) -> None:
     """Write one line of JSON, {"report": `kind`, and the `facts`}, to stdout; nothing happens if the supervisor has
     ended.
 
@@ -173,7 +176,7 @@ def _run_plan(plan: Plan, block: SharedBlock, driver: Driver, facts: Facts) -> O
         ramp_to_safe(driver, pointers, assembly.outputs_v, plan.trip_slew_v_per_s)  # no effect if the loop has done it
 
 
-def _fault_text(driver: Driver, loop: Any) -> str:
+def _fault_text(driver: Driver, loop: np.record) -> str:
     """Return driver, failed operation, tick and cause as text; the status if the driver has no `error`."""
     operation = "write" if loop.failed == WRITE_FAILED else "read"
     error = getattr(driver, "error", None)

@@ -6,6 +6,7 @@ import ctypes
 import gc
 import os
 import platform
+from collections.abc import Callable
 from typing import Any
 
 from rtloop.engine.plan import Pacing
@@ -60,7 +61,7 @@ def die_with_parent() -> None:
     _libc.prctl(PR_SET_PDEATHSIG, 9, 0, 0, 0)
 
 
-def _request(report: dict[str, Any], name: str, request: Any) -> None:
+def _request(report: dict[str, Any], name: str, request: Callable[[], object]) -> None:
     """Call `request` and store its result in `report[name]`.
 
     An OSError leaves that value, and becomes a message "name: cause" in `report["refused"]`.

@@ -23,8 +23,8 @@ ONE = np.uint64(1)
 class Ring(NamedTuple):
     """`head` (1,) uint64: positions published; `marks` (n,) uint64: position + 1 of each slot; `slots` (n, …)."""
 
-    head: Any
-    marks: Any
+    head: npt.NDArray[np.uint64]
+    marks: npt.NDArray[np.uint64]
     slots: Any
 
 
@@ -56,7 +56,7 @@ def publish(ring, position):
     store_release(ring.head, 0, position + ONE)
 
 
-def drain(ring: Ring, cursor: int, out: npt.NDArray[Any]) -> tuple[int, int, int]:
+def drain(ring: Ring, cursor: int, out: npt.NDArray[np.generic]) -> tuple[int, int, int]:
     """Copy all readable slots from position `cursor` on into `out` (m, …), oldest first.
 
     Returns (copied, first, lost): `out[:copied]` holds positions first … first + copied − 1, without a hole, and

@@ -25,7 +25,7 @@ from rtloop.errors import RtloopError
 
 TEXT_BYTES = 1000
 """Longest text; a client reserves as much."""
-Writer = Callable[["Channel", Any], Awaitable[None]]
+Writer = Callable[["Channel", object], Awaitable[None]]
 """Function that receives a channel and the value that a client wrote. Raises RtloopError to refuse it."""
 
 
@@ -37,9 +37,9 @@ class Channel(ChannelData):
     writer: Writer | None = None
     report_write: Callable[[Channel, str, RtloopError | None], Awaitable[None]]
     """Receives the channel, the address of the client, and None or the refusal."""
-    _shown: tuple[Any, ...] = ()
+    _shown: tuple[object, ...] = ()
 
-    async def show(self, value: Any, mode: str | None) -> None:
+    async def show(self, value: object, mode: str | None) -> None:
         """Show a value that the service reported in `mode`, as a MAJOR alarm if it is the variable's `alarm`.
 
         None: unknown; the channel keeps the last value, with the alarm INVALID.
@@ -52,7 +52,7 @@ class Channel(ChannelData):
         else:
             await self._show(value, AlarmStatus.NO_ALARM, AlarmSeverity.NO_ALARM, unit)
 
-    async def show_lost(self, value: Any) -> None:
+    async def show_lost(self, value: object) -> None:
         """Show that no service answers: INVALID, with `value` or, for None, the last value."""
         await self._show(value, AlarmStatus.COMM, AlarmSeverity.INVALID_ALARM, None)
 
@@ -71,7 +71,7 @@ class Channel(ChannelData):
         """Return READ, with WRITE if the channel has a writer; the client's `hostname` and `username` are ignored."""
         return AccessRights.READ if self.writer is None else AccessRights.READ | AccessRights.WRITE
 
-    async def auth_write(self, hostname: str, username: str, data: Any, data_type: Any, metadata: Any, *,
+    async def auth_write(self, hostname: str, username: str, data: object, data_type: ChannelType, metadata: object, *,
                          flags: int = 0, user_address: tuple[str, int] | None = None) -> None:  # fmt: skip
         """Pass a client's value to `writer`, and report the outcome; alarms and limits that it sends are dropped.
 
@@ -91,7 +91,7 @@ class Channel(ChannelData):
         if refusal is not None:
             raise refusal
 
-    async def write(self, value: Any, **_: Any) -> None:
+    async def write(self, value: object, **_: object) -> None:
         """Pass a converted value to `writer`; called by `write_from_dbr`. The value shown comes from the service alone.
 
         Raises RtloopError for a refused value, CaprotoValueError for several values.
@@ -99,7 +99,7 @@ class Channel(ChannelData):
         if self.writer is not None:
             await self.writer(self, self.from_client(self.preprocess_value(value)))
 
-    def from_client(self, value: Any) -> Any:
+    def from_client(self, value: Any) -> object:
         """Return a client's value as the service's requests have it: unchanged, unless a subclass converts it."""
         return value
 
@@ -107,13 +107,13 @@ class Channel(ChannelData):
 class NumberChannel(Channel, ChannelDouble):
     """A channel whose value is a number of double precision."""
 
-    async def write_from_dbr(self, data: Any, data_type: Any, metadata: Any, *, flags: int = 0) -> None:
+    async def write_from_dbr(self, data: Any, data_type: ChannelType, metadata: object, *, flags: int = 0) -> None:
         """Convert a client's value and write it. Raises CaprotoValueError for an empty text (caproto would write 0)."""
         if native_type(data_type) is ChannelType.STRING and not all(text.strip() for text in data):
             raise CaprotoValueError(data)
         await super().write_from_dbr(data, data_type, metadata, flags=flags)
 
-    def from_client(self, value: Any) -> float:
+    def from_client(self, value: float) -> float:
         """Return the client's value as a float."""
         return float(value)
 
@@ -121,7 +121,7 @@ class NumberChannel(Channel, ChannelDouble):
 class ChoiceChannel(Channel, ChannelEnum):
     """A channel with one of some words."""
 
-    def from_client(self, value: Any) -> str:
+    def from_client(self, value: float) -> str:
         """Return the word with the number `value`; caproto converts a written word to its number before.
 
         Raises CaprotoValueError for a number without a word.
@@ -134,7 +134,7 @@ class ChoiceChannel(Channel, ChannelEnum):
 class TextChannel(Channel, ChannelChar):
     """A channel with a text of at most TEXT_BYTES bytes of UTF-8, as an array of characters."""
 
-    async def _show(self, value: Any, status: AlarmStatus, severity: AlarmSeverity, unit: str | None) -> None:
+    async def _show(self, value: str | None, status: AlarmStatus, severity: AlarmSeverity, unit: str | None) -> None:
         """Show the text on one line, cut to TEXT_BYTES."""
         if value is not None:
             value = " ".join(value.split()).encode()[:TEXT_BYTES].decode(errors="ignore")

@@ -21,7 +21,7 @@ from rtloop.client import Client
 from rtloop.client.connection import Connection
 from rtloop.epics.channels import Channel, make_channel
 from rtloop.epics.requests import Requests
-from rtloop.epics.variables import LOOP_VARIABLES, STOPS, Variable, axis_variables
+from rtloop.epics.variables import LOOP_VARIABLES, STOPS, Status, Variable, axis_variables
 from rtloop.errors import RtloopError, UnavailableError, one_line_error
 
 PERIOD_S = 0.1
@@ -38,7 +38,7 @@ class ChannelServer:
 
     def __init__(self, connection: Connection, prefix: str, allows_control: bool, log: Callable[[str], None]) -> None:
         self._connection, self._prefix, self._allows_control, self._log = connection, prefix, allows_control, log
-        self.database: dict[str, Any] = {}
+        self.database: dict[str, Channel] = {}
         """Channels by name, which the server of caproto reads."""
         self._channels: dict[str, Channel] = {}
         self._requests, self._reader = Requests(), ThreadPoolExecutor(1, "status")
@@ -80,7 +80,7 @@ class ChannelServer:
             else:
                 await self.show_status(status)
 
-    async def show_status(self, status: dict[str, Any]) -> None:
+    async def show_status(self, status: Status) -> None:
         """Show a response of `/status` in all channels; an axis that is new gets its channels.
 
         The first response after a loss is logged.
@@ -101,7 +101,7 @@ class ChannelServer:
         for channel in self._channels.values():
             await channel.show_lost(text if channel.variable is self._message else channel.variable.lost)
 
-    async def _send(self, channel: Channel, value: Any) -> None:
+    async def _send(self, channel: Channel, value: object) -> None:
         """Send the request of a written value to the service: a stop at once, others after those before them.
 
         Raises RtloopError for a refusal.

@@ -27,14 +27,14 @@ class Variable(NamedTuple):
     """
 
     suffix: str
-    read: Callable[[Status], Any]
+    read: Callable[[Status], object]
     request: Callable[[Connection, Any], object] | None = None
     choices: tuple[str, ...] = ()
     is_text: bool = False
     unit: str = ""
     precision: int = 0
-    alarm: Any = None
-    lost: Any = None
+    alarm: object = None
+    lost: object = None
 
 
 def axis_variables(axis: str) -> tuple[Variable, ...]:

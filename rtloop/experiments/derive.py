@@ -10,7 +10,7 @@ import copy
 import json
 import os
 import tomllib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -26,8 +26,8 @@ METADATA_PREFIX = "rtloop experiment "
 
 
 def derive_configuration(
-    base: Configuration, axis: str, experiment: str, parameters: dict[str, Any], run: Run, run_count: int,
-    specification: dict[str, Any], is_comparison: bool = False, reductions: Sequence[str] = (),
+    base: Configuration, axis: str, experiment: str, parameters: Mapping[str, object], run: Run, run_count: int,
+    specification: Mapping[str, object], is_comparison: bool = False, reductions: Sequence[str] = (),
 ) -> Configuration:  # fmt: skip
     """Return a copy of `base` that executes `run`: its timeline for `axis`, and its changes of the axis's plant.
 
@@ -103,7 +103,7 @@ def read_metadata(configuration: str) -> dict[str, Any] | None:
     return metadata if isinstance(metadata, dict) else None
 
 
-def _change_plant(driver: dict[str, Any], axis: str, changes: Any) -> None:
+def _change_plant(driver: dict[str, Any], axis: str, changes: Mapping[str, Mapping[str, float]]) -> None:
     """Merge `changes`, values by section and key, into the axis's plant in the table [driver], in place.
 
     An axis without an entry in `plants` gets a copy of `plant` first.

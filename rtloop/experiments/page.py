@@ -28,7 +28,7 @@ def render_report(content: Mapping[str, Any], pictures: Mapping[str, Mapping[str
     )  # fmt: skip
 
 
-def comparison_keys(rows: Sequence[Mapping[str, Any]]) -> list[str]:
+def comparison_keys(rows: Sequence[Mapping[str, object]]) -> list[str]:
     """Return the keys of HEADINGS, in its order, for which any row has a value."""
     return [key for key in HEADINGS if any(row[key] is not None for row in rows)]
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Generic, TypeVar
 
 import numpy as np
 
@@ -15,8 +15,15 @@ from rtloop.errors import ConfigError
 from rtloop.experiments.recorded_run import RecordedRun
 from rtloop.experiments.setting import Bound, Setting
 from rtloop.experiments.timeline import Run
-from rtloop.experiments.verdict import Analysis
+from rtloop.experiments.verdict import Analysis, Curves
 from rtloop.foundation.options import Options
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from rtloop.design.palette import Palette
+
+Chosen = TypeVar("Chosen", bound=Options)
 
 
 class UnsuitableLoop(Exception):
@@ -28,7 +35,7 @@ LEAST_SHARE = 1e-3
 
 
 @dataclass(frozen=True)
-class Experiment:
+class Experiment(Generic[Chosen, Curves]):
     """A procedure and the analysis of its recordings.
 
     `runs(options, setting)` plans the runs, `analyse(runs, options)` evaluates them, `draw(figure, curves, palette)`
@@ -38,13 +45,13 @@ class Experiment:
     name: str
     title: str
     description: str
-    options: type[Options]
-    runs: Callable[[Any, Setting], list[Run]]
-    analyse: Callable[[Sequence[RecordedRun], Any], Analysis]
-    draw: Callable[[Any, Mapping[str, Any], Any], None]
-    next_run: Callable[[Sequence[RecordedRun], Any, Setting], Run | None] | None = None
+    options: type[Chosen]
+    runs: Callable[[Chosen, Setting], list[Run]]
+    analyse: Callable[[Sequence[RecordedRun], Chosen], Analysis[Curves]]
+    draw: Callable[[Figure, Curves, Palette], None]
+    next_run: Callable[[Sequence[RecordedRun], Chosen, Setting], Run | None] | None = None
     """Returns a further run, planned from the recordings so far; None at the end."""
-    defaults: Mapping[str, Callable[[Setting], Any]] = field(default_factory=dict)
+    defaults: Mapping[str, Callable[[Setting], float | tuple[float, ...]]] = field(default_factory=dict)
     """Values of options that are None unless a user sets them."""
     limits: Mapping[str, Callable[[Setting], Bound]] = field(default_factory=dict)
     """Largest magnitude of an option, by the option's key."""
@@ -132,7 +139,7 @@ class Experiment:
         return limit, place
 
 
-def _scale_down(value: Any, limits: Sequence[float]) -> Any:
+def _scale_down(value: object, limits: Sequence[float]) -> float | tuple[float, ...]:
     """Return a number, or a tuple of numbers, scaled down to `limits`, the largest positive and negative magnitudes.
 
     The limits are first rounded down to two significant digits. Equal limits scale all numbers by one factor, unequal
@@ -156,6 +163,6 @@ def _round_down(limit: float) -> float:
     return math.floor(limit / step) * step
 
 
-def _value_text(value: Any) -> str:
+def _value_text(value: object) -> str:
     """Return as text a number, or a tuple of numbers separated by commas, with four significant digits each."""
     return ", ".join(f"{number:.4g}" for number in (value if isinstance(value, tuple) else (value,)))

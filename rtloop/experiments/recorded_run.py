@@ -5,7 +5,7 @@ from __future__ import annotations
 import tomllib
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, TypedDict
 
 import numpy as np
 
@@ -26,6 +26,13 @@ from rtloop.signals import Flag
 
 CENTRED = ("reference_um", "position_um", "command_um")
 """Signals that are read relative to the middle of a run's motion."""
+
+
+class Trip(TypedDict):
+    """Tick of a trip, and its causes."""
+
+    tick: int
+    causes: list[str]
 
 
 class RecordedRun:
@@ -127,7 +134,7 @@ class RecordedRun:
         )
 
     @property
-    def first_trip(self) -> dict[str, Any] | None:
+    def first_trip(self) -> Trip | None:
         """Return {tick, causes} of the first trip, `causes` being a list of texts; None without a trip."""
         for event in self.recording.events:
             if event["kind"] == "tripped":

@@ -43,7 +43,7 @@ def load_runs(paths: Sequence[Path]) -> list[RecordedRun]:
 
     Raises RecordingError for an unreadable file, and for a recording of no experiment.
     """
-    run_paths: dict[tuple[Any, ...], list[Path]] = {}
+    run_paths: dict[tuple[int, str | None], list[Path]] = {}
     for path in paths:
         header = load(path).header
         run_paths.setdefault((header["created_unix_ns"], header.get("name")), []).append(path)
@@ -90,7 +90,7 @@ def make_report(runs: Sequence[RecordedRun], on_progress: ProgressCallback = lam
 
 def _experiment_section(
     experiment: Experiment, runs: Sequence[RecordedRun], comparison_runs: Sequence[RecordedRun]
-) -> tuple[dict[str, Any], dict[str, bytes]]:
+) -> tuple[dict[str, object], dict[str, bytes]]:
     """Return the section of one experiment for JSON, and its pictures by theme.
 
     Keys: name, title, about, parameters, middle_um (the middle of the motion), reduced (a sentence for each default

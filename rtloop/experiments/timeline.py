@@ -4,9 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from rtloop.configuration.schedule import ModeName
+
+if TYPE_CHECKING:
+    from rtloop.foundation.arrays import Real
 
 Reference = Mapping[str, Any]
 APPROACH = "approach"
@@ -78,7 +81,7 @@ class Timeline:
         """Number of ticks of all segments."""
         return self.segments[-1].start_tick + self.segments[-1].ticks if self.segments else 0
 
-    def add(self, label: str, mode: ModeName, reference: Reference, duration_s: float, **values: Any) -> None:
+    def add(self, label: str, mode: ModeName, reference: Reference, duration_s: float, **values: float) -> None:
         """Append a segment of `duration_s`, at least one tick; `reference` is about 0, and moved to the middle.
 
         Before the first segment that is added, segments APPROACH are appended that lead to a middle other than 0.
@@ -90,7 +93,7 @@ class Timeline:
             self._append(APPROACH, mode, self.middle.shifted(hold(0.0), mode), APPROACH_REST_S)
         self._append(label, mode, self.middle.shifted(reference, mode), duration_s, **values)
 
-    def _append(self, label: str, mode: ModeName, reference: Reference, duration_s: float, **values: Any) -> None:
+    def _append(self, label: str, mode: ModeName, reference: Reference, duration_s: float, **values: float) -> None:
         """Append a segment of at least one tick, with `reference` unchanged."""
         ticks = max(1, round(duration_s * self._rate_hz))
         self.segments.append(Segment(label, mode, self.ticks, ticks, values))
@@ -110,13 +113,13 @@ class Timeline:
         if middle_v:
             self._append("depolarise", "raw", sine(half_v, DEPOLARISING_HZ, half_v, 90.0), half_s)
 
-    def schedule(self, axis: str) -> list[dict[str, Any]]:
+    def schedule(self, axis: str) -> list[dict[str, object]]:
         """Return entries of [[schedule]] for all segments but the first: {at_tick, axis, reference} for each, and
         {at_tick, mode} where the mode changes.
 
         A mode holds for the whole loop, not for `axis` alone.
         """
-        entries: list[dict[str, Any]] = []
+        entries: list[dict[str, object]] = []
         for previous, segment, reference in zip(self.segments, self.segments[1:], self.references[1:], strict=False):
             tick_entry = {"at_tick": segment.start_tick}
             entries.append({**tick_entry, "axis": axis, "reference": dict(reference)})
@@ -150,9 +153,9 @@ class Run:
 
     label: str
     timeline: Timeline
-    plant: Mapping[str, Any] = field(default_factory=dict)
+    plant: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
     """Changes to the simulated plant, section by section (`rtloop.hil.options.PlantOptions`)."""
     may_trip: bool = False
     """A trip is a result, not a failure."""
-    tables: Mapping[str, Any] = field(default_factory=dict)
+    tables: Mapping[str, Real] = field(default_factory=dict)
     """Samples (n, 1 or 2) by the name of the file from which its references read them."""

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Generic, TypeVar
 
 from rtloop.design.synthesis.specification import ClaimOptions
 from rtloop.design.verification.judgement import Limit
+
+Curves = TypeVar("Curves", bound=Mapping[str, object])
 
 
 @dataclass(frozen=True)
@@ -78,7 +80,7 @@ class Row:
             return ""
         return "bad" if self.is_met is False else "good" if all(answers) else "mixed"
 
-    def as_dict(self) -> dict[str, Any]:
+    def as_dict(self) -> dict[str, object]:
         """Return the row and its answers by key; `run` and `model` may be NaN or infinite.
 
         Keys: quantity, unit, asked (the limit as text), claimed (the claim's words), model, tolerance, run, met,
@@ -110,11 +112,11 @@ class Table:
 
 
 @dataclass(frozen=True)
-class Analysis:
+class Analysis(Generic[Curves]):
     """Results of one experiment's recordings."""
 
     rows: Sequence[Row]
-    curves: dict[str, Any]
+    curves: Curves
     """Curves of the picture, by name."""
     tables: Sequence[Table] = ()
     notes: Sequence[str] = field(default_factory=list)

@@ -22,7 +22,7 @@ LARGEST, SMALLEST = 1e100, 1e-100
 LARGEST_INTEGER = 2**63 - 1
 
 
-def _nested_numbers(value: Any) -> Iterator[int | float]:
+def _nested_numbers(value: object) -> Iterator[int | float]:
     """Yield the numbers of a value, True and False included: itself, or those in its nested lists and tuples.
 
     All else is ignored.
@@ -65,7 +65,7 @@ class Options(BaseModel):
         """
         return cls.model_construct()
 
-    def model_copy(self, *, update: Mapping[str, Any] | None = None, deep: bool = False) -> Self:
+    def model_copy(self, *, update: Mapping[str, object] | None = None, deep: bool = False) -> Self:
         """Return a copy as pydantic does, without the cached properties of the original; `update` is not validated."""
         copy = super().model_copy(update=update, deep=deep)
         attributes = vars(copy)

@@ -9,11 +9,13 @@ import zipfile
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import IO, Any
+from typing import IO
 
 import numpy as np
+import numpy.typing as npt
 
 from rtloop.errors import MissingExtra, OutputError, output_errors
+from rtloop.foundation.arrays import Real
 from rtloop.foundation.trusted import replace_file
 from rtloop.interchange.hdf5_signals import append_rows, create_dataset, descriptor_path
 from rtloop.interchange.to_csv import write_csv
@@ -39,7 +41,7 @@ def export(
     output: Path | str | None = None,
     progress: ReportTicks | None = None,
     selection: Selection = ALL_SIGNALS,
-) -> dict[str, Any]:
+) -> dict[str, object]:
     """Write the selected signals and ticks of a recording in format `to`, a key of EXPORT_SUFFIXES.
 
     `progress` receives the number of ticks so far; of npz, whose columns are written one after the other, the number of
@@ -173,15 +175,15 @@ def _write_hdf5(recording: Recording, file: IO[bytes], selection: Selection, pro
     return ticks
 
 
-def _add_array(archive: zipfile.ZipFile, name: str, array: np.ndarray[Any, Any]) -> None:
+def _add_array(archive: zipfile.ZipFile, name: str, array: npt.NDArray[np.generic]) -> None:
     """Write an array as a member of an npz archive."""
     with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
         np.lib.format.write_array(member, array, allow_pickle=False)
 
 
-def _join_blocks(blocks: Iterable[np.ndarray[Any, Any]]) -> Iterator[np.ndarray[Any, Any]]:
+def _join_blocks(blocks: Iterable[Real]) -> Iterator[Real]:
     """Yield the blocks, joined to ROW_GROUP rows or a little more; the last one may have fewer."""
-    pending: list[np.ndarray[Any, Any]] = []
+    pending: list[Real] = []
     for rows in blocks:
         pending.append(rows)
         if sum(map(len, pending)) >= ROW_GROUP:

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import IO, Any
+from typing import IO, TYPE_CHECKING
 
-import numpy as np
+from rtloop.foundation.arrays import Real
+
+if TYPE_CHECKING:
+    import h5py
 
 CHUNK_TICKS = 1 << 16
 COMPRESSION = {"compression": "gzip", "compression_opts": 1, "shuffle": True}
@@ -19,12 +22,12 @@ def descriptor_path(file: IO[bytes]) -> str:
     return f"/proc/self/fd/{file.fileno()}"
 
 
-def create_dataset(parent: Any, name: str) -> Any:
+def create_dataset(parent: h5py.Group, name: str) -> h5py.Dataset:
     """Create an empty, growing, compressed dataset of doubles in a group or file, and return it."""
     return parent.create_dataset(name, (0,), "<f8", maxshape=(None,), chunks=(CHUNK_TICKS,), **COMPRESSION)
 
 
-def append_rows(datasets: Sequence[Any], rows: np.ndarray[Any, Any]) -> None:
+def append_rows(datasets: Sequence[h5py.Dataset], rows: Real) -> None:
     """Append each column of `rows` (n, datasets) to the dataset at the same place in `datasets`."""
     for dataset, values in zip(datasets, rows.T, strict=True):
         length = dataset.shape[0]

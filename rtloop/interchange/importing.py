@@ -9,7 +9,7 @@ import hashlib
 import json
 import os
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from fractions import Fraction
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -73,7 +73,7 @@ def import_data(
     *,
     table: Table | None = None,
     progress: ReportTicks | None = None,
-) -> dict[str, Any]:
+) -> dict[str, object]:
     """Write the selected columns of a file, all where none is selected, as the recording `output`.
 
     `output` is by default NAME.mcap beside the file, NAME.imported.mcap for a file NAME.mcap. `table` is the file's
@@ -109,7 +109,7 @@ def import_data(
     }
 
 
-def list_columns(path: Path, table: Table, selection: ColumnSelection) -> dict[str, Any]:
+def list_columns(path: Path, table: Table, selection: ColumnSelection) -> Mapping[str, object]:
     """Return the content of a file, with unit and extremes of each column.
 
     Keys: file, rows, time, time_column, rate_hz, notes, columns, about, in_other_files; `columns` are {name, unit,
@@ -121,7 +121,7 @@ def list_columns(path: Path, table: Table, selection: ColumnSelection) -> dict[s
         {"name": name, "unit": column_unit(table, name), "grows_evenly": grows_evenly(values), **extremes(values)}
         for name, values in table.columns.items()
     ]
-    summary: dict[str, Any] = {"time": None, "rate_hz": None, "time_column": time_column(table)}
+    summary: dict[str, object] = {"time": None, "rate_hz": None, "time_column": time_column(table)}
     try:
         time_base = find_time_base(table, path, selection.time, selection.rate_hz)
         summary |= {"time": time_base.description, "rate_hz": time_base.rate_hz, "notes": time_base.notes}

@@ -13,9 +13,10 @@ import os
 import signal
 import subprocess
 import sys
+from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
-from typing import IO, Any, cast
+from typing import IO, cast
 
 import numpy as np
 
@@ -99,7 +100,7 @@ def _serve_table(path: Path, group: str | None) -> None:
     out.flush()
 
 
-def _send_line(out: IO[bytes], message: dict[str, Any]) -> None:
+def _send_line(out: IO[bytes], message: Mapping[str, object]) -> None:
     """Write a message as a line of JSON, and flush it."""
     out.write(json.dumps(message).encode() + b"\n")
     out.flush()

@@ -6,9 +6,10 @@ import io
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from typing import IO, Any
+from typing import IO
 
 import numpy as np
+import numpy.typing as npt
 
 from rtloop.foundation.arrays import Real
 from rtloop.foundation.processors import usable_processors
@@ -83,7 +84,7 @@ def _format_in_python(names: Sequence[str], rows: Real) -> bytes:
     return "".join(",".join(row) + "\n" for row in zip(*fields, strict=True)).encode("ascii")
 
 
-def _printed_values(name: str, values: Real) -> np.ndarray[Any, Any]:
+def _printed_values(name: str, values: Real) -> Real | npt.NDArray[np.int64]:
     """Return a signal's values (n,) in the type in which they are printed.
 
     int64 for a signal of COUNTS if every value has the same bytes after a conversion to int64 and back; else float64.

@@ -30,13 +30,13 @@ MAX_LAWS = 32
 REFILL = -1
 """Value of `tap_index`: the next reference fills the memory of the pre-filter."""
 
-Records = np.recarray[Any, Any]
+Records = np.recarray[tuple[int, ...], np.dtype[np.record]]
 
 LINE_BYTES = 64
 """Alignment of records. Arrays come first in a record, so that no load of four numbers crosses a cache line."""
 
 
-def cache_line_record(fields: list[Any]) -> np.dtype[Any]:
+def cache_line_record(fields: list[Any]) -> np.dtype[np.void]:
     """Return the type of a record of `fields`, padded to whole cache lines by the field `reserved`."""
     size = np.dtype(fields, align=True).itemsize
     return np.dtype([*fields, ("reserved", np.float64, (-size % LINE_BYTES // 8,))], align=True)
@@ -146,7 +146,7 @@ CONTROL = np.dtype([*((name, np.float64) for name in CONTROL_SIGNALS), *_EXTRAS]
 """Signals of an axis that a controller receives (`rtloop.laws.contract`); set in each tick, not part of the state."""
 
 
-def control_dtype(axes: int) -> np.dtype[Any]:
+def control_dtype(axes: int) -> np.dtype[np.void]:
     """Return the type of the signals for a controller of `axes` axes.
 
     With several axes, each of CONTROL_SIGNALS is an array (axes,); `inputs` and `outputs` stay (MAX_EXTRAS,).

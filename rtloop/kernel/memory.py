@@ -48,8 +48,8 @@ class LawRecords:
 
     name: str
     axes: int
-    coefficients: np.dtype[Any]
-    state: np.dtype[Any]
+    coefficients: np.dtype[np.void]
+    state: np.dtype[np.void]
     allowed_coefficients: Rules
     allowed_state: Rules
 
@@ -77,16 +77,16 @@ class Layout:
         )
 
     @cached_property
-    def coefficients(self) -> np.dtype[Any]:
+    def coefficients(self) -> np.dtype[np.void]:
         """Type of an axis's coefficients: COEFFICIENTS, then `feedforward` and `controller` as bytes."""
         return self._extend_record(COEFFICIENTS, 0)
 
     @cached_property
-    def state(self) -> np.dtype[Any]:
+    def state(self) -> np.dtype[np.void]:
         """Type of an axis's state: STATE, then `feedforward` and `controller` as bytes."""
         return self._extend_record(STATE, 1)
 
-    def _extend_record(self, axis_record: np.dtype[Any], part: int) -> np.dtype[Any]:
+    def _extend_record(self, axis_record: np.dtype[np.void], part: int) -> np.dtype[np.void]:
         """Return a type of record with the slots behind it; `part` is 0 for coefficients, 1 for state."""
         slots: tuple[Slot, ...] = ("feedforward", "controller")
         return np.dtype([*axis_record.descr, *((slot, np.uint8, (self.slot_bytes(slot)[part],)) for slot in slots)])
@@ -95,7 +95,7 @@ class Layout:
         """Return the length of a snapshot in bytes: tick, coefficients and states of the axes, state of the loop."""
         return 8 + axes * (self.coefficients.itemsize + self.state.itemsize) + LOOP_STATE.itemsize
 
-    def slot_law(self, coefficients: Any, slot: Slot) -> LawRecords | None:
+    def slot_law(self, coefficients: np.void, slot: Slot) -> LawRecords | None:
         """Return the law in a slot of an axis with these coefficients; None if a preceding axis has the controller."""
         if slot == "controller" and not coefficients["controller_axes"]:
             return None
@@ -162,7 +162,7 @@ class Layout:
         two are types), `sha256` of all these (hexadecimal text), `revision`.
         """
         tables = {"coefficients": COEFFICIENTS, "state": STATE, "loop_state": LOOP_STATE}
-        content: dict[str, Any] = {name: np.lib.format.dtype_to_descr(dtype) for name, dtype in tables.items()}
+        content: dict[str, object] = {name: np.lib.format.dtype_to_descr(dtype) for name, dtype in tables.items()}
         content["laws"] = [
             {
                 "name": law.name,
@@ -174,7 +174,7 @@ class Layout:
         ]
         return {**content, "sha256": hashlib.sha256(repr(content).encode()).hexdigest(), "revision": REVISION}
 
-    def rules(self) -> list[npt.NDArray[Any]]:
+    def rules(self) -> list[npt.NDArray[np.void]]:
         """Return the rules for coefficients of each law, in the order of the laws, as arrays of RULE records.
 
         Raises ValueError for a rule other than a range.
@@ -182,7 +182,7 @@ class Layout:
         return [_rules(law.coefficients, law.allowed_coefficients) for law in self.laws]
 
 
-def _rules(record: np.dtype[Any], allowed: Rules) -> npt.NDArray[Any]:
+def _rules(record: np.dtype[np.void], allowed: Rules) -> npt.NDArray[np.void]:
     """Return the allowed ranges of a record's whole numbers as RULE records. Raises ValueError for `Bits`."""
     rules = np.zeros(len(allowed), RULE)
     for rule, (name, limits) in zip(rules, allowed.items(), strict=True):
@@ -211,19 +211,19 @@ def require_owners(controller_axes: Sequence[int]) -> None:
         owned_axes = max(owned_axes, number + count)
 
 
-def slot_view(axis: Any, slot: Slot, dtype: np.dtype[Any]) -> Any:
+def slot_view(axis: np.void, slot: Slot, dtype: np.dtype[np.void]) -> np.record:
     """Return a law's record in the slot of an axis's record `axis`, as a view with attributes."""
     return axis[slot][: dtype.itemsize].view(dtype).view(np.recarray)[0]
 
 
-def new_records(dtype: np.dtype[Any], count: int) -> Records:
+def new_records(dtype: np.dtype[np.void], count: int) -> Records:
     """Return zeroed records (count,), aligned to cache lines, whose fields are also attributes."""
     buffer = np.zeros(count * dtype.itemsize + LINE_BYTES, np.uint8)
     begin = -buffer.ctypes.data % LINE_BYTES
     return buffer[begin : begin + count * dtype.itemsize].view(dtype).view(np.recarray)
 
 
-def copy_records(source: npt.NDArray[Any]) -> Records:
+def copy_records(source: npt.NDArray[np.void]) -> Records:
     """Return a copy of records as `new_records` makes them: aligned to cache lines."""
     copy = new_records(source.dtype, source.size)
     copy[:] = source
@@ -239,7 +239,7 @@ class LawMemory:
     def __init__(
         self,
         layout: Layout,
-        functions: npt.NDArray[Any],
+        functions: npt.NDArray[np.void],
         coefficients: Records,
         axes: Records,
         state: Records,
@@ -276,7 +276,7 @@ class LawMemory:
             record["value_v"] = record["safe_v"] = output.safe_v
             record["lowest_v"], record["highest_v"], record["axis"] = output.lowest_v, output.highest_v, output.axis
             record["mark"], record["level_um"] = output.mark, output.level_um
-        self.records: Any = new_records(LAW, 1)
+        self.records = new_records(LAW, 1)
         for name, array in self._arrays.items():
             self.records[name] = array.ctypes.data
         self.law = self.records[0]
@@ -292,8 +292,8 @@ class LawMemory:
     def create_at_rest(
         cls,
         layout: Layout,
-        functions: npt.NDArray[Any],
-        coefficients: npt.NDArray[Any],
+        functions: npt.NDArray[np.void],
+        coefficients: npt.NDArray[np.void],
         extras: Extras = NO_EXTRAS,
     ) -> LawMemory:
         """Return the memory of a loop at rest: mode OFF, outputs at their safe values, an actuator that never moved.
@@ -305,31 +305,33 @@ class LawMemory:
         axes["drive_v"] = owned_coefficients["safe_v"]
         return cls(layout, functions, owned_coefficients, axes, new_records(LOOP_STATE, 1), extras)
 
-    def copy_arrays(self) -> dict[str, npt.NDArray[Any]]:
+    def copy_arrays(self) -> dict[str, npt.NDArray[np.generic]]:
         """Return a copy of every array of the memory by name, for `restore_arrays`."""
         return {name: array.copy() for name, array in self._arrays.items()}
 
-    def restore_arrays(self, copies: dict[str, npt.NDArray[Any]]) -> None:
+    def restore_arrays(self, copies: dict[str, npt.NDArray[np.generic]]) -> None:
         """Set every array to its copy, which this memory's `copy_arrays` returned."""
         for name, array in self._arrays.items():
             array[...] = copies[name]
 
-    def slot_record(self, axis: int, slot: Slot, kind: RecordKind) -> Any:
+    def slot_record(self, axis: int, slot: Slot, kind: RecordKind) -> np.record | None:
         """Return a view of the record of the law in a slot of axis number `axis`; None if a preceding axis has it."""
         law = self.layout.slot_law(self.coefficients[axis], slot)
         records = self.coefficients if kind == "coefficients" else self.axes
         return None if law is None else slot_view(records[axis], slot, getattr(law, kind))
 
 
-def field_tables(layout: Layout, coefficients: Records, record_kind: RecordKind) -> list[list[Any]]:
+def field_tables(
+    layout: Layout, coefficients: Records, record_kind: RecordKind
+) -> list[list[tuple[str, np.dtype[np.generic], int]]]:
     """Return, for each axis, (name, dtype, offset in bytes) of every field of its coefficients or state.
 
     The fields of its laws precede the slot's own entry, which has the remaining bytes of the slot.
     """
-    tables: list[list[Any]] = []
+    tables: list[list[tuple[str, np.dtype[np.generic], int]]] = []
     for axis in coefficients:
         table = getattr(layout, record_kind)
-        rows: list[Any] = []
+        rows: list[tuple[str, np.dtype[np.generic], int]] = []
         for name, (dtype, start, *_) in table.fields.items():
             law = layout.slot_law(axis, name) if name in ("feedforward", "controller") else None
             if law is not None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -45,7 +45,7 @@ SWITCH = Allowed(0, 1)
 COUNT = Allowed(0, LARGEST)
 
 
-def require_allowed(owner: str, record: Any, allowed: Mapping[str, Allowed | Bits]) -> None:
+def require_allowed(owner: str, record: np.void, allowed: Mapping[str, Allowed | Bits]) -> None:
     """Raise ValueError, with field and value, for the first field of a record that breaks its rule in `allowed`.
 
     `owner` names the record in the message.

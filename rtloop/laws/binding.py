@@ -9,12 +9,12 @@ import re
 from collections.abc import Callable, Sequence
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
 
-from rtloop.foundation.native.compiled import UNCOMPILED, cached_address, jit_strict, native_address
+from rtloop.foundation.native.compiled import UNCOMPILED, Kernel, cached_address, jit_strict, native_address
 from rtloop.foundation.native.pointers import carray
 from rtloop.kernel.layout import FUNCTIONS, control_dtype
 from rtloop.kernel.memory import LawRecords
@@ -22,12 +22,15 @@ from rtloop.laws.contract import Law
 from rtloop.laws.purity import MEMORY, foreign_calls
 from rtloop.laws.registry import LawReference, law_class
 
+if TYPE_CHECKING:
+    from numba.core.typing.templates import Signature
+
 MAX_CHARACTERS = 300
 RETURNS_NOTHING = "No conversion from none to float64"
 """Numba's message for a function with a path without return value."""
 
 
-def bind_functions(laws: Sequence[LawReference]) -> npt.NDArray[Any]:
+def bind_functions(laws: Sequence[LawReference]) -> npt.NDArray[np.void]:
     """Return the FUNCTIONS records of these laws, in their order, compiled or loaded from the cache.
 
     The fields `output`, `update` and `enter` are addresses, 0 for an `enter` that the law lacks; the others are 0.
@@ -37,7 +40,7 @@ def bind_functions(laws: Sequence[LawReference]) -> npt.NDArray[Any]:
 
 
 @cache
-def _bind_law(reference: LawReference) -> npt.NDArray[Any]:
+def _bind_law(reference: LawReference) -> npt.NDArray[np.void]:
     """Return the FUNCTIONS record of one law, shape (1,). It is compiled and checked once in a process.
 
     Raises ValueError as `bind_functions` does.
@@ -49,7 +52,7 @@ def _bind_law(reference: LawReference) -> npt.NDArray[Any]:
     return record
 
 
-def function_signatures(law: type[Law], law_records: LawRecords) -> dict[str, Any]:
+def function_signatures(law: type[Law], law_records: LawRecords) -> dict[str, Signature]:
     """Return the numba signature of each function that a law defines, by the function's name."""
     from numba import from_dtype, types
 
@@ -100,7 +103,7 @@ def _function_address(law: type[Law], law_records: LawRecords, name: str) -> int
 
 
 @cache
-def _checked_kernel(function: Callable[..., Any]) -> Any:
+def _checked_kernel(function: Callable[..., object]) -> Kernel:
     """Return the kernel of a user law's function, with checked indices and divisions; it compiles at its first use.
 
     The cache keeps it alive, because the loop calls its address.
@@ -137,13 +140,13 @@ def _line_text(error: Exception, file: str) -> str:
     return f" ({Path(file).name}), line {lines[-1]}" if lines else ""
 
 
-def _wrap_addresses(function: Callable[..., Any], law_records: LawRecords) -> Callable[..., Any]:
+def _wrap_addresses(function: Callable[..., float | None], law_records: LawRecords) -> Callable[..., float | None]:
     """Return an uncompiled function that takes addresses of records, as the loop passes them.
 
     The last argument is the address of the signals for a controller, a number for a feedforward.
     """
 
-    def call(coefficients: int, state: int, law_input: Any) -> Any:
+    def call(coefficients: int, state: int, law_input: float) -> float | None:
         """Call the law's function with the records at these addresses; return its result."""
         control = carray(law_input, 1, control_dtype(law_records.axes))[0] if law_records.axes else law_input
         return function(

@@ -10,16 +10,16 @@ Then run pytest on it. No hardware is involved: the functions are called on reco
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from functools import cache
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
 import pytest
 
 from rtloop.foundation.arrays import Complex
-from rtloop.foundation.native.compiled import UNCOMPILED, jit_strict
+from rtloop.foundation.native.compiled import UNCOMPILED, Kernel, jit_strict
 from rtloop.kernel.layout import MAX_EXTRAS, control_dtype
 from rtloop.kernel.memory import new_records
 from rtloop.laws.binding import function_signatures
@@ -28,6 +28,9 @@ from rtloop.laws.limited_return import SATURATED, LimitedLoop, dc_gains
 from rtloop.laws.linearise import python_function
 from rtloop.laws.measured_response import measure_response
 from rtloop.laws.purity import foreign_calls
+
+if TYPE_CHECKING:
+    from numba.core.typing.templates import Signature
 
 TICKS, SEED = 400, 7
 COST_TICKS = 4_000
@@ -178,7 +181,7 @@ class LawConformance:
         for name, calls in bench.calls_by_function():
             assert not calls, f"{name}: " + "; ".join(f"{called} {reason}" for called, reason in calls.items())
 
-    def test_what_a_tick_costs(self, bench: Bench, record_property: Any) -> None:
+    def test_what_a_tick_costs(self, bench: Bench, record_property: Callable[[str, object], None]) -> None:
         """Record `ns_per_tick`, called from Python, for comparison between laws; not a limit."""
         began_ns = time.perf_counter_ns()
         deque = [value for value, _ in bench.run(COST_TICKS)]
@@ -187,7 +190,7 @@ class LawConformance:
 
 
 @cache
-def _compiled(function: Any, signature: Any) -> Any:
+def _compiled(function: Callable[..., object], signature: Signature) -> Kernel:
     """Return a kernel of `function` compiled for this signature, with checked indices and divisions."""
     kernel = jit_strict(function)
     kernel.compile(signature)
@@ -200,9 +203,9 @@ class Bench:
     def __init__(self, law: Law, compiled: bool = True) -> None:
         """Build the law's coefficients, a state of zeros, and its functions, which are compiled if `compiled`."""
         law_records, self._law = law.records(law.count), law
-        self.coefficients: Any = new_records(law_records.coefficients, 1)
+        self.coefficients = new_records(law_records.coefficients, 1)
         self.coefficients[:] = build_record(law)
-        self.state: Any = new_records(law_records.state, 1)
+        self.state = new_records(law_records.state, 1)
         self._control: Any = new_records(control_dtype(law.count), 1) if law.count else None
         self._rows = (self.coefficients[0], self.state[0])
         self._kernels: dict[str, Any] = {}
@@ -218,7 +221,7 @@ class Bench:
         with np.errstate(all="ignore"):
             return self._kernels[name](*self._rows, law_input)
 
-    def run(self, ticks: int, seed: int = SEED, wild: bool = True) -> Iterator[tuple[Any, bytes]]:
+    def run(self, ticks: int, seed: int = SEED, wild: bool = True) -> Iterator[tuple[float | tuple[float, ...], bytes]]:
         """Run `ticks` ticks with random signals; yield for each (result, bytes of the state and of the extra outputs).
 
         The result is the command in µm (for several axes a tuple), or a feedforward's drive plus its command. With
@@ -244,7 +247,7 @@ class Bench:
             self._call("update", control)
             yield value, self.state.tobytes() + control["outputs"].tobytes()
 
-    def _commands(self, control: Any) -> Any:
+    def _commands(self, control: np.record) -> float | tuple[float, ...]:
         """Call the controller's `output` with `control`; return its command, µm: a number, or a tuple (axes,)."""
         value = self._call("output", control)
         return float(value) if self._law.count == 1 else tuple(control.command_um.tolist())

@@ -29,6 +29,7 @@ from types import MappingProxyType
 from typing import Any, ClassVar
 
 import numpy as np
+import numpy.typing as npt
 
 from rtloop.kernel.layout import cache_line_record
 from rtloop.kernel.memory import LawRecords, Rules
@@ -37,7 +38,7 @@ from rtloop.laws.options import ControllerOptions, FeedforwardOptions, LawOption
 
 ANY_NUMBER = -1
 """Number of axes of a coupled controller whose class leaves it open."""
-Fields = Mapping[str, Any]
+Fields = Mapping[str, type[float] | tuple[type[float], int | tuple[int, ...]]]
 """Name of each number of a record: `float` or `int`, or (type, length) for an array, (type, shape) for a matrix."""
 _TYPES = {float: np.float64, int: np.int64}
 
@@ -50,9 +51,9 @@ class Law(ABC):
     options_model: ClassVar[type[LawOptions]] = LawOptions
     axes: ClassVar[int]
     """Number of axes: 0 for a feedforward, 1 for a controller, ANY_NUMBER if the option `axes` lists them."""
-    coefficients: ClassVar[Fields | np.dtype[Any]]
+    coefficients: ClassVar[Fields | np.dtype[np.void]]
     """Names and types of the coefficients, whose values `build` returns."""
-    state: ClassVar[Fields | np.dtype[Any]] = MappingProxyType({})
+    state: ClassVar[Fields | np.dtype[np.void]] = MappingProxyType({})
     """Names and types of the state, whose values are 0 before the first tick."""
     allowed_coefficients: ClassVar[Rules] = MappingProxyType({})
     """Allowed values of the whole-number coefficients that the functions use as counts or indices."""
@@ -87,7 +88,7 @@ class Law(ABC):
         self.channels = {name: place for names in (self.inputs, self.outputs) for place, name in enumerate(names)}
 
     @abstractmethod
-    def build(self) -> Mapping[str, Any]:
+    def build(self) -> Mapping[str, object]:
         """Return a value for each coefficient, by name; arrays may be shorter than their fields, whose rest is 0.
 
         Raises ValueError for options without a solution.
@@ -172,7 +173,7 @@ class Feedforward(Law):
         """Advance the memory by the applied drive; return the command in µm that corresponds to it."""
 
 
-def record_type(fields: Fields | np.dtype[Any]) -> np.dtype[Any]:
+def record_type(fields: Fields | np.dtype[np.void]) -> np.dtype[np.void]:
     """Return a dtype unchanged; for a dict of names and types, a record padded to whole cache lines.
 
     The record's fields are in the order of their number of elements, largest first.
@@ -200,7 +201,7 @@ def _announce(law: Law) -> None:
         announce(law.kind, reference.file if reference is not None else type(law).__module__)
 
 
-def build_record(law: Law) -> Any:
+def build_record(law: Law) -> npt.NDArray[np.void]:
     """Return the coefficients that a law builds, shape (1,).
 
     A shipped law may leave names out: their values, and those behind a shorter array, are 0. Raises ValueError for a

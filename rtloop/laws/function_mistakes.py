@@ -9,7 +9,7 @@ import ast
 import builtins
 from collections.abc import Collection, Iterator, Mapping
 from difflib import get_close_matches
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from rtloop.kernel.layout import control_dtype
 from rtloop.laws.contract import Feedforward, Law
@@ -50,7 +50,7 @@ class _Parameter(NamedTuple):
     undefined: tuple[str, ...] = ()
 
 
-def mistakes_in_function(function: ast.FunctionDef, law: type[Law], names: Mapping[str, Any]) -> Iterator[Mistake]:
+def mistakes_in_function(function: ast.FunctionDef, law: type[Law], names: Mapping[str, object]) -> Iterator[Mistake]:
     """Yield the mistakes in one function of a law; if its parameters are wrong, this mistake alone.
 
     `names` are the names that its module defines.
@@ -108,7 +108,7 @@ def _wrong_fields(function: ast.FunctionDef, parameters: Mapping[str, _Parameter
 
 
 def _unknown_names(
-    function: ast.FunctionDef, parameters: Collection[str], names: Mapping[str, Any]
+    function: ast.FunctionDef, parameters: Collection[str], names: Mapping[str, object]
 ) -> Iterator[Mistake]:
     """Yield a mistake for each name that is undefined, and for each builtin function of WAITING, such as `open`.
 

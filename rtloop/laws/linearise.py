@@ -116,7 +116,7 @@ class _Tick:
     def __init__(self, law: Controller) -> None:
         """Build the coefficients of the law. Raises ValueError as `build_record` does."""
         records = law.records(law.count)
-        self._coefficients: Any = build_record(law).view(np.recarray)[0]
+        self._coefficients: np.record = build_record(law).view(np.recarray)[0]
         self._state = new_records(records.state, 1)
         self._fields = [name for name in records.state.names or () if records.state[name].base == np.float64]
         self._fields = [name for name in self._fields if name not in ("reserved", "scratch")]

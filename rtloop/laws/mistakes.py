@@ -10,7 +10,7 @@ import ast
 import inspect
 from collections.abc import Iterator, Mapping
 from difflib import get_close_matches
-from typing import Any
+from typing import TypeGuard
 
 from rtloop.laws.contract import Law, record_type
 from rtloop.laws.function_mistakes import PER_TICK, Mistake, mistakes_in_function
@@ -19,7 +19,7 @@ from rtloop.laws.options import LawOptions
 BASES = ("Controller", "CoupledController", "Feedforward")
 
 
-def find_mistakes(text: str, names: Mapping[str, Any]) -> Iterator[Mistake]:
+def find_mistakes(text: str, names: Mapping[str, object]) -> Iterator[Mistake]:
     """Yield the mistakes in the laws of a text, law by law: in records, or else in options and then in functions.
 
     `names` are the names that the text defines when it runs.
@@ -36,7 +36,7 @@ def find_mistakes(text: str, names: Mapping[str, Any]) -> Iterator[Mistake]:
                 yield from sorted(mistakes_in_function(function, law, names))
 
 
-def missing_law(text: str, names: Mapping[str, Any]) -> Mistake | None:
+def missing_law(text: str, names: Mapping[str, object]) -> Mistake | None:
     """Return the mistake for which the first class that resembles a law is none: a function or the base is missing.
 
     `names` are the names that the text defines when it runs. None if no class resembles a law.
@@ -52,7 +52,7 @@ def missing_law(text: str, names: Mapping[str, Any]) -> Mistake | None:
     return None
 
 
-def _classes(text: str, names: Mapping[str, Any]) -> Iterator[tuple[ast.ClassDef, Any]]:
+def _classes(text: str, names: Mapping[str, object]) -> Iterator[tuple[ast.ClassDef, object]]:
     """Yield each class at the top level of a text with the object of its name in `names`, None if it is absent."""
     for node in ast.parse(text).body:
         if isinstance(node, ast.ClassDef):
@@ -65,7 +65,7 @@ def _suggestion(name: str, lines: Mapping[str, int]) -> str:
     return f"; is `{near[0]}` in line {lines[near[0]]} meant?" if near else ""
 
 
-def _is_law(candidate: Any) -> bool:
+def _is_law(candidate: object) -> TypeGuard[type[Law]]:
     """Whether an object is a subclass of Law."""
     return isinstance(candidate, type) and issubclass(candidate, Law)
 
@@ -85,7 +85,7 @@ def _wrong_records(node: ast.ClassDef, law: type[Law]) -> Iterator[Mistake]:
             yield Mistake(lines.get(name, node.lineno), f"{name}: {error}")
 
 
-def _wrong_options(node: ast.ClassDef, law: type[Law], names: Mapping[str, Any]) -> Iterator[Mistake]:
+def _wrong_options(node: ast.ClassDef, law: type[Law], names: Mapping[str, object]) -> Iterator[Mistake]:
     """Yield a mistake for a law that does not name the options that its text defines."""
     classes = [item for item in names.values() if isinstance(item, type) and item.__module__ == law.__module__]
     options = [item.__name__ for item in classes if issubclass(item, LawOptions)]

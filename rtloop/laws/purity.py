@@ -3,7 +3,12 @@
 from __future__ import annotations
 
 import re
-from typing import Any
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from numba.core.typing.templates import Signature
+
+    from rtloop.foundation.native.compiled import Kernel
 
 _DEFINED = re.compile(r'^define [^@]*@"?([^"(]+)"?\(.*?^\}', re.MULTILINE | re.DOTALL)
 _CALLED = re.compile(r'\b(?:call|invoke)\b[^@\n]*@"?([^"(]+)"?\(')
@@ -27,7 +32,7 @@ _LIBRARY = _MATHEMATICS | {
 """Mathematical functions of the C library; each also exists for numbers of 32 bits, with the suffix `f`."""
 
 
-def foreign_calls(kernel: Any, signature: Any, libm: bool = False) -> dict[str, str]:
+def foreign_calls(kernel: Kernel, signature: Signature, libm: bool = False) -> dict[str, str]:
     """Return the reason for each forbidden call of a kernel compiled for `signature`, by the called function's name.
 
     {} if there is none; `libm` allows the mathematical library.

@@ -11,13 +11,12 @@ import inspect
 import re
 import sys
 import traceback
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from importlib import import_module
 from pathlib import Path
 from types import ModuleType
-from typing import Any
 
 from rtloop.kernel.memory import Layout
 from rtloop.laws.contract import Law
@@ -53,7 +52,7 @@ class LawReference:
         """SHA-256 of the text; None for a shipped law."""
         return hashlib.sha256(self.text.encode()).hexdigest() if self.text else None
 
-    def restore_options(self, values: dict[str, Any]) -> LawOptions:
+    def restore_options(self, values: Mapping[str, object]) -> LawOptions:
         """Return the law's options with `values`, bound to this law.
 
         Raises ValueError for values that are not allowed, and as `law_class` does.

@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from functools import cached_property
 from numbers import Real as RealNumber
 from pathlib import Path
-from typing import Any, NamedTuple, Self, overload
+from typing import NamedTuple, Self, overload
 
 import numpy as np
 
@@ -19,6 +19,7 @@ from rtloop.recording.errors import RecordingError
 from rtloop.recording.file.reader import Reader, Rows, Snapshot
 from rtloop.recording.file.run_readers import missing_parts, open_run
 from rtloop.recording.file.topics.events import Event
+from rtloop.recording.file.topics.format import Header, Totals
 from rtloop.recording.file.topics.overview import Overview, Range
 from rtloop.signals import DEADLINE
 
@@ -30,7 +31,7 @@ class Extent(NamedTuple):
     """
 
     first_tick: int
-    totals: dict[str, Any] | None
+    totals: Totals | None
     repeated: int
 
 
@@ -67,7 +68,7 @@ class RecordedSignals:
         self.left_out: list[str] = []
         with open_run(paths) as readers:
             self.paths = tuple(reader.path for reader in readers)
-            self.header: dict[str, Any] = readers[0].header
+            self.header: Header = readers[0].header
             self.columns: tuple[str, ...] = readers[0].columns
             self.events: list[Event] = [event for reader in readers for event in reader.events]
             self.extents = tuple(Extent(reader.first_tick, reader.totals, reader.repeated_ticks) for reader in readers)

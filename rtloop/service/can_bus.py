@@ -12,8 +12,8 @@ import contextlib
 import logging
 import threading
 import time
-from collections.abc import Callable, Iterator
-from typing import Any
+from collections.abc import Callable, Iterator, Mapping
+from typing import TYPE_CHECKING
 
 from rtloop import errors, signals
 from rtloop.drivers.can.options import BusOptions
@@ -24,6 +24,12 @@ from rtloop.recording.file.topics.events import OPERATOR
 from rtloop.service.desk import Refusal, Requester, use_requester
 from rtloop.service.service import Service, State
 from rtloop.signals import Mode
+
+if TYPE_CHECKING:  # The packages may be missing.
+    import can
+
+    from rtloop.drivers.can.frames import Frame
+    from rtloop.foundation.arrays import Real
 
 COMMANDS = {"Setpoint": ("Axis", "Value"), "Mode": ("Mode",), "TripReset": ("Confirm",)}
 """Frames that are received, each with its signals in the order of their bits."""
@@ -80,7 +86,7 @@ def can_supervision(service: Service) -> Iterator[None]:
         bus.shutdown()
 
 
-def _require_frames(frames: dict[str, Any], options: BusOptions) -> None:
+def _require_frames(frames: Mapping[str, Frame], options: BusOptions) -> None:
     """Raise ValueError, which names the DBC file, unless `frames`, by name, have all REPORTS and COMMANDS.
 
     Each must have its number of signals, too.
@@ -99,10 +105,10 @@ class CanSupervision:
     `frames` has the frames of the DBC by name. `refused_count` is the number of command frames that were not executed.
     """
 
-    def __init__(self, service: Service, options: BusOptions, bus: Any, frames: dict[str, Any]) -> None:
+    def __init__(self, service: Service, options: BusOptions, bus: can.BusABC, frames: Mapping[str, Frame]) -> None:
         """Prepare `send_frames` and `receive_frames` on the open `bus`; `frames` are those of the DBC, by name."""
         self._service, self._options, self._bus, self._frames = service, options, bus, frames
-        self._commands: dict[int, tuple[Any, Callable[..., object]]] = {
+        self._commands: dict[int, tuple[Frame, Callable[..., object]]] = {
             frames[name].identifier: (frames[name], command)
             for name, command in (
                 ("Setpoint", self._set_setpoint),
@@ -151,7 +157,7 @@ class CanSupervision:
             if message is not None and message.arbitration_id in self._commands:
                 self._execute_frame(message)
 
-    def _execute_frame(self, message: Any) -> None:
+    def _execute_frame(self, message: can.Message) -> None:
         """Execute `message`, a received frame of COMMANDS; a refusal or error is logged and counted in `refused_count`,
         never raised.
         """
@@ -206,7 +212,7 @@ class CanSupervision:
         with self._service.lock.hold(OPERATOR, Origin.CAN):
             self._service.reset()
 
-    def _newest_record(self) -> Any:
+    def _newest_record(self) -> Real | None:
         """Return the newest record (columns,), None without a loop or before its first tick."""
         supervisor = self._service.supervisor
         return None if supervisor is None else supervisor.latest()

@@ -13,9 +13,10 @@ from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from contextvars import ContextVar
 from dataclasses import dataclass
-from typing import Any, cast
+from typing import cast
 
 import numpy as np
+import numpy.typing as npt
 
 from rtloop.engine.commands import send, withdraw
 from rtloop.engine.memory import SharedBlock
@@ -148,7 +149,7 @@ class Desk:
         """
         timeout_s = ANSWER_TIMEOUT_S + ANSWER_PERIODS * self._period_s
         ring, deadline = self._block.ring("events"), time.monotonic() + timeout_s
-        events: np.ndarray[Any, Any] = np.zeros(64, MESSAGE)
+        events: npt.NDArray[np.void] = np.zeros(64, MESSAGE)
         while time.monotonic() < deadline:
             event_count, first, _ = drain(ring, cursor, events)
             cursor = int(first) + event_count

@@ -14,7 +14,6 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Any
 
 from rtloop.engine.messages import Origin
 from rtloop.recording.file.topics.events import OPERATOR
@@ -46,7 +45,7 @@ class Lock:
         self._holder: _LockHolder | None = None
 
     @property
-    def holder(self) -> dict[str, Any] | None:
+    def holder(self) -> dict[str, object] | None:
         """{name, since_unix_s, until_unix_s: end without a further command}, in s since 1970; None for a free lock."""
         with self._guard:
             holder = self._current_holder()

@@ -17,7 +17,6 @@ from collections.abc import Callable
 from dataclasses import replace
 from enum import StrEnum
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -585,7 +584,7 @@ class Service:
             )
         return replace(configuration, laws=loaded)
 
-    def reload_now(self) -> dict[str, Any]:
+    def reload_now(self) -> dict[str, list[str]]:
         """Read the configuration file again and apply it to the loop, after any reload in progress.
 
         Returns {changed: ["axis.NAME", …]}, the axes that changed, [] if none or without a loop. Raises ConfigError,

@@ -18,7 +18,7 @@ from rtloop.supervision.recording_state import recording_state
 WINDOW_TICKS = 10_000
 
 
-def status(service: Service) -> dict[str, Any]:
+def status(service: Service) -> dict[str, object]:
     """Return the content of `/status`: {name, state, armed, faults, lock: the lock's holder, measuring, recovery,
     ticks, realtime, recording, recorder_replacements, restarts: number of ended runs}, and the keys of `timing` and
     `newest_signals`, or in `no_signals` the reason why there are none.
@@ -28,7 +28,7 @@ def status(service: Service) -> dict[str, Any]:
     loop, `ticks` and `recorder_replacements` are 0, and `realtime` and `recording` are {}.
     """
     supervisor = service.supervisor
-    report: dict[str, Any] = {
+    report: dict[str, object] = {
         "name": service.configuration.name,
         "state": service.state.value,
         "armed": service.armed,
@@ -56,7 +56,7 @@ def _reason_without_signals(service: Service) -> str:
     return "the loop has not executed a tick yet"
 
 
-def running_configuration(service: Service) -> dict[str, Any]:
+def running_configuration(service: Service) -> dict[str, object]:
     """Return the running configuration with all changes, the columns of a record, and the paths of shared block and
     recordings: {folder, values, name, rate_hz, columns, block, recordings}.
 

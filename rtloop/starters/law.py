@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import tomllib
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from rtloop.starters.templates import fill_template
 
@@ -42,7 +42,7 @@ def _stage_text(name: str, stage: Configuration) -> str:
 
     table = tomllib.loads(stage.text)
     axis = table["axis"][0]
-    old: dict[str, Any] = axis.get("controller", {})
+    old: dict[str, object] = axis.get("controller", {})
     gains = {key: old[key] for key in ("kp", "ki_per_s") if key in old} if old.get("kind") == "pid" else {}
     axis.pop("prefilter", None)
     axis["controller"] = {"file": f"{name}.py", "ki_per_s": SLOW_KI_PER_S, **gains}

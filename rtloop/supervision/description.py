@@ -7,9 +7,9 @@ import os
 import platform
 import sys
 import time
+from collections.abc import Mapping
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any
 
 from rtloop.configuration.prepare import Prepared
 from rtloop.configuration.recording import event_window
@@ -20,7 +20,7 @@ FORMAT, FORMAT_EVENT_WINDOW = 1, 2
 PACKAGES = ("rtloop", "numpy", "numba", "llvmlite", "mcap", "zstandard")
 
 
-def recording_header(prepared: Prepared, realtime: dict[str, Any]) -> dict[str, Any]:
+def recording_header(prepared: Prepared, realtime: Mapping[str, object]) -> dict[str, object]:
     """Return the header of a recording of `prepared`, which begins now, as JSON values.
 
     Keys: format, name, created_unix_ns, axes, observed, columns, rate_hz, paced, ticks_expected, mode, configuration
@@ -68,7 +68,7 @@ def recording_header(prepared: Prepared, realtime: dict[str, Any]) -> dict[str, 
     }
 
 
-def _law_description(plan: Plan) -> dict[str, Any]:
+def _law_description(plan: Plan) -> dict[str, object]:
     """Return the layout of the loop's laws as JSON values: `Layout.description`.
 
     In its list `laws`, a user's law also has its `sha256`, `text` (for a replay without file) and `file`.

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import os
 from dataclasses import dataclass
-from typing import Any
 
 from pydantic import Field, ValidationError
 
@@ -71,7 +70,7 @@ class SpentMargin:
         )
 
 
-def store_host_delay(configuration: Configuration, **figures: Any) -> None:
+def store_host_delay(configuration: Configuration, **figures: object) -> None:
     """Store measured `figures` (fields of HostDelay) for the configuration's rate in the file of `_file_name`.
 
     Other figures stored for this rate stay; those for another rate are replaced. Raises OutputError if the system

@@ -12,7 +12,7 @@ import re
 import time
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from rtloop.errors import RtloopError
 from rtloop.foundation.trusted import is_own, open_own
@@ -64,7 +64,7 @@ class Removal(NamedTuple):
         return f"{self.file} was removed: {self.reason}"
 
     @property
-    def event_details(self) -> dict[str, Any]:
+    def event_details(self) -> dict[str, str | int]:
         """Details of the event that records the removal: {file: name, size_bytes, reason}."""
         return {"file": self.file.name, "size_bytes": self.size_bytes, "reason": self.reason}
 

@@ -49,7 +49,7 @@ class RecorderKeeper:
         `names` is the table of the names of clients that send commands, which a new recorder inherits.
         """
         self._child, self._block, self._names, self._path, self._options = child, block, names, path, options
-        self._header: dict[str, Any] = {}
+        self._header: dict[str, object] = {}
         self._watch = StallWatch(STALL_S, LONGEST_STEP_S)
         self._has_orders = False
         self._finishing = threading.Event()
@@ -75,7 +75,7 @@ class RecorderKeeper:
         return self._block.load(Word.RECORDER_STATE)
 
     @property
-    def written_state(self) -> dict[str, Any]:
+    def written_state(self) -> dict[str, str | int]:
         """{file: path of the run's recording, written_ticks: number of ticks in its files plus lost ones before}."""
         return {"file": str(self._path.resolve()), "written_ticks": self._block.load(Word.FLUSHED_TICKS)}
 
@@ -190,7 +190,7 @@ class RecorderKeeper:
             self._child, self._has_orders = Child(MODULE, self._block.fd, names=self._names.fd), False
             self._watch = StallWatch(STALL_S, LONGEST_STEP_S)
 
-    def _finish(self) -> dict[str, Any]:
+    def _finish(self) -> dict[str, object]:
         """Wait for the recorder's end, repair unfinished files, enforce the quota, and return the value for `totals`.
 
         A recorder that does not end within END_TIMEOUT_S is killed. Repairs and removals are added to `notes`.
@@ -234,7 +234,7 @@ class RecorderKeeper:
         except OSError as error:
             self.notes.append(f"{part}: the recording is recovered, but this file cannot be removed: {error.strerror}")
 
-    def _newest_report(self) -> dict[str, Any]:
+    def _newest_report(self) -> dict[str, object]:
         """Return the recorder's newest report since the last call, {} without one; older reports are dropped."""
         reports = self._child.reports()
         return reports[-1] if reports else {}

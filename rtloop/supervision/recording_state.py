@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Callable
-from typing import Any
+from typing import TypedDict
 
 from rtloop.engine.memory import SharedBlock, Word
 from rtloop.errors import LOW_SPACE
@@ -21,7 +21,16 @@ QUIET_S = 1.0
 """A gap ends after this time without a fault."""
 
 
-def recording_state(block: SharedBlock) -> dict[str, Any]:
+class RecordingState(TypedDict):
+    """Whether ticks are recorded now; the fields are described at `recording_state`."""
+
+    state: str
+    reason: str | None
+    since_tick: int | None
+    ticks_lost: int
+
+
+def recording_state(block: SharedBlock) -> RecordingState:
     """Return {state: "recording" or "not recording", reason, since_tick: first tick without record, ticks_lost}.
 
     `ticks_lost` counts all ticks of the loop that are in no file. `reason` and `since_tick` are None while recording.

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from rtloop.configuration.prepare import Prepared, refuse_simulated_lateness
 from rtloop.configuration.recording import ring_sizes
@@ -24,6 +25,7 @@ from rtloop.engine.memory import ProcessState, SharedBlock, Word
 from rtloop.engine.messages import MESSAGE, Kind
 from rtloop.engine.ring import drain
 from rtloop.errors import LoopFault, RtloopError, UnavailableError
+from rtloop.foundation.arrays import Real
 from rtloop.foundation.native.cache import stored_file_count
 from rtloop.recording.capture.requester_names import RequesterNames
 from rtloop.recording.file.topics.events import law_label, trip_reason
@@ -120,7 +122,7 @@ class Supervisor:
         self.prepared = prepared
         options = prepared.configuration.recording
         self.block = SharedBlock.create(ring_sizes(options.around, prepared.plan.sizes), processes.fd)
-        self.realtime: dict[str, Any] = {}
+        self.realtime: dict[str, object] = {}
         self.startup_s: float | None = None
         self.ended = False
         """Whether the loop has ended and its outputs are parked, or could not be; its files may take longer."""
@@ -145,12 +147,12 @@ class Supervisor:
         """Number of executed ticks."""
         return int(self.block["ticks_head"][0])
 
-    def latest(self) -> np.ndarray[Any, Any] | None:
+    def latest(self) -> Real | None:
         """Return a copy of the newest record (columns,), None before the first tick."""
         rows = self.newest(1)
         return rows[-1] if len(rows) else None
 
-    def newest(self, count: int) -> np.ndarray[Any, Any]:
+    def newest(self, count: int) -> Real:
         """Return a copy of up to `count` newest records (n, columns), oldest first; n is 0 before the first tick."""
         ring = self.block.ring("ticks")
         rows = np.empty((count, ring.slots.shape[1]))
@@ -164,7 +166,7 @@ class Supervisor:
         None for a trip without a reason, and if there is no trip in the ring of newest events.
         """
         ring = self.block.ring("events")
-        events: np.ndarray[Any, Any] = np.zeros(ring.slots.size, MESSAGE)
+        events: npt.NDArray[np.void] = np.zeros(ring.slots.size, MESSAGE)
         copied, _, _ = drain(ring, max(int(ring.head[0]) - events.size, 0), events)
         plan = self.prepared.plan
         trips = [event for event in events[:copied] if event["kind"] == Kind.TRIPPED]

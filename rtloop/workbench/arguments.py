@@ -21,14 +21,14 @@ FileName = str | Path
 """The name of a file."""
 
 
-def as_path(value: Any, argument: str) -> Path:
+def as_path(value: object, argument: str) -> Path:
     """Return a file's name as a path. Raises RtloopError, which begins with `argument`, for another or empty value."""
     if not isinstance(value, str | Path) or "\0" in str(value) or not str(value):
         raise RtloopError(f"{argument}: value is {value!r}; allowed: the name of a file")
     return Path(value)
 
 
-def as_paths(value: Any, argument: str) -> list[Path]:
+def as_paths(value: object, argument: str) -> list[Path]:
     """Return one file's name, or a sequence of names, as a list of paths; [] for an empty sequence.
 
     Raises RtloopError, which begins with `argument`, for other values.
@@ -52,7 +52,7 @@ def load_configuration(configuration: FileName | Configuration, argument: str) -
     return load(as_path(configuration, f"{argument}: configuration"))
 
 
-def recording_paths(value: Any, argument: str) -> list[Path]:
+def recording_paths(value: object, argument: str) -> list[Path]:
     """Return the files of a recording: of a loaded one, or of the name or names of its files.
 
     Raises RtloopError, which begins with `argument`, for another value, for an empty list, and for a part of a
@@ -70,7 +70,7 @@ def recording_paths(value: Any, argument: str) -> list[Path]:
     return paths
 
 
-def single_files(value: Any, argument: str) -> list[Path]:
+def single_files(value: object, argument: str) -> list[Path]:
     """Return the one file of each recording in `value`: a recording, the name of its file, or a list of these.
 
     Raises RtloopError, which begins with `argument`, for another value, an empty list, a part of a recording, and a
@@ -91,14 +91,14 @@ def single_files(value: Any, argument: str) -> list[Path]:
     return paths
 
 
-def require_seconds(value: Any, argument: str) -> float:
+def require_seconds(value: object, argument: str) -> float:
     """Return a finite number of seconds above 0 as float. Raises RtloopError, naming `argument`, for another value."""
     if not isinstance(value, Real) or isinstance(value, bool) or not 0 < float(value) < math.inf:
         raise RtloopError(f"{argument}: value is {value!r}; allowed: a finite number of seconds above 0")
     return float(value)
 
 
-def require_count(value: Any, argument: str, least: int, largest: int | None = None) -> None:
+def require_count(value: object, argument: str, least: int, largest: int | None = None) -> None:
     """Raise RtloopError, naming `argument`, unless `value` is a whole number from `least` to `largest`, both included.
 
     `largest` None: there is no largest one.
@@ -123,7 +123,7 @@ def require_numbers(value: Any, argument: str) -> list[float]:
     return numbers
 
 
-def require_names(value: Any, argument: str) -> list[str]:
+def require_names(value: object, argument: str) -> list[str]:
     """Return one name, or a list or tuple of names, as a list. Raises RtloopError, naming `argument`, for others."""
     names = [value] if isinstance(value, str) else value
     if not isinstance(names, list | tuple) or not all(isinstance(name, str) for name in names):
@@ -131,7 +131,7 @@ def require_names(value: Any, argument: str) -> list[str]:
     return list(names)
 
 
-def require_choice(value: Any, argument: str, allowed: Sequence[str]) -> None:
+def require_choice(value: object, argument: str, allowed: Sequence[str]) -> None:
     """Raise RtloopError, naming `argument`, for a value that is not one of `allowed`."""
     if value not in allowed:
         raise RtloopError(f"{argument}: value is {value!r}; allowed: {', '.join(map(repr, allowed))}")

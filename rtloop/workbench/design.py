@@ -231,7 +231,7 @@ def _slicot_gamma(synthesis: Synthesis, design: DesignOptions) -> float:
     return slicot_gamma(augment(design.plant.transfer(), synthesis.weights), 10 * synthesis.hinf.gamma_opt)[0]
 
 
-def controller_fields(controller: Transfer) -> dict[str, Any]:
+def controller_fields(controller: Transfer) -> dict[str, object]:
     """Return {gain, zeros, poles} of a controller for JSON; the roots as lists of [real, imaginary], in 1/s."""
     roots = {"zeros": controller.zeros, "poles": controller.poles}
     fields = {name: [[root.real, root.imag] for root in values] for name, values in roots.items()}

@@ -36,6 +36,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from rich.console import Console
 
+    from rtloop.design.identification.frequency_response import Agreement
+
 
 @dataclass(repr=False, eq=False)
 class DynamicsResult(IdentifiedModel):
@@ -54,7 +56,7 @@ class DynamicsResult(IdentifiedModel):
     excitation: Excitation
     actuator: PlayModel | None
     response: FrequencyResponse | None
-    comparison: Any
+    comparison: Agreement | None
     warnings: list[str]
 
     @property

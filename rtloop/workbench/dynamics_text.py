@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 from rtloop.design.identification.frequency_response import SEGMENT_S
@@ -14,7 +15,7 @@ if TYPE_CHECKING:
     from rich.console import Console
 
 
-def print_dynamics(out: Console, report: dict[str, Any]) -> None:
+def print_dynamics(out: Console, report: Mapping[str, Any]) -> None:
     """Print orders that were tried, modes with their uncertainty, tests of the residuals, and a measured response.
 
     `report` is the object of `DynamicsResult.as_dict`.
@@ -74,7 +75,7 @@ def print_dynamics(out: Console, report: dict[str, Any]) -> None:
     print_files(out, report)
 
 
-def _print_response(out: Console, comparison: dict[str, Any] | None) -> None:
+def _print_response(out: Console, comparison: Mapping[str, float] | None) -> None:
     """Print the deviation of the model from a measured frequency response; for None, print no line."""
     if comparison:
         out.print(

@@ -46,7 +46,7 @@ class HysteresisResult(IdentifiedModel):
     fit: HysteresisFit
     runs: list[AxisRecording]
     judgements: tuple[list[Judgement], list[Judgement]]
-    extra: dict[str, Any]
+    extra: dict[str, object]
     warnings: list[str]
 
     @property
@@ -149,7 +149,7 @@ def fit_hysteresis(
         if is_from_rest:
             fit = identify_hysteresis(runs, operators, placement, thresholds, weights)
             fitted, validating = evaluate_from_rest(runs, fit, validation_runs)
-            extra: dict[str, Any] = {"unexplained_um": unexplained_um(runs, fit)}
+            extra: dict[str, object] = {"unexplained_um": unexplained_um(runs, fit)}
         else:
             parts_fit = identify_from_parts(runs, operators, placement, thresholds, weights, validation_runs)
             fit, fitted, validating = parts_fit.hysteresis, parts_fit.judgements, parts_fit.other_judgements
@@ -172,7 +172,7 @@ def read_distinct_runs(
     return runs
 
 
-def _parts_fields(fit: PartsFit) -> dict[str, Any]:
+def _parts_fields(fit: PartsFit) -> dict[str, object]:
     """Return the fields of the report that only recordings with unknown memory have.
 
     `terms` are the effects that were fitted beside the plays and left out of the model, such as creep; `creep_um` is

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -11,7 +12,7 @@ if TYPE_CHECKING:
     from rich.console import Console
 
 
-def print_hysteresis(out: Console, report: dict[str, Any]) -> None:
+def print_hysteresis(out: Console, report: Mapping[str, Any]) -> None:
     """Print thresholds, weights, errors, and the measured and the model's relative loop height h/H.
 
     `report` is the object of `HysteresisResult.as_dict`.
@@ -44,7 +45,7 @@ def print_hysteresis(out: Console, report: dict[str, Any]) -> None:
     print_files(out, report)
 
 
-def _print_held_out(out: Console, report: dict[str, Any]) -> None:
+def _print_held_out(out: Console, report: Mapping[str, Any]) -> None:
     """Print the model's error on each held-out recording and over all of them.
 
     After a fit of recordings whose state of the hysteresis at the start is unknown (`tried_um` in the report), it also
@@ -86,13 +87,13 @@ def _print_held_out(out: Console, report: dict[str, Any]) -> None:
         out.print(f"this model is valid for strokes of up to {report['stroke_v']:.4g} V{missing}")
 
 
-def _rms_text(error: dict[str, Any]) -> str:
+def _rms_text(error: Mapping[str, float | None]) -> str:
     """Return `rms_um`, and `std_um` unless it is None, as text without a unit: `0.12 ± 0.03 (1σ)`."""
     std_um = error["std_um"]
     return f"{error['rms_um']:.3g}" + ("" if std_um is None else f" ± {std_um:.2g} (1σ)")
 
 
-def print_files(out: Console, report: dict[str, Any]) -> None:
+def print_files(out: Console, report: Mapping[str, object]) -> None:
     """Print the paths of the files that a report names as written, `output` and `plot`; no line for None or no key."""
     for key in ("output", "plot"):
         if report.get(key):

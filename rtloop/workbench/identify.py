@@ -61,7 +61,7 @@ def identify(
     outside: Sequence[str] = (),
     compare: RecordedRun | None = None,
 ) -> DynamicsResult: ...
-def identify(recordings: Any, kind: str = "hysteresis", **options: Any) -> HysteresisResult | DynamicsResult:
+def identify(recordings: object, kind: str = "hysteresis", **options: Any) -> HysteresisResult | DynamicsResult:
     """Identify the actuator's hysteresis, or the dynamics of an axis (`kind` "dynamics"), from recordings.
 
     Hysteresis is fitted to all recordings; dynamics are fitted to the first and validated with the others. No file is
@@ -81,7 +81,7 @@ def identify(recordings: Any, kind: str = "hysteresis", **options: Any) -> Hyste
     return fit(single_files(recordings, "identify: recordings"), **options)
 
 
-def _checked_option(name: str, value: Any) -> Any:
+def _checked_option(name: str, value: object) -> object:
     """Return the value of option `name`, with recordings and files as paths.
 
     Raises RtloopError for a value that is not allowed. The name, and the value of `axis`, are not checked.

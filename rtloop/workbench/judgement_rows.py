@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from rtloop.design.identification.hysteresis.judgement import Judgement
 
 
-def judgement_row(judgement: Judgement, fitted: bool) -> dict[str, Any]:
+def judgement_row(judgement: Judgement, fitted: bool) -> dict[str, object]:
     """Return the report's row on the model's held-out error in one recording, which is `fitted` or validates only.
 
     Keys: recording (name), fitted, rms_error_um, as_written_rms_um (of the plays alone), max_error_um, range_um (of the
@@ -37,7 +37,7 @@ def judgement_row(judgement: Judgement, fitted: bool) -> dict[str, Any]:
     }
 
 
-def validation_comments(rows: Sequence[dict[str, Any]], extra: dict[str, Any]) -> list[str]:
+def validation_comments(rows: Sequence[Mapping[str, Any]], extra: Mapping[str, Any]) -> list[str]:
     """Return comment lines for the model's section of a configuration.
 
     The first states the largest held-out error of `rows` (of `judgement_row`; one at least has a judged part). From

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -12,6 +12,7 @@ from rtloop.analysis.step_response import SETTLING_BAND, step_response
 from rtloop.design.figures import create_figure, label_panel
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 LEAST_HZ = 0.01
@@ -39,7 +40,7 @@ def draw_loops(loops: Mapping[str, Mapping[str, Loop]]) -> Figure:
     return figure
 
 
-def _draw_responses(open_panel: Any, sensitivity_panel: Any, loop: Loop, label: str, color: str) -> None:
+def _draw_responses(open_panel: Axes, sensitivity_panel: Axes, loop: Loop, label: str, color: str) -> None:
     """Draw |L| and |S| of a loop over its own frequencies, for a sampled loop up to 0.49 times its rate."""
     hz = loop.frequencies
     hz = hz[(hz >= LEAST_HZ) & (hz <= (np.inf if loop.period_s is None else 0.49 / loop.period_s))]
@@ -47,7 +48,7 @@ def _draw_responses(open_panel: Any, sensitivity_panel: Any, loop: Loop, label: 
     sensitivity_panel.loglog(hz, loop.sensitivity(hz), color=color, label=label)
 
 
-def _draw_step(panel: Any, loop: Loop, label: str, color: str) -> None:
+def _draw_step(panel: Axes, loop: Loop, label: str, color: str) -> None:
     """Draw the position after a unit step; of an unstable loop only the label."""
     if not loop.is_stable:
         panel.plot([], [], color=color, label=f"{label}: unstable")

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -28,7 +27,7 @@ from rtloop.workbench.arguments import FileName, load_configuration
 
 def replay_with_other_law(
     files: Sequence[Path], config: FileName | Configuration, progress: ReportTicks | None = None
-) -> dict[str, Any]:
+) -> dict[str, object]:
     """Compare the recorded outputs with the outputs of the law in `config` on the recorded inputs, from rest.
 
     Returns {recording, config, ticks, problems, signals: {name: {max, at_tick, rms}}, trip}: `max` and `rms` are those
@@ -46,7 +45,7 @@ def replay_on_the_rig(
     config: FileName | Configuration | None,
     progress: ReportTicks | None = None,
     trust: TrustedLaws | None = None,
-) -> dict[str, Any]:
+) -> dict[str, object]:
     """Run the recorded reference through law and simulated rig of `config`, or the recorded ones for None.
 
     Returns {recording, config (None: the recorded one), ticks, problems, trips: {recorded, resimulated}, axes: [{name,

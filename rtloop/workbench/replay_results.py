@@ -14,7 +14,7 @@ from rtloop.recording.replay.verdict import ReplayReport
 from rtloop.recording.views.plot import draw_recording
 from rtloop.values import count_text, to_jsonable
 from rtloop.workbench.bar_picture import draw_bars
-from rtloop.workbench.replay_text import METRICS, print_differences, print_replay, print_resimulation
+from rtloop.workbench.replay_text import METRICS, Trip, print_differences, print_replay, print_resimulation
 from rtloop.workbench.result import Result
 
 if TYPE_CHECKING:
@@ -64,7 +64,7 @@ class ReplayResult(Result):
         return self.report.gaps
 
     @property
-    def not_verified(self) -> list[dict[str, Any]]:
+    def not_verified(self) -> list[dict[str, int | str | None]]:
         """Ticks that were not compared: [{first_tick, count, why}, …]; first_tick and count are None where unknown."""
         return self.report.not_verified
 
@@ -115,12 +115,12 @@ class LawComparison(Result):
         return self.report["ticks"]
 
     @property
-    def signals(self) -> dict[str, dict[str, Any]]:
+    def signals(self) -> dict[str, dict[str, float]]:
         """Difference of each signal by its name: {max, at_tick, rms}; `max` and `rms` of |difference|, in its unit."""
         return self.report["signals"]
 
     @property
-    def trip(self) -> dict[str, Any] | None:
+    def trip(self) -> Trip | None:
         """First trip of the other law, {tick, causes}; None without a trip."""
         return self.report["trip"]
 
@@ -166,7 +166,7 @@ class Resimulation(Result):
         return {axis["name"]: axis for axis in self.report["axes"]}
 
     @property
-    def trips(self) -> dict[str, dict[str, Any] | None]:
+    def trips(self) -> dict[str, Trip | None]:
         """{recorded, resimulated}: the first trip of each run, {tick, causes}, None without a trip."""
         return self.report["trips"]
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypedDict
 
 from rtloop.values import count_text
 from rtloop.workbench.tables import escape, format_number, print_problems, table
@@ -25,6 +25,13 @@ STEP_METRICS = (
     ("settling_time_ms_worst", "settling ms (5 %), worst"),
     ("static_error_percent", "static error %, median"),
 )
+
+
+class Trip(TypedDict):
+    """The first trip of a law or a run."""
+
+    tick: int
+    causes: list[str]
 
 
 def print_replay(out: Console, path: Path, report: ReplayReport) -> None:
@@ -97,7 +104,7 @@ def print_resimulation(out: Console, report: dict[str, Any]) -> None:
     print_problems(out, report["problems"])
 
 
-def _print_trip(out: Console, label: str, trip: dict[str, Any] | None) -> None:
+def _print_trip(out: Console, label: str, trip: Trip | None) -> None:
     """Print the tick and the causes of a trip; no line for None."""
     if trip:
         out.print(f"[red]{label}[/] at tick {trip['tick']}: {', '.join(trip['causes'])}")

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
 
 from rtloop.values import count_text
 from rtloop.workbench.tables import escape, format_number, table
@@ -122,7 +123,7 @@ def _print_timing(out: Console, summary: Summary) -> None:
     out.print("a tick's time, medians: " + ", ".join(f"{label} {phases[key]:.2f} µs" for label, key in labels))
 
 
-def histogram_table(histogram: list[dict[str, Any]], heading: str) -> Table:
+def histogram_table(histogram: Sequence[Mapping[str, float | None]], heading: str) -> Table:
     """Return a table of counts and percentages from the first to the last class with a count; a full bar is 100 %.
 
     `histogram` are classes [{below_us, count}, …], ascending; the last one, below_us None, has no upper end.

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -42,7 +41,7 @@ class LoopMeasurement:
     model: Loop | None
     gain: StaticGain | None = None
 
-    def figures(self) -> dict[str, Any]:
+    def figures(self) -> dict[str, object]:
         """Return values for status and metrics, without curves, null for numbers that are not finite.
 
         Keys: periods, lines (their number), from_hz, to_hz, moved_um, margins ({name: {value, std}}), resonance (the
@@ -64,7 +63,7 @@ class LoopMeasurement:
             }
         )
 
-    def for_json(self) -> dict[str, Any]:
+    def for_json(self) -> dict[str, object]:
         """Return `figures` and, under `response`, the values of every line, for JSON.
 
         `response` has the fields of MeasuredResponse, loop (L), loop_spread, sensitivity (S), tracking (T),
@@ -80,7 +79,7 @@ class LoopMeasurement:
             curves["model_sensitivity"] = 1 / (1 + curves["model_loop"])
         return to_jsonable(self.figures() | {"response": curves})
 
-    def _model_figures(self) -> dict[str, Any] | None:
+    def _model_figures(self) -> dict[str, object] | None:
         """Return {margins: {name: value}, gain_ratio} of the model; None without a model.
 
         `gain_ratio` is the median of measured |L| over the model's at the lines whose spread is below MAX_LINE_SPREAD,

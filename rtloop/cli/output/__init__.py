@@ -4,19 +4,21 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterable
-from typing import Any
+from typing import TypeVar
 
 import click
 
 from rtloop.values import to_jsonable
 
+Content = TypeVar("Content")
 
-def echo_json(content: Any, indent: int | None = None) -> None:
+
+def echo_json(content: object, indent: int | None = None) -> None:
     """Print JSON on standard output, in one line without `indent`; null stands for NaN and infinity."""
     click.echo(json.dumps(to_jsonable(content), indent=indent, allow_nan=False))
 
 
-def print_result(result: dict[str, Any], as_json: bool, print_text: Callable[[dict[str, Any]], None]) -> None:
+def print_result(result: Content, as_json: bool, print_text: Callable[[Content], None]) -> None:
     """Print a result as one JSON object if `as_json`, else by `print_text`."""
     if as_json:
         echo_json(result)

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from rtloop.client.ticks.block_mapping import BlockMapping, is_current, open_mapping
 from rtloop.client.ticks.tick_stretch import Stretch
@@ -54,7 +54,7 @@ class Reader:
             return stretch
         return self._read_mapped() if self._switch_block() else None
 
-    def read_messages(self) -> np.ndarray[Any, np.dtype[np.void]]:
+    def read_messages(self) -> npt.NDArray[np.void]:
         """Return the run's next events, (n,) of MESSAGE, oldest first, 0 ≤ n ≤ MAX_EVENTS, without waiting.
 
         Empty before `read` has mapped a block. An event may come before `read` returns its tick. Events that were

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import Any, NamedTuple, TypeVar
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 from pydantic import ValidationError
@@ -41,7 +41,7 @@ def feedforward_section(model: PlayModel, comments: Sequence[str]) -> str:
     return write_section("axis.feedforward", feedforward_values(model), comments)
 
 
-def feedforward_values(model: PlayModel) -> dict[str, Any]:
+def feedforward_values(model: PlayModel) -> dict[str, list[float]]:
     """Return [axis.feedforward] as {"thresholds_v", "weights_um_per_v"}, two lists of numbers.
 
     Raises UnsuitableData for weights that have no inverse.
@@ -58,7 +58,7 @@ def model_section(fit: DynamicsFit, comment_lines: Sequence[str]) -> str:
     return write_section("axis.model", model_values(fit), comment_lines)
 
 
-def model_values(fit: DynamicsFit) -> dict[str, Any]:
+def model_values(fit: DynamicsFit) -> dict[str, object]:
     """Return [axis.model] as {"form": "zpk", "gain", "zeros", "poles", "delay_ticks"}, each root in rad/s as a pair
     [real, imaginary].
     """
@@ -169,14 +169,14 @@ def parse_feedforward(content: str, source: str, axis: str | None = None) -> Pra
     return _validated(PrandtlIshlinskiiOptions, table, "feedforward", source)
 
 
-def _axis_table(content: str, source: str, axis: str | None) -> dict[str, Any]:
+def _axis_table(content: str, source: str, axis: str | None) -> dict[str, object]:
     """Return the table [axis], whatever its name, or, from a list [[axis]], the table named `axis` (None: the first);
     {} if there is none.
 
     Raises ConfigError for text that is no TOML.
     """
     try:
-        table: Any = parse_toml(content).get("axis")
+        table: object = parse_toml(content).get("axis")
     except ValueError as error:
         raise ConfigError(source, [str(error)]) from None
     if isinstance(table, list):
@@ -191,7 +191,7 @@ def _missing_section(source: str, section: str, axis: str | None) -> ConfigError
     )
 
 
-def _validated(model: type[Section], table: dict[str, Any], section: str, source: str) -> Section:
+def _validated(model: type[Section], table: Mapping[str, object], section: str, source: str) -> Section:
     """Return `table[section]`, which must exist, as options of the class `model`.
 
     Raises ConfigError, which names the file `source`, for invalid ones.

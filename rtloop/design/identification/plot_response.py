@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from rtloop.design.figures import create_figure, label_panel, save_figure
 from rtloop.foundation.arrays import Complex, Real
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 MEASURED_COLOR, MODEL_COLOR = "tab:blue", "0.15"
 PLANE_LIMIT = 2.0
@@ -53,7 +56,7 @@ def plot_response(measurement: Mapping[str, Any], output: Path) -> None:
     save_figure(figure, output)
 
 
-def _plot_with_spread(panel: Any, hz: Real, size: Real, std: Real) -> None:
+def _plot_with_spread(panel: Axes, hz: Real, size: Real, std: Real) -> None:
     """Plot a measured magnitude with a band of ± two standard deviations."""
     panel.loglog(hz, size, ".-", color=MEASURED_COLOR, markersize=3, linewidth=0.8, label="measured")
     panel.fill_between(
@@ -61,7 +64,7 @@ def _plot_with_spread(panel: Any, hz: Real, size: Real, std: Real) -> None:
     )
 
 
-def _complex(pairs: Any) -> Complex:
+def _complex(pairs: Sequence[Sequence[float | None]]) -> Complex:
     """Return pairs [real, imaginary] as complex numbers (k,)."""
     parts = np.array(pairs, dtype=float)
     return parts[:, 0] + 1j * parts[:, 1]

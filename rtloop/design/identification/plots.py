@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -22,6 +22,7 @@ from rtloop.hysteresis.play_model import PlayModel
 from rtloop.recording.views.picture import create_picture
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 POINTS = 20_000
@@ -78,7 +79,7 @@ def draw_dynamics(fit: DynamicsFit, run: Excitation, measured: FrequencyResponse
     return figure
 
 
-def _draw_in_time(fit: DynamicsFit, run: Excitation, full: Any, zoom: Any, difference: Any) -> None:
+def _draw_in_time(fit: DynamicsFit, run: Excitation, full: Axes, zoom: Axes, difference: Axes) -> None:
     """Draw measured and modelled position over time, an enlarged part of them, and their difference, in a panel each.
 
     Only the first POINTS samples are drawn.
@@ -114,7 +115,7 @@ def _zoom_range(fit: DynamicsFit, run: Excitation) -> tuple[int, int]:
 
 
 def _draw_over_frequency(
-    fit: DynamicsFit, run: Excitation, measured: FrequencyResponse | None, magnitude: Any, phase: Any, input_unit: str
+    fit: DynamicsFit, run: Excitation, measured: FrequencyResponse | None, magnitude: Axes, phase: Axes, input_unit: str
 ) -> None:
     """Draw magnitude and phase of the model, and of a measured response at the frequencies where its `is_trusted` is
     True.

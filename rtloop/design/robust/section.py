@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import tomllib
-from typing import Any
+from collections.abc import Mapping
 
 from rtloop.design.robust.certificate import Certificate
 from rtloop.design.robust.programme import Taps
@@ -71,7 +71,7 @@ def taps_section(tap_design: TapDesign, subject: Subject, source: str) -> str:
     return write_section("axis.prefilter", taps_values(tap_design.taps), taps_provenance(tap_design, subject, source))
 
 
-def taps_values(taps: Taps) -> dict[str, Any]:
+def taps_values(taps: Taps) -> dict[str, list[float]]:
     """Return [axis.prefilter] as plain values: `taps` and `command_taps`."""
     return {"taps": taps.reference.tolist(), "command_taps": taps.command.tolist()}
 
@@ -104,7 +104,7 @@ def certified_values(proof: Certificate) -> list[tuple[str, float, str]]:
     ]
 
 
-def robust_values(robust: RobustDesign, design: DesignOptions) -> dict[str, Any]:
+def robust_values(robust: RobustDesign, design: DesignOptions) -> dict[str, object]:
     """Return [axis.controller] as {"form": "zpk", "gain", "zeros", "poles", "method": "matched"}; each root in rad/s as
     a pair [real, imaginary].
     """
@@ -126,7 +126,7 @@ def provenance(robust: RobustDesign, design: DesignOptions, source: str, text: s
     ]
 
 
-def _replace_in_axis(text: str, axis: str, parts: dict[str, Any], comments: list[str]) -> str:
+def _replace_in_axis(text: str, axis: str, parts: Mapping[str, object], comments: list[str]) -> str:
     """Return `text` with `parts` in the named axis and `comments` in place of older comments by the same command.
 
     Raises ValueError for an unknown axis.

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 
@@ -141,7 +140,7 @@ def provenance(synthesis: Synthesis, design: DesignOptions, source: str, text: s
     return lines
 
 
-def controller_values(controller: Transfer, output: OutputOptions) -> dict[str, Any]:
+def controller_values(controller: Transfer, output: OutputOptions) -> dict[str, object]:
     """Return [axis.controller] as {"form": "zpk", "gain", "zeros", "poles", "method"} and, if set, "prewarp_hz"; each
     root in rad/s as a pair [real, imaginary].
     """

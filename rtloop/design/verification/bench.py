@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple, cast
+from typing import NamedTuple, cast
 
 from rtloop.analysis.held_plant import POINTS
 from rtloop.configuration.axis import AxisOptions, ModelOptions
@@ -112,7 +112,7 @@ def _place_on_rig(
             "the rig that replaces the hardware has no channels for [inputs] and [outputs]; verify a copy of the "
             "configuration without these sections"
         )
-    board: Any = configuration.driver_options
+    board = configuration.driver_options
     channels = {}
     for number, axis in enumerate(axes):
         scale = abs(configuration.channels[axis.name].um_per_v)

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import asdict
-from typing import Any
 
 from rtloop.analysis.perturbation import PercentRange
 from rtloop.design.verification.verify import Row, ScenarioResults, Verification
 from rtloop.values import to_jsonable
 
 
-def as_dict(verification: Verification) -> dict[str, Any]:
+def as_dict(verification: Verification) -> dict[str, object]:
     """Return a verification for JSON; null stands for an undefined or infinite value and a missing limit.
 
     Robustness is computed if it was not before. Keys: meets; stable {continuous, running}; delay_ticks; rate_hz; rows
@@ -44,7 +43,7 @@ def as_dict(verification: Verification) -> dict[str, Any]:
     return to_jsonable(values)
 
 
-def _scenarios(scenarios: ScenarioResults) -> dict[str, Any]:
+def _scenarios(scenarios: ScenarioResults) -> dict[str, object]:
     """Return {count, rows}; each row has name, worst value (may be infinite or NaN), its plant, and verdict `met`."""
     rows = [
         {
@@ -58,7 +57,7 @@ def _scenarios(scenarios: ScenarioResults) -> dict[str, Any]:
     return {"count": scenarios.count, "rows": rows}
 
 
-def _row(row: Row) -> dict[str, Any]:
+def _row(row: Row) -> dict[str, object]:
     """Return one quantity for JSON: name, unit, required (value, at_most), continuous and running (the values of both
     loops) with continuous_met and running_met, claim; null for none.
     """

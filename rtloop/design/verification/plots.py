@@ -7,7 +7,8 @@ Templates ("gabarits" in the paper) are 1/W1 for |S| and 1/W2 for |CS|, eq
 from __future__ import annotations
 
 import math
-from typing import Any
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -19,6 +20,9 @@ from rtloop.design.verification.verify import Verification
 from rtloop.foundation.arrays import Real
 from rtloop.linear.transfer import Transfer
 from rtloop.values import count_text
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 CONTINUOUS_COLOR, RUNNING_COLOR, TEMPLATE_COLOR = "tab:blue", "tab:red", "0.35"
 
@@ -56,7 +60,7 @@ def _plotted_hz(loop: Loop, verification: Verification) -> Real:
     return hz[(hz >= 1e-2) & (hz <= (10 if loop.period_s is None else 0.49) / period_s)]
 
 
-def _bode(panels: Any, verification: Verification, _: SpecificationOptions) -> None:
+def _bode(panels: Sequence[Axes], verification: Verification, _: SpecificationOptions) -> None:
     """Draw magnitude and phase of L."""
     for label, loop, color in _loops(verification):
         hz = _plotted_hz(loop, verification)
@@ -67,7 +71,7 @@ def _bode(panels: Any, verification: Verification, _: SpecificationOptions) -> N
     panels[1].axhline(-180, color=TEMPLATE_COLOR, linewidth=0.8, linestyle=":")
 
 
-def _sensitivity(panels: Any, verification: Verification, _: SpecificationOptions) -> None:
+def _sensitivity(panels: Sequence[Axes], verification: Verification, _: SpecificationOptions) -> None:
     """Draw |S| and |CS|, with their templates if there are weights."""
     for label, loop, color in _loops(verification):
         hz = _plotted_hz(loop, verification)
@@ -79,7 +83,7 @@ def _sensitivity(panels: Any, verification: Verification, _: SpecificationOption
         _template(panels[1], hz, verification.weights.command, "W2", verification.gamma)
 
 
-def _template(panel: Any, hz: Real, weight: Transfer, name: str, gamma: float | None) -> None:
+def _template(panel: Axes, hz: Real, weight: Transfer, name: str, gamma: float | None) -> None:
     """Draw 1/|W| as specified and, for a finite `gamma`, relaxed by it."""
     inverse = 1 / np.abs(weight.response(2j * np.pi * hz))
     panel.loglog(hz, inverse, color=TEMPLATE_COLOR, linestyle="--", label=f"1/{name}, as specified")
@@ -87,7 +91,7 @@ def _template(panel: Any, hz: Real, weight: Transfer, name: str, gamma: float | 
         panel.loglog(hz, gamma * inverse, color=TEMPLATE_COLOR, linestyle=":", label=f"γ/{name}, γ = {gamma:.3g}")
 
 
-def _step(panels: Any, verification: Verification, specification: SpecificationOptions) -> None:
+def _step(panels: Sequence[Axes], verification: Verification, specification: SpecificationOptions) -> None:
     """Draw position and command after a unit step, with their limits."""
     duration_s = 4e-3 * (specification.settling_ms or 5.0)
     for label, loop, color in _loops(verification):
@@ -96,7 +100,9 @@ def _step(panels: Any, verification: Verification, specification: SpecificationO
                 panel.plot([], [], color=color, label=f"{label}: unstable")
             continue
         response = step_response(loop, duration_s)
-        style = {"color": color} if loop.period_s is None else {"color": color, "drawstyle": "steps-post"}
+        style: dict[str, Any] = (
+            {"color": color} if loop.period_s is None else {"color": color, "drawstyle": "steps-post"}
+        )
         panels[0].plot(1e3 * response.time_s, response.position, label=f"x {label}", color=color)
         panels[1].plot(1e3 * response.time_s, response.command, label=f"v {label}", **style)
     panels[0].axhspan(0.95, 1.05, color="0.9", label="±5 %")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from rtloop.design.synthesis.specification import QUANTITIES
 from rtloop.design.verification.judgement import Limit
@@ -86,7 +86,7 @@ class SimulationResult:
             if self.is_met(step, name) is False
         ] + [f"steps of {step.height_um:g} µm, which trip" for step in self.steps if step.trips]
 
-    def as_dict(self) -> dict[str, Any]:
+    def as_dict(self) -> dict[str, object]:
         """Return the result for JSON: `truth`; `steps`, each with the fields of SimulatedStep and `met` {figure:
         whether it meets its limit}, without figures that have none; `left_out_um`; `range_um` [low, high];
         `noise_x_nm`; `noise_v_nm`; `judged`. Infinite figures are still infinite, not null.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from pydantic import Field
@@ -19,6 +19,9 @@ from rtloop.experiments.verdict import Analysis, Table
 from rtloop.foundation.options import Options
 from rtloop.hysteresis.loop_shape import LoopShape, loop_shape
 from rtloop.hysteresis.plays import model_output
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 TOLERANCE_PERCENT, TOLERANCE_RATIO, FIT_TOLERANCE_PERCENT = 0.2, 0.005, 0.5
 """Expected agreement with the model: h/H in %, h and H as fractions of H, largest difference in % of H."""
@@ -71,7 +74,7 @@ def analyse(recordings: Sequence[RecordedRun], _: CharacteriseOptions) -> Analys
     at_rest = slice(0, rest_segment.ticks // 2)
     position, model = position - position[at_rest].mean(), model - model[at_rest].mean()
     shapes: dict[str, tuple[LoopShape, LoopShape]] = {}
-    curves: dict[str, Any] = {}
+    curves: dict[str, object] = {}
     for segment in run.segments_labelled("half", "major", "minor"):
         rows_of_segment = slice(segment.start_tick - start, segment.start_tick - start + segment.ticks - 1)
         shapes[segment.label] = (
@@ -143,7 +146,7 @@ def _table(shapes: Mapping[str, tuple[LoopShape, LoopShape]]) -> Table:
     return Table("Loops", ("loop", "h / µm", "H / µm", "h/H / %", "model: h", "H", "h/H"), rows)
 
 
-def draw(figure: Any, curves: Mapping[str, Any], ink: Palette) -> None:
+def draw(figure: Figure, curves: Mapping[str, Any], ink: Palette) -> None:
     """Draw the loops, the model with the major loop, and their difference over time.
 
     `curves` come from `analyse`.

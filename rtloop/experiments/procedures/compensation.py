@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, TypedDict
 
 import numpy as np
 from pydantic import Field
@@ -20,6 +20,9 @@ from rtloop.foundation.arrays import Real
 from rtloop.foundation.options import Options
 from rtloop.hysteresis.loop_shape import loop_shape
 from rtloop.hysteresis.plays import model_output
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 TOLERANCE = 0.1
 """Expected agreement with the model: % of h/H, and µm."""
@@ -48,7 +51,13 @@ def runs(options: CompensationOptions, setting: Setting) -> list[Run]:
     return [Run("", timeline)]
 
 
-def analyse(recordings: Sequence[RecordedRun], options: CompensationOptions) -> Analysis:
+class CompensationCurves(TypedDict):
+    """Command v, output y and v − y in µm."""
+
+    v_y_error: tuple[Real, ...]
+
+
+def analyse(recordings: Sequence[RecordedRun], options: CompensationOptions) -> Analysis[CompensationCurves]:
     """Evaluate the output y = x/D(0) of the compensation over the command v, both in µm, from one recording.
 
     x is the position relative to rest, D(0) the static gain of the dynamics. Rows: height h of the remaining loop, µm,
@@ -96,7 +105,7 @@ def _modelled_output(run: RecordedRun, drive: Real, rest: Segment, segment: Segm
     return output_um[segment.start_tick - start :] - rest_um
 
 
-def draw(figure: Any, curves: Mapping[str, Any], ink: Palette) -> None:
+def draw(figure: Figure, curves: CompensationCurves, ink: Palette) -> None:
     """Draw y over v, and the error v − y over v; `curves` come from `analyse`."""
     loop, error_panel = figure.subplots(1, 2)
     v, y, error = curves["v_y_error"]

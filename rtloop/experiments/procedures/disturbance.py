@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from pydantic import Field
@@ -23,6 +23,9 @@ from rtloop.experiments.timeline import Run, hold
 from rtloop.experiments.verdict import Analysis, Row, Table
 from rtloop.foundation.arrays import Real
 from rtloop.foundation.options import Numbers, Options
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 REST_S, STEP_S, SHOWN_S, SETTLE_S = 0.2, 1.0, 0.15, 0.5
 MIN_DURATION_S = 0.5
@@ -56,7 +59,7 @@ def runs(options: DisturbanceOptions, setting: Setting) -> list[Run]:
 
 
 def _plan_run(
-    label: str, change: dict[str, float], duration_s: float, setting: Setting, settle_s: float, **values: Any
+    label: str, change: dict[str, float], duration_s: float, setting: Setting, settle_s: float, **values: float
 ) -> Run:
     """Return a run with one disturbance: REST_S without it, `settle_s` with it, then `duration_s` that are measured.
 
@@ -188,7 +191,7 @@ def _settling_ms(error: Real, limit_um: float, rate_hz: float) -> float:
     return 1e3 * float(outside[-1] + 1) / rate_hz if outside.size else 0.0
 
 
-def _frequency_curves(run: RecordedRun, amplitude_um: float) -> dict[str, Any]:
+def _frequency_curves(run: RecordedRun, amplitude_um: float) -> dict[str, object]:
     """Return model and limit over frequency, for the picture: arrays hz, model_nm (n,), numbers asked_nm, asked_hz.
 
     `model_nm` is None without a model, `asked_nm` without a limit, which applies up to `asked_hz`.
@@ -205,7 +208,7 @@ def _frequency_curves(run: RecordedRun, amplitude_um: float) -> dict[str, Any]:
     }
 
 
-def draw(figure: Any, curves: Mapping[str, Any], ink: Palette) -> None:
+def draw(figure: Figure, curves: Mapping[str, Any], ink: Palette) -> None:
     """Draw the step's decay, and the error over frequency; `curves` come from `analyse`."""
     step_panel, frequency_panel = figure.subplots(1, 2, width_ratios=(3, 2))
     limit_nm = curves["asked_nm"]

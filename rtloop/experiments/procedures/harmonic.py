@@ -8,18 +8,20 @@ dead band of the hysteresis.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, TypedDict
 
 import numpy as np
+import numpy.typing as npt
 from pydantic import Field
 
 from rtloop.configuration.schedule import ModeName
 from rtloop.design.palette import Palette
+from rtloop.design.synthesis.specification import ClaimOptions
 from rtloop.experiments.largest_amplitudes import largest_swept_sine
 from rtloop.experiments.lockin import response, tone
 from rtloop.experiments.procedure import Experiment
-from rtloop.experiments.procedures.harmonic_promise import REFERENCE_HZ, HarmonicPromise
+from rtloop.experiments.procedures.harmonic_promise import REFERENCE_HZ, Curve, HarmonicPromise
 from rtloop.experiments.recorded_run import RecordedRun
 from rtloop.experiments.setting import REST_S, Setting
 from rtloop.experiments.timeline import Run, hold, sine
@@ -29,6 +31,9 @@ from rtloop.foundation.options import Numbers, Options
 from rtloop.hysteresis.play_model import PlayModel
 from rtloop.hysteresis.plays import model_output
 from rtloop.laws.shipped.options import PrandtlIshlinskiiOptions
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 MODES: tuple[ModeName, ...] = ("raw", "feedforward", "closed_loop")
 INPUTS = {"raw": "drive_v", "feedforward": "command_um", "closed_loop": "reference_um"}
@@ -91,7 +96,16 @@ def runs(options: HarmonicOptions, setting: Setting) -> list[Run]:
     return [Run("", timeline)]
 
 
-def analyse(recordings: Sequence[RecordedRun], options: HarmonicOptions) -> Analysis:
+class HarmonicCurves(TypedDict):
+    """Sweeps by mode, the band near the resonance in Hz, the model's curves and the claim."""
+
+    found: dict[str, Real]
+    near_hz: tuple[float, float]
+    modelled: list[Curve]
+    claimed: ClaimOptions | None
+
+
+def analyse(recordings: Sequence[RecordedRun], options: HarmonicOptions) -> Analysis[HarmonicCurves]:
     """Evaluate magnitude, phase and coherence of each mode over frequency, beside the model's, from one recording.
 
     Rows: peak without control, gain at low frequencies, and bandwidth and largest response of the closed loop.
@@ -137,8 +151,10 @@ def analyse(recordings: Sequence[RecordedRun], options: HarmonicOptions) -> Anal
         "hysteresis at this amplitude. The solid model curve is the sampled loop of [axis.controller] and "
         "[axis.model].",
     ]
-    curves = {"found": sweeps, "near_hz": model.near_hz, "modelled": model.curves(shifts_db),
-              "claimed": run.specification.claims.get("resonance_hz")}  # fmt: skip
+    curves: HarmonicCurves = {
+        "found": sweeps, "near_hz": model.near_hz, "modelled": model.curves(shifts_db),
+        "claimed": run.specification.claims.get("resonance_hz"),
+    }  # fmt: skip
     return Analysis(rows, curves, (Table("Every frequency", headings, table),), notes)
 
 
@@ -228,7 +244,7 @@ def bandwidth_hz(sweep: Real) -> float:
     )
 
 
-def draw(figure: Any, curves: Mapping[str, Any], ink: Palette) -> None:
+def draw(figure: Figure, curves: HarmonicCurves, ink: Palette) -> None:
     """Draw magnitude, phase and coherence over frequency, and again near the resonance.
 
     `curves` come from `analyse`.
@@ -248,7 +264,7 @@ def draw(figure: Any, curves: Mapping[str, Any], ink: Palette) -> None:
     ink.label(near_coherence, "frequency / Hz", "")
 
 
-def _draw_column(panels: Any, curves: Mapping[str, Any], ink: Palette) -> None:
+def _draw_column(panels: npt.NDArray[np.object_], curves: HarmonicCurves, ink: Palette) -> None:
     """Draw magnitude, phase and coherence of all modes in the three `panels` of a column, in this order.
 
     Points of less coherence than MIN_COHERENCE are left out of the first two. `curves` come from `analyse`.

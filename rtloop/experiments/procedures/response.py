@@ -6,8 +6,8 @@ The excitation is of the model's making where there is one: it moves the positio
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, TypedDict
 
 import numpy as np
 from pydantic import Field
@@ -27,8 +27,11 @@ from rtloop.experiments.recorded_run import RecordedRun
 from rtloop.experiments.setting import REST_S, Setting
 from rtloop.experiments.timeline import Run, hold
 from rtloop.experiments.verdict import Analysis, Row, Table
-from rtloop.foundation.arrays import Real
+from rtloop.foundation.arrays import Complex, Real
 from rtloop.foundation.options import Options
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 DIGITS = 7
 """Decimals of the reference's levels."""
@@ -95,7 +98,16 @@ def _line_grid(options: ResponseOptions, setting: Setting) -> LineGrid:
         raise ConfigError("parameters of the experiments", [f"response: {error}"]) from None
 
 
-def analyse(recordings: Sequence[RecordedRun], options: ResponseOptions) -> Analysis:
+class ResponseCurves(TypedDict):
+    """The loop L at frequencies in Hz, its relative standard deviation, and the model's L."""
+
+    hz: Real
+    loop: Complex
+    spread: Real
+    model: Complex | None
+
+
+def analyse(recordings: Sequence[RecordedRun], options: ResponseOptions) -> Analysis[ResponseCurves]:
     """Evaluate measured margins and resonance beside the model's, from one recording.
 
     The curves are the loop L at every line of the multisine, measured and modelled. Raises UnsuitableData if the
@@ -141,8 +153,10 @@ def analyse(recordings: Sequence[RecordedRun], options: ResponseOptions) -> Anal
             f"The residuals are {measurement.mode.misfit:.2g} times as large as the measurement's uncertainty "
             f"explains: {NOT_LINEAR}."
         )
-    curves = {"hz": measurement.loop.hz, "loop": measurement.loop.loop, "spread": measurement.loop.spread,
-              "model": None if loop is None else loop.open(measurement.loop.hz)}  # fmt: skip
+    curves: ResponseCurves = {
+        "hz": measurement.loop.hz, "loop": measurement.loop.loop, "spread": measurement.loop.spread,
+        "model": None if loop is None else loop.open(measurement.loop.hz),
+    }  # fmt: skip
     return Analysis(rows, curves, (Table("Standard deviations", ("margin", "measured", "± (1σ)"), deviations),), notes)
 
 
@@ -176,7 +190,7 @@ def _row(
     return run.row(name, label, unit, measured_value.value, model, tolerance)
 
 
-def draw(figure: Any, curves: Mapping[str, Any], ink: Palette) -> None:
+def draw(figure: Figure, curves: ResponseCurves, ink: Palette) -> None:
     """Draw L in magnitude and phase, and |S|, each with the model's; `curves` come from `analyse`."""
     hz, loop, model = curves["hz"], curves["loop"], curves["model"]
     magnitude, phase, sensitivity = figure.subplots(3, 1, sharex=True)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple, TypedDict
 
 import numpy as np
 from pydantic import Field
@@ -12,12 +12,16 @@ from rtloop.design.palette import Palette
 from rtloop.design.verification.text import format_range
 from rtloop.experiments.largest_amplitudes import largest_step_up
 from rtloop.experiments.procedure import Experiment
-from rtloop.experiments.recorded_run import RecordedRun
+from rtloop.experiments.recorded_run import RecordedRun, Trip
 from rtloop.experiments.setting import Setting
 from rtloop.experiments.timeline import Run, hold
 from rtloop.experiments.traces import envelope
 from rtloop.experiments.verdict import Analysis, Table
+from rtloop.foundation.arrays import Real
 from rtloop.foundation.options import Numbers, Options
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 MAX_SWING_UM = 0.5
 """Swing of the last fifth, from peak to peak, above which a step has not settled."""
@@ -40,7 +44,7 @@ class Outcome(NamedTuple):
     shift_percent: float
     swing_um: float
     largest_um: float
-    trip: Mapping[str, Any] | None
+    trip: Trip | None
 
     @property
     def is_settled(self) -> bool:
@@ -66,7 +70,15 @@ def runs(options: RobustnessOptions, setting: Setting) -> list[Run]:
     return planned_runs
 
 
-def analyse(recordings: Sequence[RecordedRun], options: RobustnessOptions) -> Analysis:
+class RobustnessCurves(TypedDict):
+    """Of each shift in %: the position in µm and the outcome as text; all outcomes."""
+
+    traces: list[tuple[float, Real, str]]
+    outcomes: list[Outcome]
+    rate_hz: float
+
+
+def analyse(recordings: Sequence[RecordedRun], options: RobustnessOptions) -> Analysis[RobustnessCurves]:
     """Evaluate which shifts settle, ring or trip, and the range of shifts about 0 that settle, beside the model's.
 
     `recordings` has one run for each shift, in any order.
@@ -102,7 +114,7 @@ def analyse(recordings: Sequence[RecordedRun], options: RobustnessOptions) -> An
              "ringing that is small enough dies away by its own damping although the linear loop is unstable. Only a "
              "ringing that leaves the dead band grows, until the interlocks of the configuration trip."]  # fmt: skip
     headings = ("shift / %", "model", "run", "x in the last fifth, peak to peak / µm", "largest |x| / µm")
-    curves = {"traces": traces, "outcomes": outcomes, "rate_hz": ordered[0].rate_hz}
+    curves: RobustnessCurves = {"traces": traces, "outcomes": outcomes, "rate_hz": ordered[0].rate_hz}
     return Analysis(rows, curves, (Table("Every shift", headings, table),), notes)
 
 
@@ -143,7 +155,7 @@ def _stability_text(predicted: Mapping[float, bool] | None, shift_percent: float
     return "–" if predicted is None else "stable" if predicted[shift_percent] else "unstable"
 
 
-def draw(figure: Any, curves: Mapping[str, Any], ink: Palette) -> None:
+def draw(figure: Figure, curves: RobustnessCurves, ink: Palette) -> None:
     """Draw the step at each shift, coloured by its outcome; `curves` come from `analyse`."""
     traces = curves["traces"]
     columns = min(5, len(traces))

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, TypedDict
 
 import numpy as np
 from pydantic import Field
@@ -26,6 +26,9 @@ from rtloop.experiments.timeline import Run
 from rtloop.experiments.verdict import Analysis, Row, Table
 from rtloop.foundation.arrays import Real
 from rtloop.foundation.options import Numbers, Options
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 
 class ScanOptions(Options):
@@ -155,7 +158,13 @@ def _mean_error(run: RecordedRun, number: int) -> Real:
     return triangle(ticks, float(run.parameters["amplitude_um"])) - position
 
 
-def analyse(recordings: Sequence[RecordedRun], options: ScanOptions) -> Analysis:
+class ScanCurves(TypedDict):
+    """Of each scan: frequency in Hz, rms error of each cycle in %, first and last error in µm."""
+
+    traces: list[tuple[float, list[float], Real, Real]]
+
+
+def analyse(recordings: Sequence[RecordedRun], options: ScanOptions) -> Analysis[ScanCurves]:
     """Evaluate the rms error of every frequency before and after learning, in % of peak to peak.
 
     `recordings` are in the order of the cycles; a table has the error of each cycle, and the curves too.
@@ -179,7 +188,7 @@ def analyse(recordings: Sequence[RecordedRun], options: ScanOptions) -> Analysis
                     notes)  # fmt: skip
 
 
-def draw(figure: Any, curves: Mapping[str, Any], ink: Palette) -> None:
+def draw(figure: Figure, curves: ScanCurves, ink: Palette) -> None:
     """Draw the error over a period before and after learning, and its size over the cycles.
 
     `curves` come from `analyse`.

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, TypedDict
 
 import numpy as np
 from pydantic import Field
@@ -16,7 +16,11 @@ from rtloop.experiments.recorded_run import RecordedRun
 from rtloop.experiments.setting import Setting
 from rtloop.experiments.timeline import Run, sine
 from rtloop.experiments.verdict import Analysis, Table
+from rtloop.foundation.arrays import Real
 from rtloop.foundation.options import Numbers, Options
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 MIN_DURATION_S = 0.5
 TOLERANCE_RATIO, MIN_TOLERANCE_RATIO = 0.1, 0.0025
@@ -48,7 +52,13 @@ def runs(options: SinesOptions, setting: Setting) -> list[Run]:
     return [Run("", timeline)]
 
 
-def analyse(recordings: Sequence[RecordedRun], options: SinesOptions) -> Analysis:
+class SinesCurves(TypedDict):
+    """Of each sine: frequency in Hz, cycles, reference and position in µm."""
+
+    traces: list[tuple[float, Real, Real, Real]]
+
+
+def analyse(recordings: Sequence[RecordedRun], options: SinesOptions) -> Analysis[SinesCurves]:
     """Evaluate rms error and phase at each frequency beside the model's, from one recording.
 
     A table has the largest error, the gain and the coherence too; the curves are two cycles of each frequency.
@@ -84,7 +94,7 @@ def analyse(recordings: Sequence[RecordedRun], options: SinesOptions) -> Analysi
     return Analysis(rows, {"traces": traces}, (Table("Every frequency", headings, table),), notes)
 
 
-def draw(figure: Any, curves: Mapping[str, Any], ink: Palette) -> None:
+def draw(figure: Figure, curves: SinesCurves, ink: Palette) -> None:
     """Draw the first two cycles of each frequency with the error below; `curves` come from `analyse`."""
     traces = curves["traces"]
     columns = min(3, len(traces))

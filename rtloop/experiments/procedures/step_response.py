@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, NamedTuple, TypedDict
 
 import numpy as np
 from pydantic import Field
@@ -20,6 +20,9 @@ from rtloop.experiments.verdict import Analysis
 from rtloop.foundation.arrays import Real
 from rtloop.foundation.options import Options
 from rtloop.hysteresis.plays import loading_curve
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 SHOWN_S, SHOWN_PERIODS = 0.1, 9.0
 RINGING_S = 0.015, 0.1
@@ -68,7 +71,17 @@ def runs(options: StepResponseOptions, setting: Setting) -> list[Run]:
     return [Run("", timeline)]
 
 
-def analyse(recordings: Sequence[RecordedRun], options: StepResponseOptions) -> Analysis:
+class StepResponseCurves(TypedDict):
+    """Position after the step in µm, measured and modelled, over the time in ms."""
+
+    time_ms: Real
+    measured: Real
+    final: float
+    model: Real | None
+    zoom_ms: float
+
+
+def analyse(recordings: Sequence[RecordedRun], options: StepResponseOptions) -> Analysis[StepResponseCurves]:
     """Evaluate overshoot, frequency and damping of the ringing, and final position, beside the model's.
 
     From one recording. The curves are the positions, measured and modelled, after the step. Raises UnsuitableData for
@@ -114,9 +127,11 @@ def analyse(recordings: Sequence[RecordedRun], options: StepResponseOptions) -> 
             "height. The model is [axis.model] with the loop's zero-order hold."
         ]
     is_shown = time_s <= SHOWN_S
-    curves = {"time_ms": 1e3 * time_s[is_shown], "measured": height[is_shown], "final": final,
-              "model": None if modelled.response is None else modelled.response[is_shown],
-              "zoom_ms": 1e3 * SHOWN_PERIODS / ringing.frequency_hz}  # fmt: skip
+    curves: StepResponseCurves = {
+        "time_ms": 1e3 * time_s[is_shown], "measured": height[is_shown], "final": final,
+        "model": None if modelled.response is None else modelled.response[is_shown],
+        "zoom_ms": 1e3 * SHOWN_PERIODS / ringing.frequency_hz,
+    }  # fmt: skip
     return Analysis(rows, curves, notes=notes)
 
 
@@ -169,7 +184,7 @@ def _columns(unknowns: Real, time_s: Real) -> Real:
     return np.stack([decay * np.cos(omega * time_s), decay * np.sin(omega * time_s), np.ones_like(time_s)], axis=1)
 
 
-def draw(figure: Any, curves: Mapping[str, Any], ink: Palette) -> None:
+def draw(figure: Figure, curves: StepResponseCurves, ink: Palette) -> None:
     """Draw the response, and enlarged its first milliseconds; `curves` come from `analyse`."""
     overview, zoom = figure.subplots(1, 2, sharey=True, width_ratios=(3, 2))
     for panel in (overview, zoom):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from pydantic import Field
@@ -20,6 +20,9 @@ from rtloop.experiments.verdict import Analysis, Table
 from rtloop.foundation.arrays import Real
 from rtloop.foundation.options import Numbers, Options
 from rtloop.recording.views.steps import StepMetrics, step_metrics
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 SHOWN_SETTLINGS = 5.0
 OVERSHOOT_TOLERANCE, STATIC_TOLERANCE, PEAK_TOLERANCE = 0.3, 0.02, 0.1
@@ -163,7 +166,7 @@ def _steps_table(steps: Sequence[Step]) -> Table:
     return Table("Every step", headings, rows)
 
 
-def draw(figure: Any, curves: Mapping[str, Any], ink: Palette) -> None:
+def draw(figure: Figure, curves: Mapping[str, Any], ink: Palette) -> None:
     """Draw the series with its drive, and all steps over each other; `curves` come from `analyse`."""
     grid = figure.add_gridspec(2, 2, height_ratios=(2, 1), width_ratios=(3, 2))
     series, drive, zoom = (figure.add_subplot(cell) for cell in (grid[0, 0], grid[1, 0], grid[:, 1]))

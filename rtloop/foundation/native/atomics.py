@@ -6,15 +6,25 @@ load of the stored value makes those writes visible.
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Callable, Sequence
+from types import ModuleType
+from typing import TYPE_CHECKING, Any
 
 from rtloop.foundation.native import uncompiled
 from rtloop.foundation.native.compiled import intrinsic, intrinsic_like
 
+if TYPE_CHECKING:
+    from llvmlite.ir import IRBuilder, Value
+    from numba.core.base import BaseContext
+    from numba.core.types.abstract import Type
+    from numba.core.typing.templates import Signature
+
 ALIGNMENT = 8
 
 
-def _element_pointer(compiler: Any, context: Any, builder: Any, array_type: Any, array: Any, index: Any) -> Any:
+def _element_pointer(
+    compiler: ModuleType, context: BaseContext, builder: IRBuilder, array_type: Type, array: Value, index: Value
+) -> Value:
     """Return the LLVM pointer to element `index` of `array`, without bounds check.
 
     `compiler` is the module `native.compiler`, the other parameters are as in numba's code generators.
@@ -23,19 +33,19 @@ def _element_pointer(compiler: Any, context: Any, builder: Any, array_type: Any,
     return compiler.cgutils.get_item_pointer(context, builder, array_type, fields, [index], wraparound=False)
 
 
-def _is_word_array(types: Any, array: Any) -> bool:
+def _is_word_array(types: ModuleType, array: Any) -> bool:
     """Whether the numba type `array` is a one-dimensional array of uint64."""
     return isinstance(array, types.Array) and array.dtype == types.uint64 and array.ndim == 1
 
 
 @intrinsic_like(uncompiled.load_acquire)
-def load_acquire(compiler: Any, array: Any, index: Any) -> Any:
+def load_acquire(compiler: ModuleType, array: Type, index: Type) -> tuple[Signature, Callable[..., Value]] | None:
     """Return word `index` of a uint64 array, loaded before every later load and store; the index is not checked."""
     types = compiler.types
     if not _is_word_array(types, array):
         return None
 
-    def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+    def codegen(context: BaseContext, builder: IRBuilder, signature: Signature, arguments: Sequence[Value]) -> Value:
         """Emit the LLVM code of the load and return its value; numba defines the parameters."""
         pointer = _element_pointer(compiler, context, builder, signature.args[0], arguments[0], arguments[1])
         return builder.load_atomic(pointer, "acquire", ALIGNMENT)
@@ -44,13 +54,15 @@ def load_acquire(compiler: Any, array: Any, index: Any) -> Any:
 
 
 @intrinsic_like(uncompiled.store_release)
-def store_release(compiler: Any, array: Any, index: Any, value: Any) -> Any:
+def store_release(
+    compiler: ModuleType, array: Type, index: Type, value: Type
+) -> tuple[Signature, Callable[..., Value]] | None:
     """Set word `index` of a uint64 array, ordered after every earlier load and store; the index is not checked."""
     types = compiler.types
     if not _is_word_array(types, array):
         return None
 
-    def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+    def codegen(context: BaseContext, builder: IRBuilder, signature: Signature, arguments: Sequence[Value]) -> Value:
         """Emit the LLVM code of the store and return numba's None; numba defines the parameters."""
         pointer = _element_pointer(compiler, context, builder, signature.args[0], arguments[0], arguments[1])
         builder.store_atomic(arguments[2], pointer, "release", ALIGNMENT)
@@ -60,7 +72,9 @@ def store_release(compiler: Any, array: Any, index: Any, value: Any) -> Any:
 
 
 @intrinsic
-def compare_exchange(compiler: Any, array: Any, index: Any, expected: Any, replacement: Any) -> Any:
+def compare_exchange(
+    compiler: ModuleType, array: Type, index: Type, expected: Type, replacement: Type
+) -> tuple[Signature, Callable[..., Value]] | None:
     """Replace word `index` of a uint64 array if it equals `expected`; return whether it did, as one atomic operation.
 
     Among concurrent calls with one `expected` and other replacements, in any processes, at most one returns True. The
@@ -70,7 +84,7 @@ def compare_exchange(compiler: Any, array: Any, index: Any, expected: Any, repla
     if not _is_word_array(types, array):
         return None
 
-    def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+    def codegen(context: BaseContext, builder: IRBuilder, signature: Signature, arguments: Sequence[Value]) -> Value:
         """Emit the LLVM code of the exchange and return whether it succeeded; numba defines the parameters."""
         pointer = _element_pointer(compiler, context, builder, signature.args[0], arguments[0], arguments[1])
         return builder.extract_value(builder.cmpxchg(pointer, arguments[2], arguments[3], "seq_cst"), 1)
@@ -79,10 +93,10 @@ def compare_exchange(compiler: Any, array: Any, index: Any, expected: Any, repla
 
 
 @intrinsic
-def fence_acquire(compiler: Any) -> Any:
+def fence_acquire(compiler: ModuleType) -> tuple[Signature, Callable[..., Value]]:
     """Keep every later load and store behind all earlier loads. Compiled kernels only."""
 
-    def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+    def codegen(context: BaseContext, builder: IRBuilder, signature: Signature, arguments: Sequence[Value]) -> Value:
         """Emit the LLVM code of the fence and return numba's None; numba defines the parameters."""
         builder.fence("acquire")
         return context.get_dummy_value()
@@ -91,10 +105,10 @@ def fence_acquire(compiler: Any) -> Any:
 
 
 @intrinsic
-def fence_release(compiler: Any) -> Any:
+def fence_release(compiler: ModuleType) -> tuple[Signature, Callable[..., Value]]:
     """Keep every earlier load and store in front of all later stores. Compiled kernels only."""
 
-    def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+    def codegen(context: BaseContext, builder: IRBuilder, signature: Signature, arguments: Sequence[Value]) -> Value:
         """Emit the LLVM code of the fence and return numba's None; numba defines the parameters."""
         builder.fence("release")
         return context.get_dummy_value()

@@ -11,12 +11,17 @@ import pickle
 import re
 from collections.abc import Callable
 from functools import cached_property
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from rtloop.foundation.native import machine_code
 from rtloop.foundation.native.uncompiled import allow_uncompiled, is_uncompiled_allowed
+
+if TYPE_CHECKING:
+    from _ctypes import CFuncPtr
+
+    from numba.core.typing.templates import Signature
 
 C_TYPES = {"int32": ctypes.c_int32, "int64": ctypes.c_int64, "uint64": ctypes.c_uint64, "intp": ctypes.c_ssize_t}
 C_TYPES |= {"voidptr": ctypes.c_ssize_t, "CPointer(float64)": ctypes.c_ssize_t}
@@ -28,7 +33,7 @@ FAILED = -1
 class ExportedKernel:
     """A kernel with a signature, such as "int64(intp, uint64)", and the address of its machine code."""
 
-    def __init__(self, function: Callable[..., Any], signature: str) -> None:
+    def __init__(self, function: Callable[..., object], signature: str) -> None:
         """Store the kernel and its signature; it is loaded or compiled when its address is first read."""
         self.__name__, self._function, self._signature = function.__name__, function, signature
         self._name = f"{function.__module__}.{function.__qualname__}"
@@ -49,7 +54,7 @@ class ExportedKernel:
         raise NotImplementedError
 
     @property
-    def _c_types(self) -> list[Any]:
+    def _c_types(self) -> list[type[ctypes._SimpleCData[int]]]:
         """The ctypes of the result and of each argument."""
         return [C_TYPES[type_name] for type_name in re.findall(r"\w+\(float64\)|\w+", self._signature)]
 
@@ -68,21 +73,21 @@ class CFunction(ExportedKernel):
             return self._machine_code or self._python_callback[1]
         return super().address
 
-    def __call__(self, *arguments: int) -> Any:
+    def __call__(self, *arguments: int) -> int:
         """Call the C function with integers and return its result."""
         return self._prototype(self.address)(*arguments)
 
     @cached_property
-    def _prototype(self) -> Any:
+    def _prototype(self) -> type[CFuncPtr]:
         """The C function's type; a call through it keeps the interpreter's lock."""
         result, *argument_types = self._c_types
         return ctypes.PYFUNCTYPE(result, *argument_types)
 
     @cached_property
-    def _python_callback(self) -> tuple[Any, int]:
+    def _python_callback(self) -> tuple[CFuncPtr, int]:
         """A C function that calls the Python function, and its address; an exception becomes the result FAILED."""
 
-        def call_python(*arguments: int) -> Any:
+        def call_python(*arguments: int) -> object:
             """Run the Python function, uncompiled, for a call from C, and return its result.
 
             An exception is dropped, and FAILED returned.
@@ -111,7 +116,7 @@ class CFunction(ExportedKernel):
 class Entry(ExportedKernel):
     """A kernel that Python calls; an exception that it raises reaches the caller."""
 
-    def __call__(self, *arguments: int) -> Any:
+    def __call__(self, *arguments: int) -> int:
         """Call the kernel with integers and return its result. Raises the kernel's exception."""
         result, raised = self._c_types[0](), ctypes.c_void_p()
         status = self._callable(ctypes.byref(result), ctypes.byref(raised), *arguments)
@@ -120,7 +125,7 @@ class Entry(ExportedKernel):
         return result.value
 
     @cached_property
-    def _callable(self) -> Any:
+    def _callable(self) -> CFuncPtr:
         """The machine code as a C function of two addresses, for result and exception, and the arguments.
 
         Its result is a status, 0 for success.
@@ -136,7 +141,11 @@ class Entry(ExportedKernel):
 
 
 def compile_kernel(
-    function: Callable[..., Any], signature: Any, name: str, options: dict[str, Any], raises: bool = False
+    function: Callable[..., object],
+    signature: Signature,
+    name: str,
+    options: dict[str, Any],
+    raises: bool = False,
 ) -> int:
     """Compile a kernel and return its address; store its machine code under `name` unless it needs numba at run time.
 
@@ -146,7 +155,7 @@ def compile_kernel(
     from rtloop.foundation.native.compiler import numba
     from rtloop.foundation.native.standalone import kernel_object_code
 
-    dispatcher: Any = numba.njit(**options)(function)
+    dispatcher = numba.njit(**options)(function)
     dispatcher.compile(signature)
     overload = dispatcher.overloads[signature.args]
     if code := kernel_object_code(overload.library, overload.fndesc.llvm_func_name, name, raises):
@@ -155,7 +164,7 @@ def compile_kernel(
     return overload.library.get_pointer_to_function(overload.fndesc.llvm_func_name)
 
 
-_dispatchers: list[Any] = []
+_dispatchers: list[object] = []
 """Dispatchers of all compiled kernels: numba frees the code of a deleted dispatcher."""
 
 

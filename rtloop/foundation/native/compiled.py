@@ -9,11 +9,18 @@ from __future__ import annotations
 import os
 from collections.abc import Callable
 from functools import cached_property, update_wrapper, wraps
-from typing import Any
+from types import ModuleType
+from typing import TYPE_CHECKING, Any
 
 from rtloop.foundation.native import machine_code
 from rtloop.foundation.native.c_function import CFunction, Entry, compile_kernel
 from rtloop.foundation.native.uncompiled import UncompiledFunction, is_uncompiled_allowed, register_function
+
+if TYPE_CHECKING:
+    from numba.core.ccallback import CFunc
+    from numba.core.dispatcher import Dispatcher
+    from numba.core.types.abstract import Type
+    from numba.core.typing.templates import Signature
 
 PACKAGE_PREFIX = "rtloop."
 """Prefix of the modules in the cache folder's digest; numba caches the kernels of other modules itself."""
@@ -24,7 +31,7 @@ UNCOMPILED = bool(int(os.environ.get("NUMBA_DISABLE_JIT") or 0))
 class Kernel:
     """A function that is compiled on first use; other attributes come from numba's dispatcher."""
 
-    def __init__(self, function: Callable[..., Any], options: dict[str, Any]) -> None:
+    def __init__(self, function: Callable[..., object], options: dict[str, Any]) -> None:
         """Store the function, uncompiled. `options` are numba's; with `cache`, numba stores the compiled code."""
         update_wrapper(self, function)
         self.py_func = function
@@ -32,13 +39,13 @@ class Kernel:
         self._cached = options.get("cache", False)
 
     @cached_property
-    def _dispatcher(self) -> Any:
+    def _dispatcher(self) -> Dispatcher:
         """numba's dispatcher of the function; the first access imports numba."""
         from rtloop.foundation.native.compiler import numba
 
         return numba.njit(cache=self._cached, **self.options)(self.py_func)
 
-    def __call__(self, *arguments: Any) -> Any:
+    def __call__(self, *arguments: object) -> Any:
         """Call the kernel and return its result; within `allow_uncompiled`, run its Python function."""
         return (self.py_func if is_uncompiled_allowed() else self._dispatcher)(*arguments)
 
@@ -59,26 +66,26 @@ class KernelSymbol:
     """
 
     def __init__(
-        self, name: str, resolve_type: Callable[[Any], Any], uncompiled: Callable[..., Any] | None = None
+        self, name: str, resolve_type: Callable[[ModuleType], Type], uncompiled: Callable[..., object] | None = None
     ) -> None:
         """Store the parts; `resolve_type` receives the module `native.compiler` when numba first needs the type."""
         self.__name__, self._resolve_type, self._uncompiled = name, resolve_type, uncompiled
 
-    def __call__(self, *arguments: Any) -> Any:
+    def __call__(self, *arguments: object) -> Any:
         """Call the Python equivalent and return its result. Raises NotImplementedError if there is none."""
         if self._uncompiled is None:
             raise NotImplementedError(f"{self.__name__} has no Python version; call it in compiled functions only")
         return self._uncompiled(*arguments)
 
     @cached_property
-    def _numba_type_(self) -> Any:
+    def _numba_type_(self) -> Type:
         """numba's type of this name in kernels; numba looks for this attribute."""
         from rtloop.foundation.native import compiler
 
         return self._resolve_type(compiler)
 
 
-def _make_kernel(function: Callable[..., Any], **options: Any) -> Any:
+def _make_kernel(function: Callable[..., object], **options: object) -> Kernel | Callable[..., object]:
     """Return a Kernel with numba's options, or the function itself if UNCOMPILED."""
     return function if UNCOMPILED else Kernel(function, options)
 
@@ -128,7 +135,7 @@ def jit_inline(function: Callable[..., Any]) -> Any:
     return _make_kernel(function, inline="always", error_model="numpy")
 
 
-def intrinsic(function: Callable[..., Any], uncompiled: Callable[..., Any] | None = None) -> Any:
+def intrinsic(function: Callable[..., object], uncompiled: Callable[..., object] | None = None) -> KernelSymbol:
     """Make a name for kernels from a function that generates its LLVM code.
 
     The function's first parameter is the module `native.compiler`; kernels leave it out. It returns signature and code
@@ -136,52 +143,50 @@ def intrinsic(function: Callable[..., Any], uncompiled: Callable[..., Any] | Non
     run without compilation; without one they cannot call the name.
     """
 
-    def resolve_type(compiler: Any) -> Any:
+    def resolve_type(compiler: ModuleType) -> Type:
         """Return numba's type of the name; `compiler` is the module `native.compiler`."""
 
         @wraps(function)
-        def typing_function(_: Any, *arguments: Any) -> Any:
+        def typing_function(_: object, *arguments: Type) -> object:
             return function(compiler, *arguments)
 
         return compiler.types.Function(compiler.make_intrinsic_template(symbol, typing_function, function.__name__))
 
-    symbol: Any = KernelSymbol(
-        function.__name__, resolve_type, uncompiled
-    )  # as Any, for its callers leave out that parameter
+    symbol = KernelSymbol(function.__name__, resolve_type, uncompiled)
     return symbol
 
 
-def intrinsic_like(uncompiled: Callable[..., Any]) -> Callable[[Callable[..., Any]], Any]:
+def intrinsic_like(uncompiled: Callable[..., object]) -> Callable[[Callable[..., object]], KernelSymbol]:
     """Decorate an `intrinsic` whose Python equivalent, for uncompiled kernels, is the function `uncompiled`."""
     return lambda function: intrinsic(function, uncompiled)
 
 
-def numba_function(name: str, uncompiled: Callable[..., Any] | None = None) -> Any:
+def numba_function(name: str, uncompiled: Callable[..., object] | None = None) -> KernelSymbol:
     """Return a function of numba's own, by name, for use in kernels; `uncompiled` is its Python equivalent, if any."""
     return KernelSymbol(name, lambda compiler: compiler.kernel_type(getattr(compiler.numba, name)), uncompiled)
 
 
-def c_library_function(name: str, signature: str, uncompiled: Callable[..., Any] | None = None) -> Any:
+def c_library_function(name: str, signature: str, uncompiled: Callable[..., object] | None = None) -> KernelSymbol:
     """Return a function of the C library for use in kernels; `uncompiled` is its Python equivalent, if any.
 
     `signature` is numba's, as a text such as "int32(int32, intp)".
     """
 
-    def resolve_type(compiler: Any) -> Any:
+    def resolve_type(compiler: ModuleType) -> Type:
         """Return numba's type of the function; `compiler` is the module `native.compiler`."""
         return compiler.types.ExternalFunction(name, compiler.parse_signature(signature))
 
     return KernelSymbol(name, resolve_type, uncompiled)
 
 
-def cfunc(signature: str) -> Callable[[Callable[..., Any]], Any]:
+def cfunc(signature: str) -> Callable[[Callable[..., object]], Any]:
     """Decorate a kernel: make it a C function whose `.address` other compiled code may call.
 
     `signature` is numba's, as a text. The result is a CFunction; numba's own C function outside of rtloop, and an
     UncompiledFunction if UNCOMPILED.
     """
 
-    def compile_function(function: Callable[..., Any]) -> Any:
+    def compile_function(function: Callable[..., object]) -> CFunction | UncompiledFunction | CFunc:
         """Return the C function of a kernel, of the kind that fits its module and UNCOMPILED."""
         if UNCOMPILED:
             return UncompiledFunction(function)
@@ -194,7 +199,7 @@ def cfunc(signature: str) -> Callable[[Callable[..., Any]], Any]:
     return compile_function
 
 
-def python_entry(signature: str) -> Callable[[Callable[..., Any]], Entry]:
+def python_entry(signature: str) -> Callable[[Callable[..., object]], Entry]:
     """Decorate a kernel that Python calls with integers and addresses: the result is an Entry.
 
     `signature` is a text such as "int64(intp, uint64)".
@@ -215,7 +220,7 @@ def native_address(kernel: Any, signature: Any) -> int:
     return overload.library.get_pointer_to_function(overload.fndesc.llvm_func_name)
 
 
-def cached_address(kernel: Any, name: str, signature: Callable[[], Any]) -> int:
+def cached_address(kernel: Kernel, name: str, signature: Callable[[], Signature]) -> int:
     """Return the address of a kernel, loaded from the cache by `name`, or compiled and stored under that name.
 
     `signature()` is called for a compilation alone; it returns numba's signature. Raises numba's errors for a function

@@ -14,7 +14,7 @@ from numba import config
 from numba.core import caching, cgutils, types
 from numba.core.registry import cpu_target
 from numba.core.sigutils import normalize_signature
-from numba.core.typing.templates import make_intrinsic_template
+from numba.core.typing.templates import Signature, make_intrinsic_template
 
 from rtloop.foundation.native.cache import CACHE_FOLDER
 from rtloop.foundation.native.numba_cache_file import CheckedCacheFile
@@ -49,13 +49,13 @@ config.CACHE_DIR = str(CACHE_FOLDER)  # pyright: ignore[reportAttributeAccessIss
 config.SLP_VECTORIZE, config.LOOP_VECTORIZE = 1, 0  # pyright: ignore[reportAttributeAccessIssue]
 
 
-def kernel_type(value: Any) -> Any:
+def kernel_type(value: object) -> types.Type:
     """Return numba's type of a Python value."""
     context: Any = cpu_target.typing_context
     return context.resolve_value_type(value)
 
 
-def parse_signature(text: str) -> Any:
+def parse_signature(text: str) -> Signature:
     """Return numba's signature for a text such as "int32(int32, intp)". Raises ValueError for one without a result."""
     arguments, result = normalize_signature(text)
     if result is None:

@@ -7,11 +7,14 @@ from __future__ import annotations
 
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 from rtloop.foundation.native import cache_files as stored
 
-_engines: list[Any] = []
+if TYPE_CHECKING:
+    from llvmlite.binding import ExecutionEngine, TargetMachine
+
+_engines: list[ExecutionEngine] = []
 """Engines that own the loaded machine code, one per load; several may hold copies of one kernel."""
 
 
@@ -46,7 +49,7 @@ def assemble(text: str, name: str) -> int:
     return engine.get_function_address(name)
 
 
-def _create_engine(text: str) -> Any:
+def _create_engine(text: str) -> ExecutionEngine:
     """Return an LLVM engine that contains a text in LLVM's assembly language, and keep it alive."""
     import llvmlite.binding as llvm
 
@@ -64,7 +67,7 @@ def _path(name: str) -> Path:
 
 
 @cache
-def _target_machine() -> Any:
+def _target_machine() -> TargetMachine:
     """Return LLVM's machine for this processor, created by the first call."""
     import llvmlite.binding as llvm
 

@@ -17,14 +17,14 @@ from rtloop.foundation.native import cache_files as stored
 class CheckedCacheFile(IndexDataCacheFile):
     """Index and data of one kernel. A damaged file is treated as missing and written again."""
 
-    def _load_index(self) -> Any:
+    def _load_index(self) -> dict[tuple[object, ...], str]:
         """Return a dict from each signature of the kernel to the file name of its code.
 
         It is empty if the index is missing or damaged.
         """
         return super()._load_index() if stored.read(Path(self._index_path)) is not None else {}
 
-    def _load_data(self, name: str) -> Any:
+    def _load_data(self, name: str) -> object:
         """Return the code in file `name`. Raises FileNotFoundError if damaged or missing: numba compiles again."""
         if stored.read(Path(self._data_path(name))) is None:
             raise FileNotFoundError(errno.ENOENT, "damaged, or not there", name)

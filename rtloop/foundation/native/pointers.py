@@ -6,26 +6,34 @@ another. The loop calls them by their address and needs no branch for each kind.
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Callable, Sequence
+from types import ModuleType
+from typing import TYPE_CHECKING
 
 from rtloop.foundation.native import uncompiled
 from rtloop.foundation.native.compiled import c_library_function, intrinsic_like, numba_function
 
-carray: Any = numba_function("carray", uncompiled.carray)
+if TYPE_CHECKING:
+    from llvmlite.ir import IRBuilder, Value
+    from numba.core.base import BaseContext
+    from numba.core.types.abstract import Type
+    from numba.core.typing.templates import Signature
+
+carray = numba_function("carray", uncompiled.carray)
 """numba's array view of a pointer."""
 SIGNATURE = "int32(voidptr, CPointer(float64))"
 """numba's signature of `int32 function(void *context, double *values)`."""
 
-copy_bytes: Any = c_library_function("memcpy", "intp(intp, intp, intp)")
+copy_bytes = c_library_function("memcpy", "intp(intp, intp, intp)")
 """`memcpy(target, source, bytes)`, with addresses as integers."""
 
 
 @intrinsic_like(uncompiled.call)
-def call(compiler: Any, function: Any, context: Any, values: Any) -> Any:
+def call(compiler: ModuleType, function: Type, context: Type, values: Type) -> tuple[Signature, Callable[..., Value]]:
     """Call `int32 function(void *context, double *values)` and return its result; all arguments are addresses."""
     types, ir = compiler.types, compiler.ir
 
-    def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+    def codegen(context: BaseContext, builder: IRBuilder, signature: Signature, arguments: Sequence[Value]) -> Value:
         """Emit the LLVM code of a call and return its value; numba defines the parameters."""
         void_pointer, double_pointer = ir.IntType(8).as_pointer(), ir.DoubleType().as_pointer()
         function_type = ir.FunctionType(ir.IntType(32), [void_pointer, double_pointer]).as_pointer()
@@ -40,8 +48,8 @@ def call(compiler: Any, function: Any, context: Any, values: Any) -> Any:
 
 @intrinsic_like(uncompiled.call_law)
 def call_law(
-    compiler: Any, function: Any, result: Any, raised: Any, coefficients: Any, state: Any, law_input: Any
-) -> Any:
+    compiler: ModuleType, function: Type, result: Type, raised: Type, coefficients: Type, state: Type, law_input: Type
+) -> tuple[Signature, Callable[..., Value]]:
     """Call a function of a law and return its status, 0 unless it raised.
 
     `function`, `result`, `raised`, `coefficients` and `state` are addresses; `law_input` is an address or a float64. It
@@ -49,7 +57,7 @@ def call_law(
     """
     types, ir = compiler.types, compiler.ir
 
-    def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+    def codegen(context: BaseContext, builder: IRBuilder, signature: Signature, arguments: Sequence[Value]) -> Value:
         """Emit the LLVM code of a call and return its value; numba defines the parameters."""
         pointer = ir.IntType(8).as_pointer()
         last = ir.DoubleType() if number else pointer
@@ -64,11 +72,11 @@ def call_law(
 
 
 @intrinsic_like(uncompiled.address_pointer)
-def address_pointer(compiler: Any, address: Any) -> Any:
+def address_pointer(compiler: ModuleType, address: Type) -> tuple[Signature, Callable[..., object]]:
     """Convert an integer address to `void *`, for numba.carray."""
     types = compiler.types
 
-    def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+    def codegen(context: BaseContext, builder: IRBuilder, signature: Signature, arguments: Sequence[Value]) -> object:
         """Emit the LLVM code of the conversion and return its value; numba defines the parameters."""
         return builder.inttoptr(arguments[0], context.get_value_type(types.voidptr))
 
@@ -76,14 +84,14 @@ def address_pointer(compiler: Any, address: Any) -> Any:
 
 
 @intrinsic_like(uncompiled.load_word)
-def load_word(compiler: Any, address: Any) -> Any:
+def load_word(compiler: ModuleType, address: Type) -> tuple[Signature, Callable[..., Value]]:
     """Load the eight bytes at an address as uint64, in the processor's byte order, and not as one atomic operation.
 
     The address need not be aligned.
     """
     types, ir = compiler.types, compiler.ir
 
-    def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+    def codegen(context: BaseContext, builder: IRBuilder, signature: Signature, arguments: Sequence[Value]) -> Value:
         """Emit the LLVM code of a load and return its value; numba defines the parameters."""
         return builder.load(builder.inttoptr(arguments[0], ir.IntType(64).as_pointer()), align=1)
 

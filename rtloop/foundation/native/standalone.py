@@ -7,9 +7,12 @@ this module emits the same instructions with a plain C function around them.
 from __future__ import annotations
 
 import ctypes
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import llvmlite.binding as llvm
+
+if TYPE_CHECKING:
+    from numba.core.codegen import CPUCodeLibrary
 
 EXCEPTION_PREFIX = ".const.pickle"
 """Prefix of the names of numba's constants that describe an exception."""
@@ -29,7 +32,7 @@ define {result} @"{name}"({arguments}) {{
 status."""
 
 
-def kernel_object_code(library: Any, symbol: str, name: str, raises: bool) -> bytes | None:
+def kernel_object_code(library: CPUCodeLibrary, symbol: str, name: str, raises: bool) -> bytes | None:
     """Return the object code of a compiled kernel, with `name` for its symbol; None if it needs numba at run time.
 
     With `raises`, the code may contain descriptions of exceptions; without it, None for a kernel that may raise.
@@ -47,7 +50,7 @@ def c_function_object_code(cfunc: Any, name: str) -> bytes | None:
     return _emit_object_code(module, name, library._codegen._tm, raises=False)
 
 
-def _emit_object_code(module: Any, name: str, machine: Any, raises: bool) -> bytes | None:
+def _emit_object_code(module: llvm.ModuleRef, name: str, machine: llvm.TargetMachine, raises: bool) -> bytes | None:
     """Return object code that exports `name` alone.
 
     None if it needs a symbol that neither LLVM nor this process has, or may raise without `raises`. `module` is
@@ -68,7 +71,7 @@ def _emit_object_code(module: Any, name: str, machine: Any, raises: bool) -> byt
     return machine.emit_object(module)
 
 
-def _wrapper_text(module: Any, numba_name: str, name: str) -> str:
+def _wrapper_text(module: llvm.ModuleRef, numba_name: str, name: str) -> str:
     """Return LLVM's text (IR) of a C function `name` with the signature of `numba_name`, a C function of numba's.
 
     It calls the same kernel and ignores the kernel's status. `module` is the parsed LLVM module that defines both.

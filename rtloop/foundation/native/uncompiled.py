@@ -17,10 +17,11 @@ from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from rtloop.foundation.native import word_access as words
 
-_functions: dict[int, Callable[..., Any]] = {}
+_functions: dict[int, Callable[..., object]] = {}
 _numbers = itertools.count(1)
 OK, RAISED = 0, -1
 raised_exceptions: list[Exception] = []
@@ -43,7 +44,7 @@ def is_uncompiled_allowed() -> bool:
     return getattr(_thread, "as_written", False)
 
 
-def register_function(function: Callable[..., Any]) -> int:
+def register_function(function: Callable[..., object]) -> int:
     """Assign the next number, from 1, to `function`, by which `call` and `call_law` find it; return the number."""
     number = next(_numbers)
     _functions[number] = function
@@ -53,11 +54,11 @@ def register_function(function: Callable[..., Any]) -> int:
 class UncompiledFunction:
     """A registered function that can be called, and has an address for `call`, like a compiled C function."""
 
-    def __init__(self, function: Callable[..., Any]) -> None:
+    def __init__(self, function: Callable[..., object]) -> None:
         """Register `function`, which a call runs as plain Python; `address` is its number for `call`."""
         self._function, self.address = function, register_function(function)
 
-    def __call__(self, *arguments: int) -> Any:
+    def __call__(self, *arguments: int) -> object:
         """Call the function with integers, such as addresses, and return its result."""
         return self._function(*arguments)
 
@@ -72,7 +73,7 @@ def load_word(address: int) -> np.uint64:
     return np.uint64(ctypes.c_uint64.from_buffer_copy(ctypes.string_at(int(address), 8)).value)
 
 
-def carray(pointer: int, shape: Any, dtype: Any = np.float64) -> Any:
+def carray(pointer: int, shape: int | tuple[int, ...], dtype: npt.DTypeLike = np.float64) -> Any:
     """Return an array over the memory at address `pointer`, not a copy; the fields of its records are attributes.
 
     For a size of 0 it is a new array, and the address is not used.
@@ -86,12 +87,12 @@ def carray(pointer: int, shape: Any, dtype: Any = np.float64) -> Any:
     return array.view(np.recarray) if record_type.names else array
 
 
-def call(function: int, context: int, values: int) -> Any:
+def call(function: int, context: int, values: int) -> object:
     """Call a registered function with two addresses, like `pointers.call`; return its status."""
     return _functions[int(function)](int(context), int(values))
 
 
-def call_law(function: int, result: int, raised_address: int, coefficients: int, state: int, law_input: Any) -> int:
+def call_law(function: int, result: int, raised_address: int, coefficients: int, state: int, law_input: float) -> int:
     """Call a registered function of a law, like `pointers.call_law`; return OK or RAISED.
 
     A result other than None is written to the float64 at `result`; an exception is appended to `raised_exceptions`, and
@@ -107,11 +108,11 @@ def call_law(function: int, result: int, raised_address: int, coefficients: int,
     return OK
 
 
-def load_acquire(array: Any, index: int) -> Any:
+def load_acquire(array: npt.NDArray[np.uint64], index: int) -> np.uint64:
     """Return word `index` of a uint64 array, ordered as by `atomics.load_acquire`."""
     return np.uint64(words.load_acquire(array.ctypes.data + int(index) * array.itemsize))
 
 
-def store_release(array: Any, index: int, value: int) -> None:
+def store_release(array: npt.NDArray[np.uint64], index: int, value: int) -> None:
     """Set word `index` of a uint64 array, ordered as by `atomics.store_release`."""
     words.store_release(array.ctypes.data + int(index) * array.itemsize, int(value))

@@ -8,9 +8,12 @@ from __future__ import annotations
 
 import ctypes
 from functools import cache
-from typing import Any
+from typing import TYPE_CHECKING
 
 from rtloop.foundation.native import machine_code
+
+if TYPE_CHECKING:
+    from _ctypes import CFuncPtr
 
 _LLVM_TEXT = """
 define i64 @load_acquire(i64 %address) {
@@ -35,7 +38,7 @@ _WORD = ctypes.c_uint64
 
 
 @cache
-def _assembled_function(name: str, result: Any, count: int) -> Any:
+def _assembled_function(name: str, result: type[ctypes._SimpleCData[int]] | None, count: int) -> CFuncPtr:
     """Return a function of `_LLVM_TEXT` with `count` words as arguments; a call keeps the interpreter's lock."""
     return ctypes.PYFUNCTYPE(result, *[_WORD] * count)(machine_code.assemble(_LLVM_TEXT, name))
 

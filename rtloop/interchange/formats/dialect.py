@@ -12,11 +12,14 @@ import re
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 from rtloop.foundation.trusted import open_user_file
 from rtloop.interchange.formats.table import UnreadableData
 from rtloop.interchange.units import is_unit
+
+if TYPE_CHECKING:
+    import pandas
 
 SAMPLE_BYTES = 1 << 16
 SAMPLE_LINES = 1000
@@ -108,7 +111,7 @@ def is_number(field: str, decimal: str) -> bool:
     return bool((_COMMA if decimal == "," else _POINT).fullmatch(field)) or field.lower() in (*NO_NUMBER, *INFINITE)
 
 
-def strip_units(text: Any) -> Any:
+def strip_units(text: pandas.Series) -> pandas.Series:
     """Return a column of fields (a pandas series of text) without the units behind their numbers."""
     return text.str.replace(_TRAILING_UNIT, "", regex=True)
 

@@ -7,12 +7,15 @@ import csv
 import io
 import os
 import re
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from rtloop.errors import MissingExtra
+from rtloop.foundation.arrays import Real
 from rtloop.foundation.trusted import open_user_file
 from rtloop.interchange.formats.dialect import LONGEST_LINE, NO_NUMBER, CsvDialect, detect_dialect, strip_units
 from rtloop.interchange.formats.groups import MAX_BYTES, MAX_COLUMNS, unique_name
@@ -78,7 +81,7 @@ class _NumberLines(io.TextIOBase):
             raise UnreadableData(f"{self._path}: damaged: contains {fault}")
         return text
 
-    def __iter__(self) -> Any:
+    def __iter__(self) -> Iterator[str]:
         """Return an iterator over the lines, with their ends; it checks nothing, unlike `read`."""
         return iter(self._file)
 
@@ -87,7 +90,7 @@ class _NumberLines(io.TextIOBase):
         self._file.close()
 
 
-def _read_numbers(path: Path, dialect: CsvDialect) -> list[list[np.ndarray[Any, Any]]]:
+def _read_numbers(path: Path, dialect: CsvDialect) -> list[list[npt.NDArray[Any]]]:
     """Return blocks of rows, each a list of columns (rows,): first the dates, in ns since 1970, then the numbers.
 
     Raises UnreadableData with the place of a text among the numbers, for a row of another length, and for too many
@@ -97,8 +100,8 @@ def _read_numbers(path: Path, dialect: CsvDialect) -> list[list[np.ndarray[Any, 
         import pandas
     except ImportError:
         raise MissingExtra("CSV needs pandas: pip install 'rtloop[data]'") from None
-    blocks: list[list[np.ndarray[Any, Any]]] = []
-    without_last: list[np.ndarray[Any, Any]] = []
+    blocks: list[list[npt.NDArray[Any]]] = []
+    without_last: list[npt.NDArray[np.intp]] = []
     rows, max_rows = 0, min(MAX_ROWS, MAX_BYTES // (8 * len(dialect.numbers)))
     lines = _NumberLines(path, dialect)
     try:
@@ -133,7 +136,7 @@ def _read_numbers(path: Path, dialect: CsvDialect) -> list[list[np.ndarray[Any, 
     return blocks
 
 
-def _require_even_rows(path: Path, dialect: CsvDialect, without_last: np.ndarray[Any, Any]) -> None:
+def _require_even_rows(path: Path, dialect: CsvDialect, without_last: npt.NDArray[np.intp]) -> None:
     """Raise UnreadableData for the first row with fewer columns than the others, unless it is the last of the file.
 
     Only the rows `without_last` are examined: (rows,) the numbers, rising from 0 for the first row of numbers, of rows
@@ -159,7 +162,7 @@ def _uneven_row_message(line: int, columns: int, dialect: CsvDialect) -> str:
     return f"line {line} has {count_text(columns, 'column')}; {allowed}"
 
 
-def _column_numbers(path: Path, dialect: CsvDialect, values: Any) -> np.ndarray[Any, Any]:
+def _column_numbers(path: Path, dialect: CsvDialect, values: Any) -> Real:
     """Return the numbers of a column, a series of pandas, as float64; missing ones are NaN.
 
     Raises UnreadableData at the first text.
@@ -182,7 +185,7 @@ def _column_numbers(path: Path, dialect: CsvDialect, values: Any) -> np.ndarray[
     return numbers
 
 
-def _dates_ns(path: Path, dialect: CsvDialect, values: Any) -> np.ndarray[Any, Any]:
+def _dates_ns(path: Path, dialect: CsvDialect, values: Any) -> npt.NDArray[np.int64]:
     """Return the dates of a column, a series of pandas, as ns since 1970 in UTC, int64.
 
     Raises UnreadableData at the first field without a date, such as NaN.

@@ -10,8 +10,9 @@ from __future__ import annotations
 import os
 import warnings
 import zlib
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import IO, Any, TypeGuard
 
 import numpy as np
 
@@ -50,7 +51,7 @@ def read_mat(path: Path, group: str | None = None) -> Table:
     return select_table(path, tables | columns.grouped_tables(), group, columns.in_other_files)
 
 
-def _load_variables(path: Path, head: bytes) -> dict[str, Any]:
+def _load_variables(path: Path, head: bytes) -> dict[str, object]:
     """Return the variables of a file of version 5 or older by name, structures as dicts.
 
     `head` is the begin of the file, at least HEADER_BYTES, which tells the version. Raises UnreadableData if it is no
@@ -94,7 +95,7 @@ def _require_bounded_size(path: Path, order: str) -> None:
             position += 8 + length
 
 
-def _decompressed_size(path: Path, file: Any, length: int, limit: int) -> int:
+def _decompressed_size(path: Path, file: IO[bytes], length: int, limit: int) -> int:
     """Return the decompressed size in bytes of an element of `length` bytes at the place that `file` has reached.
 
     Counting ends with the first block beyond `limit`, so that a larger size is only known to be above it. Raises
@@ -111,7 +112,7 @@ def _decompressed_size(path: Path, file: Any, length: int, limit: int) -> int:
     return total
 
 
-def _is_controldesk(value: Any) -> bool:
+def _is_controldesk(value: object) -> TypeGuard[Mapping[str, object]]:
     """Whether `value` is a structure of ControlDesk: X and Y(k), each with Data."""
     if not isinstance(value, dict) or not {"X", "Y"} <= value.keys():
         return False
@@ -120,7 +121,7 @@ def _is_controldesk(value: Any) -> bool:
     )
 
 
-def _controldesk_tables(path: Path, value: dict[str, Any]) -> dict[str, Table]:
+def _controldesk_tables(path: Path, value: Mapping[str, object]) -> dict[str, Table]:
     """Return a table for each X that has columns, by the name of its raster: "X(2)" without a name, "" for a single X.
 
     A Y belongs to an X of equal length, unless its XIndex or its raster names another one.
@@ -144,7 +145,7 @@ def _controldesk_tables(path: Path, value: dict[str, Any]) -> dict[str, Table]:
     return tables
 
 
-def _rasters_agree(y: dict[str, Any], x: dict[str, Any]) -> bool:
+def _rasters_agree(y: Mapping[str, object], x: Mapping[str, object]) -> bool:
     """Whether signal `y` and time `x` name the same raster; True also where either names none."""
     y_raster, x_raster = _as_text(y.get("Raster")), _as_text(x.get("Raster"))
     return not y_raster or not x_raster or y_raster == x_raster
@@ -156,14 +157,14 @@ def _raster_index(y: dict[str, Any]) -> int | None:
     return int(number) if number is not None and np.size(number) == 1 else None
 
 
-def _description(value: dict[str, Any]) -> dict[str, str]:
+def _description(value: Mapping[str, object]) -> dict[str, str]:
     """Return {"description": text}, at most 200 characters, of a structure of ControlDesk; {} without one."""
     text = value.get("Description")
     text = next((entry for entry in text.values() if isinstance(entry, str)), "") if isinstance(text, dict) else text
     return {"description": text[:200]} if isinstance(text, str) and text else {}
 
 
-def _collect_arrays(columns: FileColumns, path: str, value: Any, depth: int, unit: str | None = None) -> None:
+def _collect_arrays(columns: FileColumns, path: str, value: object, depth: int, unit: str | None = None) -> None:
     """Collect every array of numbers below `value` into `columns`, by its path; names and units are beside it.
 
     `unit` counts if `value` is an array itself; `depth` is the number of levels above it. Objects that only MATLAB
@@ -197,7 +198,7 @@ def _collect_arrays(columns: FileColumns, path: str, value: Any, depth: int, uni
         columns.add_column(path, value, unit)
 
 
-def _collect_signals(columns: FileColumns, path: str, signals: Any, depth: int) -> None:
+def _collect_signals(columns: FileColumns, path: str, signals: object, depth: int) -> None:
     """Collect Simulink's signals(k) into `columns`: values under their label, others like any structure.
 
     In values of three or more dimensions, the time is the last one.
@@ -218,14 +219,14 @@ def _collect_signals(columns: FileColumns, path: str, signals: Any, depth: int) 
             _collect_arrays(columns, f"{path}/signals/{number}", signal, depth + 1)
 
 
-def _as_list(value: Any) -> list[Any]:
+def _as_list(value: object) -> list[Any]:
     """Return a structure as a list of one, or the elements of a list or array of structures; [] for other values."""
     if isinstance(value, dict):
         return [value]
     return list(value.ravel()) if isinstance(value, np.ndarray) else list(value) if isinstance(value, list) else []
 
 
-def _as_text(value: Any) -> str:
+def _as_text(value: object) -> str:
     """Return stripped text, or empty text for other values."""
     return value.strip() if isinstance(value, str) else ""
 

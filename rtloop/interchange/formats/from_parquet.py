@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -13,6 +13,9 @@ from rtloop.errors import MissingExtra
 from rtloop.foundation.trusted import open_user_file
 from rtloop.interchange.formats.groups import FileColumns, select_table
 from rtloop.interchange.formats.table import Table, UnreadableData
+
+if TYPE_CHECKING:
+    import pyarrow
 
 
 def read_parquet(path: Path) -> Table:
@@ -41,7 +44,7 @@ def read_parquet(path: Path) -> Table:
     return replace(table, time=table.time or time_column)
 
 
-def _add_field(columns: FileColumns, field: Any, column: Any) -> None:
+def _add_field(columns: FileColumns, field: pyarrow.Field, column: pyarrow.ChunkedArray) -> None:
     """Add a column of numbers or times to `columns`; columns of other types are listed as left out.
 
     Durations are in s, dates in s since the first row.

@@ -6,9 +6,9 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import takewhile
 from pathlib import Path
-from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from rtloop.foundation.arrays import Real
 from rtloop.interchange.formats.table import MAX_ROWS, Table, UnreadableData
@@ -52,7 +52,7 @@ class FileColumns:
                 "the file with the program that wrote it, or write fewer signals"
             )
 
-    def add_column(self, name: str, values: Any, unit: str | None = None) -> None:
+    def add_column(self, name: str, values: npt.ArrayLike, unit: str | None = None) -> None:
         """Add one column as float64, or each column of a matrix, whose longer side is the time, as NAME_1, NAME_2, ….
 
         A name that exists already gets a number in brackets. Single values are ignored; text, larger matrices and
@@ -183,7 +183,7 @@ def _shared_depth(first_path: str, second_path: str) -> int:
     return depth
 
 
-def _kind_description(array: np.ndarray[Any, Any]) -> str:
+def _kind_description(array: npt.NDArray[np.generic]) -> str:
     """Return the kind of an array that holds no numbers, as text."""
     return {"U": "text", "S": "text", "O": "text or cells", "c": "complex", "M": "dates"}.get(
         array.dtype.kind, "no numbers"

@@ -7,14 +7,17 @@ ROS 1 is not decoded: the available libraries generate code from a file's defini
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator, Mapping
-from typing import Any
+from collections.abc import Callable, Collection, Iterator, Mapping
+from typing import TYPE_CHECKING, Any
 
 import pydantic_core
 from mcap.records import Channel, Schema
 
 from rtloop.errors import MissingExtra
 from rtloop.recording.file.mcap.stock import encoding
+
+if TYPE_CHECKING:
+    from google.protobuf.message import Message
 
 MOST_FIELDS = 2000
 MOST_ITEMS = 1000
@@ -48,7 +51,7 @@ def decoder(channel: Channel, schema: Schema | None) -> Callable[[bytes], Fields
     raise DecodingError(f"messages are encoded as {encoding(channel, schema)}; allowed: {ENCODINGS}")
 
 
-def _flat(value: Any, children: Callable[[Any], Iterator[tuple[str, Any]] | None]) -> Fields:
+def _flat(value: object, children: Callable[[object], Iterator[tuple[str, object]] | None]) -> Fields:
     """Return all numbers in `value` by name; `children` gives the named parts of a value, None for a leaf.
 
     True and False are 1 and 0, None is NaN. A text counts only if it is one of WORDS, such as "NaN" and "-Infinity";
@@ -56,7 +59,7 @@ def _flat(value: Any, children: Callable[[Any], Iterator[tuple[str, Any]] | None
     deeply nested fields, and for too large an integer.
     """
     fields: Fields = {}
-    pending: list[tuple[str, Any, int]] = [("", value, 0)]
+    pending: list[tuple[str, object, int]] = [("", value, 0)]
     while pending:
         name, node, depth = pending.pop()
         parts = children(node)
@@ -82,7 +85,7 @@ def _double(value: float) -> float:
         raise DecodingError("an integer is too large for a 64-bit float") from None
 
 
-def _items(values: Any) -> Iterator[tuple[str, Any]]:
+def _items(values: Collection[object]) -> Iterator[tuple[str, object]]:
     """Return the items of a list with their numbers, from 0, as names; none for a list beyond MOST_ITEMS."""
     return ((str(place), value) for place, value in enumerate(values)) if len(values) <= MOST_ITEMS else iter(())
 
@@ -98,14 +101,14 @@ def _json(payload: bytes) -> Fields:
     return _flat(content, _json_children)
 
 
-def _json_children(value: Any) -> Iterator[tuple[str, Any]] | None:
+def _json_children(value: object) -> Iterator[tuple[str, object]] | None:
     """Return the named parts of a JSON value; None for a leaf."""
     if isinstance(value, dict):
         return iter(value.items())
     return _items(value) if isinstance(value, list) else None
 
 
-def message_class(schema: Schema) -> Any:
+def message_class(schema: Schema) -> type[Message]:
     """Return the class of a protobuf schema's messages.
 
     Raises DecodingError if the schema cannot be read, MissingExtra without protobuf.
@@ -137,7 +140,7 @@ def _protobuf(schema: Schema) -> Callable[[bytes], Fields]:
     kind = message_class(schema)
     from google.protobuf.message import DecodeError, Message
 
-    def children(value: Any) -> Iterator[tuple[str, Any]] | None:
+    def children(value: Any) -> Iterator[tuple[str, object]] | None:
         """Return the named parts of a protobuf value; None for a leaf."""
         if isinstance(value, Message):
             return _present(value)
@@ -155,7 +158,7 @@ def _protobuf(schema: Schema) -> Callable[[bytes], Fields]:
     return decode
 
 
-def _present(message: Any) -> Iterator[tuple[str, Any]]:
+def _present(message: Message) -> Iterator[tuple[str, object]]:
     """Yield the fields of a protobuf message, except optional fields without a value."""
     for field in message.DESCRIPTOR.fields:
         if not field.has_presence or message.HasField(field.name):
@@ -189,7 +192,7 @@ def _ros2(schema: Schema) -> Callable[[bytes], Fields]:
     return decode
 
 
-def _ros2_children(value: Any) -> Iterator[tuple[str, Any]] | None:
+def _ros2_children(value: Any) -> Iterator[tuple[str, object]] | None:
     """Return the named parts of a ROS 2 value; None for a leaf."""
     if hasattr(value, "__slots__") and not isinstance(value, bytes | memoryview):
         return ((name, getattr(value, name)) for name in value.__slots__)

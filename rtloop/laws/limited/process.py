@@ -18,7 +18,7 @@ import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, Any, TypeVar
 
 from rtloop.drivers.errors import DriverError
 from rtloop.errors import ConfigError, RtloopError, UnavailableError
@@ -32,6 +32,7 @@ MAX_WAIT_FACTOR = 6.0
 """Multiple of a limit after which a process is abandoned, however busy the host is."""
 MAX_OUTPUT_BYTES = 1 << 16
 """Largest number of bytes that a law's code may print in a job."""
+Result = TypeVar("Result")
 
 
 class AbandonedJob(UnavailableError):
@@ -63,7 +64,7 @@ class LimitedProcess:
         process = self._process  # Another thread may end it meanwhile.
         return None if process is None else process.pid
 
-    def prepare_ahead(self, function: Callable[..., Any]) -> None:
+    def prepare_ahead(self, function: Callable[..., object]) -> None:
         """Start the process and have it import `function`, without waiting for it.
 
         An OSError is ignored: the first job tries again.
@@ -72,7 +73,9 @@ class LimitedProcess:
             self._start()
             self._prepare(function, compiles=False)
 
-    def run(self, function: Callable[..., Any], *arguments: Any, compiles: bool = False, show: bool = True) -> Any:
+    def run(
+        self, function: Callable[..., Result], *arguments: object, compiles: bool = False, show: bool = True
+    ) -> Result:
         """Run a module-level function in the limited process and return its result; `show` forwards its output to
         stderr.
 
@@ -146,7 +149,7 @@ class LimitedProcess:
         )
         atexit.register(self.end)
 
-    def _prepare(self, function: Callable[..., Any], compiles: bool) -> None:
+    def _prepare(self, function: Callable[..., object], compiles: bool) -> None:
         """Send the preparation of a job and count it in `_unanswered`; its acknowledgement is read later."""
         preparation = Preparation(os.getcwd(), sys.path, pickle.dumps(function), compiles, self.limit_s)
         self._send(pickle.dumps((PREPARE, tuple(preparation))))

@@ -5,12 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from contextlib import suppress
 from functools import partial
-from typing import Any
 
 from rtloop.drivers.errors import DriverError
 from rtloop.errors import ConfigError, RtloopError
 from rtloop.laws.limited.announcement import is_limited
-from rtloop.laws.limited.process import PROCESS, AbandonedJob
+from rtloop.laws.limited.process import PROCESS, AbandonedJob, Result
 from rtloop.laws.registry import LawReference
 
 
@@ -22,7 +21,7 @@ def needs_limited_process(laws: Iterable[LawReference]) -> bool:
     return not is_limited() and any(law.text for law in laws)
 
 
-def run_limited(source: str, function: Callable[..., Any], *arguments: Any, compiles: bool = False) -> Any:
+def run_limited(source: str, function: Callable[..., Result], *arguments: object, compiles: bool = False) -> Result:
     """Run `function` in the limited process and return its result; `compiles` says whether it needs the compiler.
 
     Raises ConfigError of `source` for faults of a law and for every ConfigError of `function`, DriverError and
@@ -31,7 +30,7 @@ def run_limited(source: str, function: Callable[..., Any], *arguments: Any, comp
     return _run_for_source(source, partial(PROCESS.run, compiles=compiles), function, *arguments)
 
 
-def try_limited(source: str, function: Callable[..., Any], *arguments: Any) -> None:
+def try_limited(source: str, function: Callable[..., object], *arguments: object) -> None:
     """Run `function` in the limited process before it runs in this one; no effect inside a limited process.
 
     Raises ConfigError of `source` if a law's code ends the process, does not return, leaves a thread or process, or
@@ -42,7 +41,9 @@ def try_limited(source: str, function: Callable[..., Any], *arguments: Any) -> N
         _run_for_source(source, partial(PROCESS.run, show=False), partial(_run_ignoring_errors, function), *arguments)
 
 
-def _run_for_source(source: str, run: Callable[..., Any], function: Callable[..., Any], *arguments: Any) -> Any:
+def _run_for_source(
+    source: str, run: Callable[..., Result], function: Callable[..., object], *arguments: object
+) -> Result:
     """Return `run(function, *arguments)`; its ConfigError, and AbandonedJob caused by a law, become ConfigError of
     `source`.
 
@@ -58,7 +59,7 @@ def _run_for_source(source: str, run: Callable[..., Any], function: Callable[...
         raise ConfigError(source, [str(error)]) from None
 
 
-def _run_ignoring_errors(function: Callable[..., Any], *arguments: Any) -> None:
+def _run_ignoring_errors(function: Callable[..., object], *arguments: object) -> None:
     """Call `function` and ignore ValueError, RtloopError and DriverError."""
     with suppress(ValueError, RtloopError, DriverError):
         function(*arguments)

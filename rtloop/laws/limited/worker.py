@@ -15,7 +15,7 @@ import sys
 import traceback
 from collections.abc import Callable
 from difflib import get_close_matches
-from typing import IO, Any, NamedTuple
+from typing import IO, NamedTuple
 
 from rtloop.drivers.errors import DriverError
 from rtloop.errors import ConfigError, RtloopError
@@ -54,7 +54,7 @@ class Worker:
 
     def work(self) -> None:
         """Process jobs until the parent ends or closes its pipe. Arguments belong to the latest preparation."""
-        function: Callable[..., Any] = _identity
+        function: Callable[..., object] = _identity
         limit_s = 0.0
         while (data := read_frame(self._jobs)) is not None:
             kind, content = pickle.loads(data)
@@ -68,7 +68,7 @@ class Worker:
             signal.setitimer(signal.ITIMER_PROF, 0.0)
             self._answer(*outcome)
 
-    def _prepare(self, preparation: Preparation) -> Callable[..., Any]:
+    def _prepare(self, preparation: Preparation) -> Callable[..., object]:
         """Set folder and module path, load a job's function and all that it needs, acknowledge; return the function."""
         os.chdir(preparation.folder)
         sys.path[:] = preparation.module_folders
@@ -78,7 +78,7 @@ class Worker:
         self._answer("ready", None)
         return function
 
-    def _outcome(self, function: Callable[..., Any], arguments: bytes) -> tuple[str, Any]:
+    def _outcome(self, function: Callable[..., object], arguments: bytes) -> tuple[str, object]:
         """Run the function; return kind and value of the answer: "done" with the pickled result, or as `_failure` does.
 
         "leftover" with a message if a law's code left a thread or process, or replaced a stream.
@@ -95,7 +95,7 @@ class Worker:
             return "leftover", fault
         return kind, value
 
-    def _failure(self, error: BaseException) -> tuple[str, Any]:
+    def _failure(self, error: BaseException) -> tuple[str, object]:
         """Return the answer for an error: "faults" (source, faults), "driver" or "error" with the message.
 
         An error of another class is a fault of the law if a law was announced. Without a law, an ArithmeticError is a
@@ -124,7 +124,7 @@ class Worker:
             self._law = kind, file
             self._answer("begins", self._law)
 
-    def _answer(self, kind: str, value: Any) -> None:
+    def _answer(self, kind: str, value: object) -> None:
         """Send kind and value of a message to the parent."""
         write_frame(self._answers, pickle.dumps((kind, value)))
 
@@ -168,14 +168,14 @@ def _suggestion(error: BaseException) -> str:
     return f"; did you mean {near[0]}?" if near else ""
 
 
-def _streams() -> list[tuple[int, Any]]:
+def _streams() -> list[tuple[int, IO[str]]]:
     """Return (inode, Python object) of stdin, stdout and stderr, in this order, to tell later whether a law replaced
     one.
     """
     return [(os.fstat(number).st_ino, getattr(sys, name)) for number, name in STREAMS.items()]
 
 
-def _leftover_fault(threads: int, streams: list[tuple[int, Any]]) -> str | None:
+def _leftover_fault(threads: int, streams: list[tuple[int, IO[str]]]) -> str | None:
     """Return the fault if the law's code left a thread or process, or replaced or closed a standard stream, else None.
 
     `threads` and `streams` are from before the job.

@@ -10,10 +10,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 from functools import cached_property
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
+import numpy.typing as npt
 
+from rtloop.foundation.arrays import Real
 from rtloop.foundation.native.compiled import jit
 from rtloop.kernel.layout import MAX_COUPLED, cache_line_record
 from rtloop.kernel.validity import Allowed
@@ -115,7 +117,7 @@ class Coupled(CoupledController):
     output, update, enter = commands, advance, continue_from_commands
 
     @cached_property
-    def _controller_and_tracking(self) -> tuple[SampledCoupledSystem, Any]:
+    def _controller_and_tracking(self) -> tuple[SampledCoupledSystem, Real]:
         """Discrete controller with its decoupling, and its anti-windup matrix M (states, axes).
 
         Raises ValueError for options that cannot be discretised.
@@ -145,7 +147,7 @@ class Coupled(CoupledController):
             tracking = antiwindup_matrix(system.a, system.b, decoupling @ system.c)
         return SampledCoupledSystem(system.transform(after=decoupling), self.period_s), tracking
 
-    def build(self) -> Mapping[str, Any]:
+    def build(self) -> Mapping[str, npt.ArrayLike]:
         """Return `order`, `count` (of axes), `a`, `b`, `c`, `d` of the discrete controller with its decoupling, and the
         coefficients of its anti-windup and of its entry.
 

@@ -12,8 +12,8 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from types import MappingProxyType
-from typing import Any
 
+import numpy as np
 from pydantic import Field
 
 from rtloop.laws.contract import Controller
@@ -41,7 +41,7 @@ class IntegralResonant(Controller):
     coefficients = MappingProxyType({name: float for name in ("ki", "feedthrough", "decay", "tracking")})
     state = MappingProxyType({"integral_um": float, "lag_um": float})
 
-    def build(self) -> Mapping[str, Any]:
+    def build(self) -> Mapping[str, float]:
         """Return ki = ki_per_s T, feedthrough = d, decay = exp(−k d T) of the lag and tracking, for the period T.
 
         `tracking` is the part of (v_applied − v) that the lag takes over in a tick: T/`tracking_s`, at most 1. The
@@ -61,12 +61,12 @@ class IntegralResonant(Controller):
         }
 
     @staticmethod
-    def output(c: Any, s: Any, told: Any) -> float:
+    def output(c: np.record, s: np.record, told: np.record) -> float:
         """Return the command in µm, the state of the lag."""
         return s.lag_um
 
     @staticmethod
-    def update(c: Any, s: Any, told: Any) -> None:
+    def update(c: np.record, s: np.record, told: np.record) -> None:
         """Advance lag and integral; both follow the applied command."""
         shortfall_um = told.applied_um - told.command_um
         target_um = (s.integral_um + told.position_um) / c.feedthrough
@@ -74,7 +74,7 @@ class IntegralResonant(Controller):
         s.integral_um += c.ki * told.error_um + c.tracking * c.feedthrough * shortfall_um
 
     @staticmethod
-    def enter(c: Any, s: Any, told: Any) -> None:
+    def enter(c: np.record, s: np.record, told: np.record) -> None:
         """Set lag and integral at rest with the command in force."""
         s.lag_um = told.command_um
         s.integral_um = c.feedthrough * told.command_um - told.position_um

@@ -11,8 +11,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from types import MappingProxyType
-from typing import Any
 
+import numpy as np
 from pydantic import Field
 
 from rtloop.laws.contract import Controller
@@ -41,7 +41,7 @@ class Pid(Controller):
     coefficients = MappingProxyType({name: float for name in ("kp", "ki", "decay", "kd", "tracking")})
     state = MappingProxyType({"integral_um": float, "derivative_um": float, "last_um": float})
 
-    def build(self) -> Mapping[str, Any]:
+    def build(self) -> Mapping[str, float]:
         """Return kp, ki = ki_per_s T, kd = kd_s/(T_f + T), decay = T_f/(T_f + T) and tracking, for the period T.
 
         `tracking` is the part of (v_applied − v) that the integral takes over in a tick: T/T_t, at most 1.
@@ -57,20 +57,20 @@ class Pid(Controller):
         }
 
     @staticmethod
-    def output(c: Any, s: Any, told: Any) -> float:
+    def output(c: np.record, s: np.record, told: np.record) -> float:
         """Return the command in µm: kp times the error, plus the integral, minus the filtered derivative."""
         derivative_um = c.decay * s.derivative_um + c.kd * (told.position_um - s.last_um)
         return c.kp * told.error_um + s.integral_um - derivative_um
 
     @staticmethod
-    def update(c: Any, s: Any, told: Any) -> None:
+    def update(c: np.record, s: np.record, told: np.record) -> None:
         """Advance integral and filtered derivative by a tick; the integral follows a limited command."""
         s.integral_um += c.ki * told.error_um + c.tracking * (told.applied_um - told.command_um)
         s.derivative_um = c.decay * s.derivative_um + c.kd * (told.position_um - s.last_um)
         s.last_um = told.position_um
 
     @staticmethod
-    def enter(c: Any, s: Any, told: Any) -> None:
+    def enter(c: np.record, s: np.record, told: np.record) -> None:
         """Set, in a state of zeros, the integral so that the command continues; the position was constant before."""
         s.last_um = told.position_um
         s.integral_um = told.command_um - c.kp * told.error_um

@@ -11,11 +11,11 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from types import MappingProxyType
-from typing import Any
 
 import numpy as np
 from pydantic import Field
 
+from rtloop.foundation.arrays import Real
 from rtloop.laws.contract import Controller
 from rtloop.laws.options import ControllerOptions
 
@@ -45,7 +45,7 @@ class PositivePosition(Controller):
     )
     state = MappingProxyType({"filter": (float, 2), "integral_um": float})
 
-    def build(self) -> Mapping[str, Any]:
+    def build(self) -> Mapping[str, float | Real]:
         """Return a (2, 2) and b (2,) of the discretised filter, gain = g, ki = ki_per_s T and tracking, for the period
         T.
 
@@ -68,12 +68,12 @@ class PositivePosition(Controller):
         }
 
     @staticmethod
-    def output(c: Any, s: Any, told: Any) -> float:
+    def output(c: np.record, s: np.record, told: np.record) -> float:
         """Return the command in µm: the integral plus the filtered position."""
         return s.integral_um + c.gain * s.filter[0]
 
     @staticmethod
-    def update(c: Any, s: Any, told: Any) -> None:
+    def update(c: np.record, s: np.record, told: np.record) -> None:
         """Advance filter and integral by a tick."""
         first, second = s.filter[0], s.filter[1]
         s.filter[0] = c.a[0, 0] * first + c.a[0, 1] * second + c.b[0] * told.position_um
@@ -81,7 +81,7 @@ class PositivePosition(Controller):
         s.integral_um += c.ki * told.error_um + c.tracking * (told.applied_um - told.command_um)
 
     @staticmethod
-    def enter(c: Any, s: Any, told: Any) -> None:
+    def enter(c: np.record, s: np.record, told: np.record) -> None:
         """Set, in a state of zeros, the filter at rest with the position, and the integral so that the command
         continues.
         """
@@ -89,9 +89,7 @@ class PositivePosition(Controller):
         s.integral_um = told.command_um - c.gain * told.position_um
 
 
-def discretise_resonance(
-    omega: float, damping: float, period_s: float
-) -> tuple[np.ndarray[Any, Any], np.ndarray[Any, Any]]:
+def discretise_resonance(omega: float, damping: float, period_s: float) -> tuple[Real, Real]:
     """Return A (2, 2) and b (2,) of ω²/(s² + 2 ζ ω s + ω²), for an input held over each period.
 
     ω is `omega` in rad/s, ζ is `damping`, below 1. The states are the output, and its rate divided by ω.

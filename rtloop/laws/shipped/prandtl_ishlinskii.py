@@ -9,10 +9,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from types import MappingProxyType
-from typing import Any
 
 import numpy as np
 
+from rtloop.foundation.arrays import Real
 from rtloop.foundation.native.compiled import jit, jit_inline
 from rtloop.hysteresis.play_model import MAX_PLAYS
 from rtloop.kernel.layout import cache_line_record
@@ -155,7 +155,7 @@ class PrandtlIshlinskii(Feedforward):
     shipped = True
     output, update, enter = inverse_drive, update_model, enter_at_drive
 
-    def build(self) -> Mapping[str, Any]:
+    def build(self) -> Mapping[str, float | Real]:
         """Return thresholds and weights of the model and of its inverse, `play_count`, `dead_band_v` and
         `dead_band_threshold_v`.
 

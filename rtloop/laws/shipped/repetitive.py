@@ -15,11 +15,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from types import MappingProxyType
-from typing import Any
 
 import numpy as np
 from pydantic import Field
 
+from rtloop.foundation.arrays import Real
 from rtloop.kernel.validity import Allowed
 from rtloop.laws.contract import Controller
 from rtloop.laws.options import ControllerOptions
@@ -63,7 +63,7 @@ class Repetitive(Controller):
     )
     allowed_state = MappingProxyType({"at": Allowed(0, MAX_PLACES - 1)})
 
-    def build(self) -> Mapping[str, Any]:
+    def build(self) -> Mapping[str, float | Real]:
         """Return ki = ki_per_s T, the weights g q_j and their count, and `places` and `ahead` of the memory, in ticks.
 
         The memory has `places` errors: a period and the half-width of Q. The sum begins `ahead` ticks after the oldest
@@ -91,7 +91,7 @@ class Repetitive(Controller):
             "places": repeat + width,
         }
 
-    def _require_contraction(self, weights: np.ndarray[Any, Any]) -> None:
+    def _require_contraction(self, weights: Real) -> None:
         """Raise ValueError if an error grows from one period to the next at some frequency, on the axis's model.
 
         The law must have a model. `weights` are the g q_j of the sum, in the order of j.
@@ -113,12 +113,12 @@ class Repetitive(Controller):
             )
 
     @staticmethod
-    def output(c: Any, s: Any, told: Any) -> float:
+    def output(c: np.record, s: np.record, told: np.record) -> float:
         """Return the command in µm, the integral."""
         return s.integral_um
 
     @staticmethod
-    def update(c: Any, s: Any, told: Any) -> None:
+    def update(c: np.record, s: np.record, told: np.record) -> None:
         """Store u_k in the memory, and add ki T ê_k to the integral (equations of the module).
 
         If the command was limited, 0 is stored in place of u_k, and the integral moves to the applied command as well.
@@ -134,13 +134,13 @@ class Repetitive(Controller):
         s.at = (s.at + 1) % c.places
         s.integral_um += c.ki * (told.error_um + led_um) + told.applied_um - told.command_um
 
-    def linear(self) -> Any:
+    def linear(self) -> SampledController:
         """Return the transfer of the integrator alone; `build` checks the memory."""
         return SampledController(
             System(np.eye(1), np.array([self.options.ki_per_s * self.period_s]), np.ones(1), 0.0), self.period_s
         )
 
     @staticmethod
-    def enter(c: Any, s: Any, told: Any) -> None:
+    def enter(c: np.record, s: np.record, told: np.record) -> None:
         """Set, in a state of zeros, the integral to the command in force; the memory of a period stays empty."""
         s.integral_um = told.command_um

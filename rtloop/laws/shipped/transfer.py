@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from functools import cached_property
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
@@ -146,7 +146,7 @@ class TransferController(Controller):
         options: TransferControllerOptions = self.options
         return discretise_controller(options.transfer(), self.period_s, options.method, options.prewarp_hz)
 
-    def build(self) -> Mapping[str, Any]:
+    def build(self) -> Mapping[str, npt.ArrayLike]:
         """Return the values of COEFFICIENTS by name: C(z), its anti-windup and its entry, with the states in the
         kernels' order.
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 from rtloop.kernel.reference import Generator
@@ -63,7 +64,7 @@ def _configured_reference(reference: dict[str, Any]) -> PlayedReference:
     return PlayedReference(kind, reference_text(reference), value)
 
 
-def _started_reference(values: list[Any], text: str) -> PlayedReference:
+def _started_reference(values: Sequence[float | None], text: str) -> PlayedReference:
     """Return the reference that an event `set_reference` starts; its value is None unless it is constant.
 
     `values` are [kind, *parameters] of its generator, `text` is the event's text.

@@ -10,7 +10,10 @@ import json
 import threading
 from collections import deque
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
 
 from rtloop.engine.messages import Kind, Origin
 from rtloop.errors import RtloopError
@@ -59,14 +62,14 @@ class Events:
         """Number of the newest version of any row."""
 
     @property
-    def references(self) -> dict[str, dict[str, Any]]:
+    def references(self) -> dict[str, dict[str, object]]:
         """Return {axis: {kind, text, value}} of the references that play now, as `PlayedReference` describes them.
 
         `value` is None unless the reference is constant; an axis whose reference is unknown is missing.
         """
         return {axis: reference._asdict() for axis, reference in self._run_state.references.items()}
 
-    def append(self, messages: Any, loop: Description, run: int) -> None:
+    def append(self, messages: npt.NDArray[np.void], loop: Description, run: int) -> None:
         """Add messages (n,) of MESSAGE, n ≥ 0, of the run `run` of a loop as rows, at most the last MAX_ROWS of them.
 
         Messages about late ticks may extend a row. The service is asked for the operators, for QUERY_TIMEOUT_S at most

@@ -6,7 +6,7 @@ import logging
 import threading
 import time
 from collections.abc import Sequence
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -25,7 +25,7 @@ IDLE_S = 0.2
 """Pause between reads without clients; the ring holds ten seconds."""
 RETRY_S = 0.5
 """Pause before the next request to a service that did not answer."""
-Messages = npt.NDArray[Any]
+Messages = npt.NDArray[np.void]
 log = logging.getLogger(__name__)
 
 

@@ -7,9 +7,10 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
+
+from rtloop.foundation.arrays import Real
 
 LITTLE_ENDIAN = b"\x00\x01\x00\x00"
 TIME = "builtin_interfaces/Time"
@@ -27,7 +28,7 @@ def live_schema(names: Sequence[str]) -> str:
     return _schema(f"{TIME} stamp\nuint64 tick\nuint64 ticks\nuint64 lost\n{fields}", TIME, EXTREMES)
 
 
-def live_message(stamp_ns: int, tick: int, ticks: int, lost: int, extremes: np.ndarray[Any, Any]) -> bytes:
+def live_message(stamp_ns: int, tick: int, ticks: int, lost: int, extremes: Real) -> bytes:
     """Return the CDR message of a digest: newest tick, count of ticks, count of lost ticks, `extremes` (signals, 3) as
     min, max, last. `stamp_ns` is a UNIX time.
     """

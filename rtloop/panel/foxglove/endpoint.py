@@ -17,8 +17,8 @@ import hmac
 import json
 import struct
 import time
+from collections.abc import Mapping
 from contextlib import suppress
-from typing import Any
 from urllib.parse import parse_qs
 
 import anyio.to_thread
@@ -189,6 +189,6 @@ class _Viewer:
             data = MESSAGE_DATA.pack(1, number, stamp_ns) + message
             await asyncio.wait_for(self._socket.send_bytes(data), SEND_TIMEOUT_S)
 
-    async def _send_json(self, message: dict[str, Any]) -> None:
+    async def _send_json(self, message: Mapping[str, object]) -> None:
         """Send a JSON text. Raises TimeoutError after SEND_TIMEOUT_S."""
         await asyncio.wait_for(self._socket.send_text(json.dumps(message)), SEND_TIMEOUT_S)

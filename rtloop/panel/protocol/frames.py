@@ -5,16 +5,20 @@ from __future__ import annotations
 import json
 import struct
 from collections.abc import Mapping
-from typing import Any
 
+import numpy as np
 import numpy.typing as npt
+
+from rtloop.foundation.arrays import Real
 
 ALIGNMENT = 8
 SEND_TIMEOUT_S = 10.0
 """A client that takes no message for this time is dropped."""
 
 
-def pack_frame(kind: str, header: Mapping[str, Any], arrays: Mapping[str, npt.NDArray[Any]] | None = None) -> bytes:
+def pack_frame(
+    kind: str, header: Mapping[str, object], arrays: Mapping[str, npt.NDArray[np.generic]] | None = None
+) -> bytes:
     """Return a binary message with `kind`, the JSON values of `header`, and the arrays (n,) as Float32, by their names.
 
     NaN in an array marks a missing value. Raises ValueError for NaN or infinity in `header`.
@@ -27,7 +31,7 @@ def pack_frame(kind: str, header: Mapping[str, Any], arrays: Mapping[str, npt.ND
     return b"".join([struct.pack("<I", len(text)), text, *numbers])
 
 
-def pack_envelopes(signals: tuple[str, ...], lows: npt.NDArray[Any], highs: npt.NDArray[Any]) -> dict[str, Any]:
+def pack_envelopes(signals: tuple[str, ...], lows: Real, highs: Real) -> dict[str, Real]:
     """Return the arrays NAME:low and NAME:high of a frame from envelopes (signals, points)."""
     rows = zip(signals, lows, highs, strict=True)
     return {f"{name}:{bound}": row for name, low, high in rows for bound, row in (("low", low), ("high", high))}

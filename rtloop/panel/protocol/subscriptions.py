@@ -74,7 +74,7 @@ FIELD_TYPES: dict[str, TypeAdapter[Any]] = {
 }
 
 
-def read_message(text: str) -> dict[str, Any]:
+def read_message(text: str) -> dict[str, object]:
     """Return the fields of a JSON message by name, not yet validated.
 
     Raises ValueError unless it is a JSON object without NaN and infinity.
@@ -85,7 +85,7 @@ def read_message(text: str) -> dict[str, Any]:
     return fields
 
 
-def validate_field(name: str, value: Any) -> Any:
+def validate_field(name: str, value: object) -> Subscription | bool | None:
     """Return the validated value of a message's field, of its type in FIELD_TYPES.
 
     Raises ValueError that names value and allowed values, also for an unknown field.

@@ -5,8 +5,9 @@ from __future__ import annotations
 import os
 import threading
 import time
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from rtloop.errors import RtloopError
 from rtloop.foundation.trusted import open_without_link
@@ -20,7 +21,7 @@ BUDGET_S = 1.5
 """Time for opening new files in one listing; the other new files show their size alone until the next listing."""
 MAX_COUNTED_BYTES = 64 << 20
 """Size of a file above which trips are not counted, because all its events would have to be read."""
-UNKNOWN_SUMMARY: dict[str, Any] = dict.fromkeys(
+UNKNOWN_SUMMARY: Mapping[str, object] = dict.fromkeys(
     ("complete", "ticks", "duration_s", "created_unix_s", "begins_unix_s", "trips", "cut", "around")
 )
 
@@ -43,10 +44,10 @@ class RecordingFolder:
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
-        self._summaries: dict[RecordingFile, dict[str, Any]] = {}
+        self._summaries: dict[RecordingFile, Mapping[str, object]] = {}
         self._lock = threading.Lock()
 
-    def listing(self) -> list[dict[str, Any]]:
+    def listing(self) -> list[dict[str, object]]:
         """Return a dictionary for each of the last MAX_LISTED recordings, the newest first.
 
         Keys: file (`shown_name`), bytes (size), captured (whether a capture made it), complete, ticks and trips
@@ -100,7 +101,7 @@ class RecordingFolder:
         return files
 
 
-def _summary(path: Path, size: int) -> dict[str, Any]:
+def _summary(path: Path, size: int) -> Mapping[str, object]:
     """Return the values of UNKNOWN_SUMMARY's keys, as `RecordingFolder.listing` describes them, from a recording.
 
     All are None if it is unreadable; `trips` is None for a `size` (bytes) above MAX_COUNTED_BYTES.

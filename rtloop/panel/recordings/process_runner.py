@@ -8,7 +8,6 @@ import os
 import shlex
 import sys
 from contextlib import suppress
-from typing import Any
 
 from rtloop.errors import RtloopError
 from rtloop.service.api.lanes import TooManyRequests
@@ -43,7 +42,7 @@ class ProcessRunner:
         self._max_unfinished, self._timeout_s = max_unfinished, timeout_s
         self._pending = 0
 
-    async def run(self, module: str, *arguments: object, stdin: str = "") -> dict[str, Any]:
+    async def run(self, module: str, *arguments: object, stdin: str = "") -> dict[str, object]:
         """Run `python -m module arguments` with the input `stdin` and return the JSON object that it prints.
 
         The process is killed if this call is cancelled. Raises TooManyRequests if `max_unfinished` run or wait, and
@@ -62,7 +61,7 @@ class ProcessRunner:
             self._pending -= 1
 
 
-async def _run_json(command: list[str], stdin: bytes, timeout_s: float) -> dict[str, Any]:
+async def _run_json(command: list[str], stdin: bytes, timeout_s: float) -> dict[str, object]:
     """Run a command and return the JSON object that it prints.
 
     The process is killed after `timeout_s`, and if this call is cancelled. `stdin` is its input; its stderr is

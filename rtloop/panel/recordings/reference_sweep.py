@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
 from rtloop.client.ticks.tick_stretch import column_index
+from rtloop.foundation.arrays import Real
 from rtloop.foundation.trusted import open_without_link
 from rtloop.panel.feed.envelope import envelope
 from rtloop.panel.protocol.frames import pack_envelopes, pack_frame
@@ -77,7 +77,7 @@ def _tick_range(seeker: ChunkSeeker, request: SweepRequest) -> tuple[int, int]:
     return first, end
 
 
-def _read_values(seeker: ChunkSeeker, columns: Sequence[int], first: int, end: int) -> np.ndarray[Any, Any]:
+def _read_values(seeker: ChunkSeeker, columns: Sequence[int], first: int, end: int) -> Real:
     """Return columns, by their indices, of ticks `first` … `end` − 1: (columns, end − first), NaN for missing ticks."""
     values = np.full((len(columns), end - first), np.nan)
     for chunk in range(seeker.find_place(first), min(seeker.find_place(end - 1) + 1, seeker.end)):

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import threading
 import time
-from typing import Any
 
 from rtloop.client import Client
 from rtloop.client.control import UnansweredRequest
@@ -22,7 +21,7 @@ class StateListener:
 
     def __init__(self, client: Client) -> None:
         self._client = client
-        self._status: dict[str, Any] = {}
+        self._status: dict[str, object] = {}
         self._heard_s = float("-inf")
         self._fault, self._remedy = "no answer from the service yet", ""
         self._thread = threading.Thread(target=self._listen, name="state", daemon=True)
@@ -32,7 +31,7 @@ class StateListener:
         self._thread.start()
 
     @property
-    def status(self) -> dict[str, Any]:
+    def status(self) -> dict[str, object]:
         """The newest state, as `Client.watch` yields it.
 
         Without a connection, or SILENT_S after the newest one: {state: "unreachable", lock: None, error, remedy (may be

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Iterable
-from typing import Any
 
 import numpy as np
 
@@ -64,7 +63,7 @@ class Scope:
         """Number of sweeps that have ended."""
         self._newest_sweep: Sweep | None = None
         self._ready_frame: bytes | None = None
-        self._shown: Any = None
+        self._shown: object = None
 
     def arm(self) -> None:
         """Allow one more sweep in mode single; no effect in the other modes."""

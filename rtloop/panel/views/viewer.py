@@ -34,7 +34,9 @@ class Viewer:
 
     def __init__(self, feed: Feed, state: StateListener) -> None:
         self._feed, self._state = feed, state
-        self._subscriptions: dict[str, Any] = dict.fromkeys(("view", "spectrum", "xy"))
+        self._subscriptions: dict[str, ViewSubscription | SpectrumSubscription | XySubscription | None] = dict.fromkeys(
+            ("view", "spectrum", "xy")
+        )
         """Subscriptions that are validated again when another loop begins."""
         self._scope: Scope | None = None
         self._analyser: Analyser | None = None

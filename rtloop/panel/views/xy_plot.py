@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from rtloop.foundation.arrays import Real
 from rtloop.hysteresis.loop_shape import loop_shape
@@ -60,7 +61,7 @@ class XyPlot:
         valid = np.isfinite(drive) & np.isfinite(position)
         drive, position = drive[valid], position[valid]
         indices = extreme_indices([drive, position], BINS)
-        header: dict[str, Any] = {"axis": self._subscription.axis, "run": past.run, "end": end, "at_rest": at_rest}
+        header: dict[str, object] = {"axis": self._subscription.axis, "run": past.run, "end": end, "at_rest": at_rest}
         header["loop_percent"] = None
         arrays = {"drive_v": drive[indices], "position_um": position[indices]}
         if drive.size and np.ptp(drive) > 0 and not at_rest:
@@ -132,7 +133,7 @@ def bin_means(signal: Real, bins: int) -> Real:
     return np.add.reduceat(signal, first_samples) / np.diff(first_samples, append=signal.size)
 
 
-def extreme_indices(signals: list[Real], bins: int) -> np.ndarray[Any, np.dtype[np.intp]]:
+def extreme_indices(signals: list[Real], bins: int) -> npt.NDArray[np.intp]:
     """Return the indices, ascending, of the smallest and largest sample of each signal (n,) in each of `bins` time
     bins; all n indices if n ≤ 2·signals·bins.
     """

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 from rtloop.configuration.axis import InterlockOptions, LimitsOptions
 from rtloop.panel.feed.tick_history import longest_view_s
 from rtloop.panel.service.service import Description
 
 
-def describe_loop(loop: Description) -> dict[str, Any]:
+def describe_loop(loop: Description) -> dict[str, object]:
     """Return {name, rate_hz, axes, columns, units, longest_s, defaults: {limits, interlocks}} of a loop.
 
     `axes` are names, `columns` the signals of a record as {name, unit, meaning}, `units` by signal; the longest screen

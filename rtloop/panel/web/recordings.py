@@ -9,7 +9,7 @@ import os
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, TypeVar
 from urllib.parse import quote
 
 import anyio.to_thread
@@ -29,6 +29,7 @@ from rtloop.panel.service.service import Service
 from rtloop.panel.web.requests import LONGEST_S, CaptureBody, Span, validate_request
 from rtloop.panel.web.responses import PlainJSONResponse, RequestRefused, limited_body, with_error_responses
 
+T = TypeVar("T")
 MAX_READERS = 2
 MAX_BODY_BYTES = 4096
 AHEAD_S = 60.0
@@ -185,7 +186,7 @@ class Recordings:
             raise RequestRefused(404, f"{name[:100]!r}: no recording of this name is in the folder of recordings")
         return path
 
-    async def _run_in_thread(self, action: Callable[[], Any]) -> Any:
+    async def _run_in_thread(self, action: Callable[[], T]) -> T:
         """Run an action in one of MAX_READERS threads, once one is free, and return its result or raise its error."""
         return await anyio.to_thread.run_sync(action, limiter=self._readers)
 

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Any, Self
+from typing import Self, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from rtloop.configuration.file import describe
 from rtloop.recording.file.topics.ticks import LARGEST
 
+M = TypeVar("M", bound=BaseModel)
 LONGEST_S = 600.0
 
 
@@ -44,7 +45,7 @@ class Span(BaseModel):
     until: float | None = Field(default=None, gt=0, le=1e9)
 
 
-def validate_request(model: type[Any], data: Any) -> Any:
+def validate_request(model: type[M], data: object) -> M:
     """Return an instance of the pydantic class `model` with the fields in `data`, JSON bytes or a mapping.
 
     Raises ValueError that names each invalid value.

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 from collections.abc import Awaitable, Callable
 from functools import wraps
-from typing import Any
 
 from starlette.requests import ClientDisconnect, Request
 from starlette.responses import JSONResponse, Response
@@ -27,7 +26,7 @@ class RequestRefused(Exception):
 class PlainJSONResponse(JSONResponse):
     """JSON in ASCII, in which any file name can be sent, also one that is not UTF-8."""
 
-    def render(self, content: Any) -> bytes:
+    def render(self, content: object) -> bytes:
         """Return `content` as JSON in ASCII. Raises ValueError for NaN and infinity."""
         return json.dumps(content, allow_nan=False).encode("ascii")
 
@@ -40,7 +39,7 @@ def with_error_responses(handler: Handler) -> Handler:
     """
 
     @wraps(handler)
-    async def respond(*arguments: Any, **options: Any) -> Response:
+    async def respond(*arguments: object, **options: object) -> Response:
         """Return the handler's response, or a response that states its error."""
         try:
             return await handler(*arguments, **options)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from contextlib import nullcontext
-from typing import Annotated, Any
+from typing import Annotated
 
 import anyio
 from pydantic import Field
@@ -91,7 +91,7 @@ class Retuning:
                 return JSONResponse(await self._run_command(name, body))
         return Response()
 
-    async def _run_command(self, name: str, body: RetuneBody | SwapBody) -> dict[str, Any]:
+    async def _run_command(self, name: str, body: RetuneBody | SwapBody) -> dict[str, object]:
         """Run `rtloop ctl retune` for the body, under a client's `name`, and return the JSON object that it prints.
 
         Raises TooManyRequests while another one runs, RequestRefused (409, 503 or 422) with the command's error.

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Iterable
-from typing import Any, NamedTuple
+from collections.abc import Callable, Iterable, Mapping
+from typing import NamedTuple
 
 from rtloop.recording.capture.buffer import TickBuffer, TickTime
 from rtloop.recording.file.topics import format
@@ -58,7 +58,7 @@ class PendingMessages:
         message = Message(format.LAW, self.log_time(tick), hashlib.sha256(data).digest() + data)
         self._entries.append(PendingEntry(tick, message, from_loop=False))
 
-    def recorder_message(self, kind: str, place: TickTime, details: dict[str, Any]) -> Message:
+    def recorder_message(self, kind: str, place: TickTime, details: Mapping[str, object]) -> Message:
         """Return an event `kind` of the recorder, at tick and time of `place`, as a message, without appending it.
 
         `details` becomes its `what`.

@@ -125,7 +125,7 @@ def record_run(fd: int, names: RequesterNames | None = None) -> int:
         return 0  # The supervisor ended before there was a block.
     recorder = Recorder(block)
     block.store(Word.RECORDER_STATE, ProcessState.READY)
-    totals: dict[str, Any]
+    totals: dict[str, object]
     try:
         orders = SupervisorOrders()
         if (command := orders.next(None)) is None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from rtloop.engine.memory import SharedBlock
 from rtloop.engine.ring import drain
@@ -18,7 +19,7 @@ class RingReader:
         self._ring = block.ring(name)
         self.position, self.lost = position, 0
 
-    def take_into(self, out: np.ndarray[Any, Any]) -> tuple[int, int]:
+    def take_into(self, out: npt.NDArray[np.generic]) -> tuple[int, int]:
         """Copy the next slots into `out`, at most len(out), and move `position` behind them.
 
         Returns (slots copied, slots lost before them); `lost` sums the latter.
@@ -28,7 +29,7 @@ class RingReader:
         self.lost += int(lost)
         return copied, int(lost)
 
-    def take(self) -> np.ndarray[Any, Any]:
+    def take(self) -> npt.NDArray[Any]:
         """Return a copy of all new slots, possibly none, and move `position` behind them.
 
         If the loop has written more than the ring holds, the oldest new slots are lost and added to `lost`.

@@ -5,13 +5,14 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from rtloop.errors import OutputError
 from rtloop.foundation.arrays import Real
 from rtloop.recording.capture.buffer import TickTime
 from rtloop.recording.file.mcap.chunkfile import NotOnDisk
 from rtloop.recording.file.topics.contents import Message
+from rtloop.recording.file.topics.format import Header
 from rtloop.recording.file.topics.overview import Intervals
 from rtloop.recording.file.writer import Writer
 
@@ -55,7 +56,7 @@ class RunFiles:
     def __init__(
         self,
         path: Path,
-        header: dict[str, Any],
+        header: Header,
         options: Options,
         begin: TickTime,
         ticks_logged: int,

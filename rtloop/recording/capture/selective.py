@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import time
 from pathlib import Path
-from typing import Any
 
 from rtloop.engine.memory import SharedBlock
 from rtloop.errors import OutputError
@@ -20,6 +19,7 @@ from rtloop.recording.capture.segment_buffer import SegmentBuffer, WriteBatch
 from rtloop.recording.capture.session import Session
 from rtloop.recording.file.event_window import EventWindow
 from rtloop.recording.file.topics.events import FINISHED, RETENTION_BEGUN, recorder_event
+from rtloop.recording.file.topics.format import Header
 
 
 class SelectiveSession(Session):
@@ -29,7 +29,7 @@ class SelectiveSession(Session):
         self,
         block: SharedBlock,
         path: Path,
-        header: dict[str, Any],
+        header: Header,
         options: Options,
         names: RequesterNames | None = None,
     ) -> None:

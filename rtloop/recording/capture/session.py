@@ -11,8 +11,8 @@ import errno
 import math
 import time
 from collections import deque
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 from rtloop.engine.memory import SharedBlock, Word
 from rtloop.errors import OutputError
@@ -60,7 +60,7 @@ class Session:
         self,
         block: SharedBlock,
         path: Path,
-        header: dict[str, Any],
+        header: format.Header,
         options: Options,
         names: RequesterNames | None = None,
     ) -> None:
@@ -139,7 +139,7 @@ class Session:
             self._pending.add_snapshot(self._waiting_snapshots.popleft())
         return ticks + len(snapshots) + len(events)
 
-    def record_removal(self, details: dict[str, Any]) -> None:
+    def record_removal(self, details: Mapping[str, object]) -> None:
         """Queue the event FILE_REMOVED: a file, of this run or an earlier one, was removed to make room.
 
         `details`: file (its name), size_bytes, reason.
@@ -155,7 +155,7 @@ class Session:
         if self.free_rows == 0 or is_late:
             self._write_all()
 
-    def finish(self, result: str) -> dict[str, Any]:
+    def finish(self, result: str) -> dict[str, object]:
         """Write the remaining data and finish the file.
 
         `result`: how the loop ended, as `Recorder.record` returns it. Returns {path, paths, ticks_logged, ticks_lost,

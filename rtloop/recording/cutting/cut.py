@@ -34,7 +34,7 @@ class RangeCopy:
         self._account = CopyAccount(tick_range.first, source.header["rate_hz"])
         self.gaps: list[tuple[int, int]] = []
         """Missing ranges (first tick, count), set by `run`."""
-        self._recorded_gaps: list[dict[str, Any]] = []
+        self._recorded_gaps: list[dict[str, int]] = []
         self._skipped_ranges: list[Range] = []
 
     def run(self, progress: ReportTicks | None) -> None:
@@ -89,7 +89,7 @@ def cut(
     until_s: float | None = None,
     min_free_bytes: int = 0,
     progress: ReportTicks | None = None,
-) -> dict[str, Any]:
+) -> dict[str, object]:
     """Write the ticks from `first` to before `end` of a recording, finished, rotated or growing, as a recording.
 
     `from_s` and `until_s`, in s since the start, give the first tick and the tick after the last one by their deadlines
@@ -196,7 +196,7 @@ def _write_copy(
     return copy, writer.ticks
 
 
-def _recorded_gap(message: Message) -> dict[str, Any] | None:
+def _recorded_gap(message: Message) -> dict[str, int] | None:
     """Gap {first_tick, count} in a gap event of the recorder; None for any other message."""
     if message.channel != format.EVENTS:
         return None

@@ -5,14 +5,14 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 from functools import lru_cache
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from rtloop.recording.file.reader import Reader, Rows
 from rtloop.recording.file.topics.contents import Message
 from rtloop.recording.file.topics.events import FINAL
-from rtloop.recording.file.topics.format import EVENTS
+from rtloop.recording.file.topics.format import EVENTS, Totals
 from rtloop.recording.file.topics.ticks import Ticks
 from rtloop.signals import DEADLINE, TICK
 
@@ -55,7 +55,7 @@ class ChunkSeeker:
         """Span of the last chunk with ticks; None if the file has no ticks."""
         return next(filter(None, map(self.span, reversed(range(self.end)))), None)
 
-    def final_totals(self) -> dict[str, Any] | None:
+    def final_totals(self) -> Totals | None:
         """Totals as `Reader.totals`, from the last chunk alone; None for an unfinished file or a damaged last chunk."""
         content = self.chunk(self.end - 1)
         events = (

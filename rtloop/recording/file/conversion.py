@@ -15,6 +15,7 @@ import threading
 from collections import Counter
 from contextlib import closing
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from mcap.records import Channel, Schema
@@ -170,7 +171,7 @@ class _Conversion:
             "%s: another tool wrote this recording; rtloop converts it into a temporary file. `rtloop recover` writes "
             "a permanent one", self._path
         )  # fmt: skip
-        header = {key: value for key, value in self._header.items() if key != "configuration_sha256"}
+        header: dict[str, Any] = {key: value for key, value in self._header.items() if key != "configuration_sha256"}
         self._layout = TickLayout(header["columns"])
         self._schema = format.tick_schema(header["columns"])
         self._rows = format.chunk_rows(header["columns"])

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Mapping
 
 from rtloop.foundation.arrays import Real
 from rtloop.recording.file.topics.contents import Message, event_message
@@ -38,7 +38,7 @@ class CopyAccount:
         if len(intervals):
             self._end_ns = float(intervals[-1, DEADLINE, MAXIMUM]) + self._period_ns
 
-    def end_message(self, kind: str, tick: int, details: dict[str, Any], start_unix_ns: int) -> Message:
+    def end_message(self, kind: str, tick: int, details: Mapping[str, object], start_unix_ns: int) -> Message:
         """Return the event `kind` that ends the copy, at `tick`, as a message; `details` becomes its `what`.
 
         The time of the event is one period after the last tick in copied rows or intervals, 0 without any; log time =

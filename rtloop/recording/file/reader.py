@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import cached_property, partial
 from pathlib import Path
-from typing import Any, NamedTuple, Self
+from typing import NamedTuple, Self
 
 from rtloop.foundation.arrays import Real
 from rtloop.foundation.trusted import open_user_file
@@ -73,7 +73,7 @@ class Reader:
         except BaseException:
             self._source.close()
             raise
-        self.header: dict[str, Any] = self._layout.header
+        self.header: format.Header = self._layout.header
         self.entries: list[ChunkEntry] = self._layout.entries
         """All chunks, in the order of the file."""
         self.problems = [*self._layout.problems]
@@ -260,7 +260,7 @@ class Reader:
         ]
 
     @property
-    def totals(self) -> dict[str, Any] | None:
+    def totals(self) -> format.Totals | None:
         """Totals that the recorder stored when it finished the file; None for an unfinished file.
 
         Keys: ticks_executed, ticks_logged, ticks_lost, events_lost, result, complete, and further ones in some files.

@@ -126,7 +126,7 @@ def recover(
     if is_being_written(path):
         raise RecordingError(f"{path}: a recorder is writing this file; recover it after the run")
     with Reader(path, tolerant=True, opener=opener) as reader:
-        header = {key: value for key, value in reader.header.items() if key != "configuration_sha256"}
+        header: dict[str, Any] = {key: value for key, value in reader.header.items() if key != "configuration_sha256"}
         remove_leftover(output, UNFINISHED_SUFFIX)
         log_time = header["created_unix_ns"] if header["paced"] else 0
         writer = Writer(output, header, log_time, message_index=True, suffix=UNFINISHED_SUFFIX)

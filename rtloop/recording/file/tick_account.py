@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 from rtloop.recording.file.mcap.container import DamagedChunk
+from rtloop.recording.file.topics.format import Totals
 from rtloop.recording.file.topics.ticks import LARGEST, Ticks
 
 
 class TickAccount:
     """Account of the ticks read from one file: whether they are in order, and as many as the recorder counted."""
 
-    def __init__(self, first_tick: int, totals: dict[str, Any] | None, end_of_repetition: int = 0) -> None:
+    def __init__(self, first_tick: int, totals: Totals | None, end_of_repetition: int = 0) -> None:
         """Expect ticks from `first_tick` on, and the counts `totals` of the recorder, None for an unfinished file.
 
         Ticks before `end_of_repetition` are read from another file; here they are only counted.

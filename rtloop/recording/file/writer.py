@@ -9,7 +9,7 @@ import itertools
 import json
 import math
 import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -33,7 +33,7 @@ class Writer:
     def __init__(
         self,
         path: Path,
-        header: dict[str, Any],
+        header: Mapping[str, Any],
         log_time: int,
         *,
         message_index: bool = False,
@@ -191,7 +191,7 @@ class Writer:
             return False
         return True
 
-    def _write_header(self, header: dict[str, Any], log_time: int, repeated: Sequence[McapRecord]) -> None:
+    def _write_header(self, header: Mapping[str, Any], log_time: int, repeated: Sequence[McapRecord]) -> None:
         """Write the first chunk: schemas and channels `repeated`, then `header` with `configuration_sha256` added.
 
         Raises OutputError.

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 
@@ -28,7 +27,7 @@ class SignalDifferences:
         size = len(self._columns)
         self._largest, self._at_tick = np.zeros(size), np.zeros(size, np.int64)
         self._square_sum, self._count = np.zeros(size), np.zeros(size, np.int64)
-        self._trip: dict[str, Any] | None = None
+        self._trip: dict[str, object] | None = None
 
     def add(self, recorded: Rows, replayed: Rows) -> None:
         """Update largest difference, its tick and sum of squares of each signal, and the first trip of the replay.
@@ -49,7 +48,7 @@ class SignalDifferences:
         self._count += finite.sum(axis=0)
         self._trip = self._trip or first_trip(replayed)
 
-    def report(self) -> dict[str, Any]:
+    def report(self) -> dict[str, object]:
         """Return {signals: {name: {max, at_tick, rms}}, trip: {tick, causes} of the replay or None}.
 
         `max` and `rms` are of the absolute difference, in the signal's unit; a signal without a finite difference has
@@ -73,7 +72,7 @@ class TrackingPerformance:
         self._drive_v, self._error_um = np.zeros(len(axes)), np.zeros(len(axes))
         self._traces: list[Rows] = []
         self._trace_ticks = 0
-        self.trip: dict[str, Any] | None = None
+        self.trip: dict[str, object] | None = None
 
     def add(self, rows: Rows) -> None:
         """Add rows (n, columns) of consecutive ticks; a NaN error in closed loop counts as 0.
@@ -98,7 +97,7 @@ class TrackingPerformance:
             self._trace_ticks += len(rows)
         self.trip = self.trip or first_trip(rows)
 
-    def report(self) -> list[dict[str, Any]]:
+    def report(self) -> list[dict[str, object]]:
         """Return a dict for each axis, in order: rms_error_um, max_abs_error_um, max_abs_drive_v and steps.
 
         The errors are None if the loop was never closed. `steps` is `StepMetrics.as_dict`, or None where `step_metrics`
@@ -117,7 +116,7 @@ class TrackingPerformance:
         ]
 
 
-def first_trip(rows: Rows) -> dict[str, Any] | None:
+def first_trip(rows: Rows) -> dict[str, object] | None:
     """Return {tick, causes} of the first tripped row of `rows` (n, columns); None if no row is tripped."""
     tripped = np.flatnonzero(rows[:, signals.FLAGS].astype(np.int64) & TRIP_MASK)
     if not tripped.size:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -83,19 +83,19 @@ def fill_tape(rows: Real, pairs: npt.NDArray[np.int64], tape: Real, refused: npt
 
 
 @jit
-def _bits(address: Any, row_step: Any, column_step: Any, count: Any, columns: Any) -> Any:
+def _bits(address: int, row_step: int, column_step: int, count: int, columns: int) -> npt.NDArray[np.uint64]:
     """Return the values at an address as bits, 1-D: row i, column j is number i row_step + j column_step."""
     return carray(address_pointer(address), (count - 1) * row_step + (columns - 1) * column_step + 1, np.uint64)
 
 
 @jit
-def _values(address: Any, row_step: Any, column_step: Any, count: Any, columns: Any) -> Any:
+def _values(address: int, row_step: int, column_step: int, count: int, columns: int) -> Real:
     """Return the values at an address, 1-D: row i, column j is number i row_step + j column_step."""
     return carray(address_pointer(address), (count - 1) * row_step + (columns - 1) * column_step + 1, np.float64)
 
 
 @jit
-def _is_flag_equal(recorded: Any, replayed: Any) -> Any:
+def _is_flag_equal(recorded: float, replayed: float) -> bool:
     """Whether two values of `flags` are equal but for OVERRUN, and the recorded one is a whole number and not −0."""
     flags = np.int64(recorded)
     return (

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Generator
 from contextlib import closing
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from rtloop import signals
 from rtloop.drivers.base import Driver
@@ -52,7 +52,9 @@ def recorded_law(recording: Recording, trust: TrustedLaws = NO_TRUST) -> LawWith
     return LawWithCoefficients(laws, snapshot_law(first, recording, laws).coefficients)
 
 
-def compare_law(recording: Recording, law: LawWithCoefficients, progress: ReportTicks | None = None) -> dict[str, Any]:
+def compare_law(
+    recording: Recording, law: LawWithCoefficients, progress: ReportTicks | None = None
+) -> dict[str, object]:
     """Compare the outputs of another law with the recorded ones, on the recorded inputs.
 
     Returns {ticks, problems, signals: {name: {max, at_tick, rms}}, trip: {tick, causes} of the other law or None}:
@@ -70,7 +72,7 @@ def compare_law(recording: Recording, law: LawWithCoefficients, progress: Report
 
 def resimulate(
     recording: Recording, law: LawWithCoefficients, driver: Driver, progress: ReportTicks | None = None
-) -> dict[str, Any]:
+) -> dict[str, object]:
     """Run a law with the recorded reference on a simulated rig, and compare its tracking with the recorded one.
 
     Returns {ticks, problems, trips: {recorded, resimulated}, axes: [{name, recorded, resimulated}]} with the figures of

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import closing, contextmanager
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -315,7 +314,7 @@ class Replay:
         if periods >= MIN_RATE_PERIODS and abs(span_ns * 1e-9 * rate_hz / periods - 1) >= RATE_TOLERANCE:
             self._record_difference(int(recorded[0, signals.TICK]), "rate_hz", rate_hz, 1e9 * periods / span_ns)
 
-    def _record_difference(self, tick: int, signal: str, recorded: Any, replayed: Any) -> None:
+    def _record_difference(self, tick: int, signal: str, recorded: object, replayed: object) -> None:
         """Set `first_difference` of the report to {tick, signal, recorded, replayed}; NaN and infinities as text."""
         values = {"recorded": json_value(recorded), "replayed": json_value(replayed)}
         self.report.first_difference = {"tick": tick, "signal": signal, **values}

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Sequence
 
 import numpy as np
 import numpy.typing as npt
@@ -19,6 +18,7 @@ from rtloop.foundation.arrays import Real
 from rtloop.kernel.memory import LawMemory
 from rtloop.kernel.reference import GENERATOR, Generator
 from rtloop.laws.registry import LawReference
+from rtloop.recording.file.topics.format import Header
 from rtloop.recording.file.topics.validation import header_extra_channels, header_extras
 from rtloop.recording.replay.kernels import fill_tape
 from rtloop.signals import Mode
@@ -36,7 +36,7 @@ class RecordedInputs:
 
     enable_input = "enable"
 
-    def __init__(self, header: Mapping[str, Any]) -> None:
+    def __init__(self, header: Header) -> None:
         """Prepare the playback driver for a recording with this header; `load` gives it the ticks."""
         axes, observed = header["axes"], tuple(header["observed"])
         channels = [tuple(Channel(f"{axis} {way}") for axis in axes) for way in ("in", "out")]
@@ -105,7 +105,7 @@ class Rerun:
 
     def __init__(
         self,
-        header: Mapping[str, Any],
+        header: Header,
         source: InputSource,
         laws: Sequence[LawReference],
         law: LawMemory,
@@ -174,7 +174,7 @@ class Rerun:
 
 
 def _make_rerun_plan(
-    header: Mapping[str, Any],
+    header: Header,
     source: InputSource,
     laws: Sequence[LawReference],
     law: LawMemory,

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from typing import Any
 
 import numpy as np
 
@@ -11,7 +10,9 @@ from rtloop.kernel.layout import LOOP_STATE, Records
 from rtloop.kernel.memory import LawMemory, RecordKind, field_tables
 
 
-def first_difference(recorded: bytes, replayed: bytes, axes: Sequence[str], law: LawMemory) -> tuple[str, Any, Any]:
+def first_difference(
+    recorded: bytes, replayed: bytes, axes: Sequence[str], law: LawMemory
+) -> tuple[str, object, object]:
     """Return (field, recorded value, replayed value) of the first difference; (text, None, None) outside all fields.
 
     The field is law.AXIS.NAME or law.loop.NAME, with [index] for an element of an array; the values are numbers.
@@ -32,7 +33,7 @@ def first_difference(recorded: bytes, replayed: bytes, axes: Sequence[str], law:
     return "bytes of the law that belong to no field", None, None
 
 
-def _snapshot_fields(axes: Sequence[str], law: LawMemory) -> Iterator[tuple[str, np.dtype[Any], int]]:
+def _snapshot_fields(axes: Sequence[str], law: LawMemory) -> Iterator[tuple[str, np.dtype[np.generic], int]]:
     """Yield name, type and offset in bytes of every field, in the order of a snapshot without its tick."""
     offset = 0
     tables: tuple[tuple[RecordKind, Records], ...] = (("coefficients", law.coefficients), ("state", law.axes))

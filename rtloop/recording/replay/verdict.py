@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from rtloop import signals
+
+if TYPE_CHECKING:
+    from rtloop.recording.file.topics.format import Header
 
 
 @dataclass
@@ -53,7 +55,7 @@ class ReplayReport:
                 return
         self.not_verified.append({"first_tick": first_tick, "count": count, "why": reason})
 
-    def as_dict(self) -> dict[str, Any]:
+    def as_dict(self) -> dict[str, object]:
         """The object of `rtloop replay --json`, with the fields of the report.
 
         Keys: ticks, stretches, ticks_skipped, identical, first_difference, not_verified, unverified, gaps,
@@ -74,7 +76,7 @@ class ReplayReport:
         }
 
 
-def unjudged_contents(header: Mapping[str, Any]) -> list[str]:
+def unjudged_contents(header: Header) -> list[str]:
     """Texts, one for each kind of recorded contents that no replay can judge: no output of the law depends on these.
 
     The texts are the same for every recording but for the names of its observed signals.

@@ -6,10 +6,11 @@ No peak is lost at any picture size.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
+from rtloop.foundation.arrays import Real
 from rtloop.recording.columns import signal_unit
 from rtloop.recording.errors import RecordingError
 from rtloop.recording.file.run_readers import RecordingPaths, ReportTicks
@@ -34,9 +35,9 @@ class Band(NamedTuple):
     `time_s` (n,) is the deadline of each group's first tick, in s since the start of the run.
     """
 
-    time_s: Any
-    low: Any
-    high: Any
+    time_s: Real
+    low: Real
+    high: Real
 
     @property
     def is_line(self) -> bool:
@@ -66,7 +67,7 @@ class DrawnRecording(NamedTuple):
     recording: Recording
     panels: list[Panel]
     bands: dict[str, Band]
-    time_s: Any
+    time_s: Real
 
     @property
     def marks(self) -> list[Mark]:
@@ -158,7 +159,7 @@ def signal_kind(name: str) -> str:
 
 def _overview_band(
     recording: Recording, names: list[str], start_s: float, end_s: float, points: int
-) -> tuple[Any, Any, Any]:
+) -> tuple[Real, Real, Real]:
     """Return times (n,) in s, least and largest values (n, names) of the omitted ticks; n is about 2 `points`, or 0."""
     empty = np.empty((0, len(names)))
     if not recording.skipped:

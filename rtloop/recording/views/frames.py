@@ -3,19 +3,24 @@
 from __future__ import annotations
 
 import json
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from rtloop.errors import MissingExtra
+from rtloop.foundation.arrays import Real
 from rtloop.recording.columns import describe_signal
 from rtloop.recording.recorded_signals import RecordedSignals
 from rtloop.recording.views.selection import Selection
 
+if TYPE_CHECKING:
+    import pandas
+    import xarray
+
 TIME = "time_s"
 
 
-def to_pandas(recording: RecordedSignals, selection: Selection) -> Any:
+def to_pandas(recording: RecordedSignals, selection: Selection) -> pandas.DataFrame:
     """Return a DataFrame of tick, deadline_ns and the selected signals over the time in s since the start of the run.
 
     Its `attrs` have `recording` (the path), `name`, `rate_hz`, `units` and `events`. Raises RecordingError if a pattern
@@ -32,7 +37,7 @@ def to_pandas(recording: RecordedSignals, selection: Selection) -> Any:
     return frame
 
 
-def to_xarray(recording: RecordedSignals, selection: Selection) -> Any:
+def to_xarray(recording: RecordedSignals, selection: Selection) -> xarray.Dataset:
     """Return a Dataset of tick, deadline_ns and the selected signals over the time in s since the start of the run.
 
     Each signal has `units` and `long_name`. The Dataset's `attrs` have `recording` (the path), `name`, `rate_hz` and
@@ -54,7 +59,7 @@ def to_xarray(recording: RecordedSignals, selection: Selection) -> Any:
     )
 
 
-def _selected_signals(recording: RecordedSignals, selection: Selection) -> dict[str, Any]:
+def _selected_signals(recording: RecordedSignals, selection: Selection) -> dict[str, Real]:
     """Return the selected ticks of tick, deadline_ns and the selected signals: arrays (ticks,) by name.
 
     Raises RecordingError if a pattern fits no signal or a limited time span holds no tick.
@@ -64,6 +69,6 @@ def _selected_signals(recording: RecordedSignals, selection: Selection) -> dict[
     return {name: np.concatenate([rows[:, index] for rows in blocks]) for index, name in enumerate(names)}
 
 
-def _recording_attributes(recording: RecordedSignals) -> dict[str, Any]:
+def _recording_attributes(recording: RecordedSignals) -> dict[str, object]:
     """Attributes {recording, name, rate_hz} of a DataFrame or Dataset."""
     return {"recording": str(recording.paths[0]), **{key: recording.header[key] for key in ("name", "rate_hz")}}

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
 
@@ -65,7 +64,7 @@ class TimeHistogram:
         ranks = [max(math.ceil(quantile * cumulative[-1]), 1) for quantile in quantiles]
         return [float(values[np.searchsorted(cumulative, rank)]) / NS_PER_US for rank in ranks]
 
-    def class_counts(self) -> list[dict[str, Any]]:
+    def class_counts(self) -> list[dict[str, float | None]]:
         """Counts of all classes, also empty ones, as {below_us, count}; [] without values.
 
         A class holds times from the bound of the class before up to, not including, `below_us` (None for the last one).

@@ -6,11 +6,12 @@ import base64
 import json
 import os
 from pathlib import Path
-from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from rtloop.errors import output_errors
+from rtloop.foundation.arrays import Real
 from rtloop.foundation.trusted import overwrite_file
 from rtloop.recording.file.run_readers import RecordingPaths, ReportTicks
 from rtloop.recording.load import Recording
@@ -63,13 +64,13 @@ def _page_subtitle(drawing: DrawnRecording) -> str:
     return " · ".join(filter(None, parts))
 
 
-def _panel_data(panel: Panel, bands: dict[str, Band]) -> dict[str, Any]:
+def _panel_data(panel: Panel, bands: dict[str, Band]) -> dict[str, object]:
     """Panel as {unit, traces} for the page."""
     traces = [_trace_data(bands[name], name) for name in panel.names]
     return {"unit": panel.unit, "traces": traces}
 
 
-def _trace_data(band: Band, name: str) -> dict[str, Any]:
+def _trace_data(band: Band, name: str) -> dict[str, object]:
     """Band as {label, colour, width, low, high} for the page; `high` is None for a line.
 
     `low` and `high` are single-precision values in base64, `width` is in pixels, `colour` one of COLOURED or "other".
@@ -80,6 +81,6 @@ def _trace_data(band: Band, name: str) -> dict[str, Any]:
     return {"label": label, "colour": colour, "width": width, "low": _encode_base64(band.low, np.float32), "high": high}
 
 
-def _encode_base64(values: Any, dtype: Any) -> str:
+def _encode_base64(values: Real, dtype: npt.DTypeLike) -> str:
     """Values as little-endian bytes of `dtype` in base64."""
     return base64.b64encode(np.asarray(values).astype(np.dtype(dtype).newbyteorder("<")).tobytes()).decode()

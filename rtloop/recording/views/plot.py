@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -24,6 +24,7 @@ from rtloop.recording.views.bands import (
 from rtloop.recording.views.picture import DOTS_PER_INCH, create_picture
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 FORMATS = (".png", ".pdf", ".svg")
@@ -85,7 +86,7 @@ def draw_recording(
     return figure
 
 
-def _draw(figure: Any, drawing: DrawnRecording) -> None:
+def _draw(figure: Figure, drawing: DrawnRecording) -> None:
     """Draw all panels, one below the other, and the marks of the events."""
     panels, bands = drawing.panels, drawing.bands
     plots = list(np.ravel(figure.subplots(len(panels), 1, sharex=True)))
@@ -100,7 +101,7 @@ def _draw(figure: Any, drawing: DrawnRecording) -> None:
     _mark_events(plots, drawing.marks)
 
 
-def _draw_trace(subplot: Any, band: Band, kind: str) -> None:
+def _draw_trace(subplot: Axes, band: Band, kind: str) -> None:
     """Draw a band as a line, or as two lines with the area between them."""
     color = COLOURS.get(kind, OTHER_COLOUR)
     line = {"color": color, "linewidth": WIDE_LINES.get(kind, 0.8), "zorder": 1.9 if kind in WIDE_LINES else 2.0}
@@ -110,7 +111,7 @@ def _draw_trace(subplot: Any, band: Band, kind: str) -> None:
         subplot.fill_between(band.time_s, band.low, band.high, color=color, alpha=0.5, linewidth=0)
 
 
-def _mark_events(panels: list[Any], events: list[Mark]) -> None:
+def _mark_events(panels: list[Axes], events: list[Mark]) -> None:
     """Draw a line at each event, and the labels of the first MAX_LABELS above the topmost panel."""
     for event in events:
         for panel in panels:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import asdict, dataclass
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -34,7 +33,7 @@ class StepMetrics:
     static_error_percent: float
     static_error_percent_worst: float
 
-    def as_dict(self) -> dict[str, Any]:
+    def as_dict(self) -> dict[str, float | None]:
         """Metrics as a dict for JSON; an infinite settling time and a missing overshoot become None."""
         return {name: value if math.isfinite(value) else None for name, value in asdict(self).items()}
 

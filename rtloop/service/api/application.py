@@ -11,12 +11,11 @@ import itertools
 import json
 from collections.abc import AsyncIterator
 from contextlib import AbstractAsyncContextManager, asynccontextmanager, nullcontext
-from typing import Any
 
 from starlette.applications import Starlette
 from starlette.requests import ClientDisconnect, HTTPConnection, Request
 from starlette.responses import JSONResponse, PlainTextResponse, Response
-from starlette.routing import Route, WebSocketRoute
+from starlette.routing import BaseRoute, Route, WebSocketRoute
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from rtloop.service.api.bodies import MAX_BODY_BYTES, Body
@@ -97,7 +96,7 @@ def application(service: Service) -> Starlette:
         """Return the response to /openapi.json: the description for the configured axes."""
         return JSONResponse(openapi([axis.name for axis in service.configuration.axes]))
 
-    routes: list[Any] = [
+    routes: list[BaseRoute] = [
         Route("/openapi.json", get_openapi),
         WebSocketRoute("/watch", watch),
         WebSocketRoute("/setpoints", setpoints),

@@ -20,7 +20,7 @@ MAX_VALUES, MAX_DEPTH, MAX_CHARACTERS = 10_000, 6, 4096
 """Bounds on settings: number of values, depth of nested tables and lists, length of a text."""
 
 
-def _require_bounded(settings: dict[str, Any]) -> dict[str, Any]:
+def _require_bounded(settings: dict[str, object]) -> dict[str, object]:
     """Return `settings` itself. Raises ValueError for more than MAX_VALUES keys and values, for nesting deeper than
     MAX_DEPTH, texts longer than MAX_CHARACTERS and integers beyond ±LARGEST_INTEGER.
     """
@@ -41,7 +41,7 @@ def _require_bounded(settings: dict[str, Any]) -> dict[str, Any]:
     return settings
 
 
-def _walk_values(node: Any, depth: int) -> Iterator[tuple[int, Any]]:
+def _walk_values(node: object, depth: int) -> Iterator[tuple[int, object]]:
     """Yield (depth, value) for `node` itself, at `depth`, then for all keys and values in it, each value one deeper.
 
     A key has the depth of its table. Contents of tables and lists deeper than MAX_DEPTH are left out.

@@ -9,10 +9,14 @@ from __future__ import annotations
 
 import asyncio
 import resource
-from typing import Any
+from typing import TYPE_CHECKING
 
 import uvicorn
 from uvicorn.protocols.http.h11_impl import H11Protocol
+
+if TYPE_CHECKING:
+    import h11
+    from starlette.applications import Starlette
 
 MAX_CONNECTIONS = min(256, resource.getrlimit(resource.RLIMIT_NOFILE)[0] // 4)
 IDLE_S = 10.0
@@ -27,7 +31,7 @@ class BoundedConnection(H11Protocol):
     _open_connections: dict[BoundedConnection, None] = {}  # noqa: RUF012  (one event loop, one server)
     _timer: asyncio.TimerHandle | None = None
 
-    def connection_made(self, transport: Any) -> None:
+    def connection_made(self, transport: asyncio.Transport) -> None:
         """Count the connection and wait for a request; with too many, abort the oldest idle one, or else this one."""
         super().connection_made(transport)
         self._open_connections[self] = None
@@ -41,7 +45,7 @@ class BoundedConnection(H11Protocol):
         self._release_place()
         super().connection_lost(exc)
 
-    def handle_websocket_upgrade(self, event: Any) -> None:
+    def handle_websocket_upgrade(self, event: h11.Request) -> None:
         """Stop counting the connection: the application counts its WebSockets."""
         self._release_place()
         super().handle_websocket_upgrade(event)
@@ -83,7 +87,7 @@ class BoundedConnection(H11Protocol):
             self._timer.cancel()
 
 
-def server_settings(application: Any) -> uvicorn.Config:
+def server_settings(application: Starlette) -> uvicorn.Config:
     """Return uvicorn's configuration that serves `application` over BoundedConnections, on a socket that is open
     already.
     """

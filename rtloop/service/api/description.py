@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Mapping, Sequence
 
 from rtloop.configuration.file import type_adapter
 from rtloop.configuration.reference_options import ReferenceOptions
@@ -36,12 +35,12 @@ NAME_PARAMETER = {
 }
 
 
-def openapi(axes: Sequence[str]) -> dict[str, Any]:
+def openapi(axes: Sequence[str]) -> dict[str, object]:
     """Return the OpenAPI description, as JSON values, of the API of a service with these axes."""
     reference = type_adapter(ReferenceOptions).json_schema(ref_template="#/components/schemas/{model}")
     components = reference.pop("$defs")
     fields = {"axis": {"enum": list(axes)}, "section": {"enum": list(TUNABLE_SECTIONS)}, "reference": reference}
-    paths: dict[str, Any] = {}
+    paths: dict[str, dict[str, object]] = {}
     for request in REQUESTS:
         paths.setdefault(request.path, {})[request.method.lower()] = _operation(request, fields)
     return {
@@ -52,19 +51,19 @@ def openapi(axes: Sequence[str]) -> dict[str, Any]:
     }
 
 
-def _operation(request: ApiRequest, fields: dict[str, Any]) -> dict[str, Any]:
+def _operation(request: ApiRequest, fields: Mapping[str, object]) -> dict[str, object]:
     """Return the OpenAPI operation of one request: parameters, body and responses.
 
     `fields` are schemas, by name, that replace those of the body's fields.
     """
-    answers: dict[str, Any] = {"200": {"description": "done", "content": {request.media_type: {}}}}
+    answers: dict[str, object] = {"200": {"description": "done", "content": {request.media_type: {}}}}
     for code in request.errors:
         content = {"application/json": {"schema": ERROR_SCHEMA}}
         answers[str(code)] = {"description": ERRORS[code], "content": content}
     parameters = [] if request.sender is Sender.ANYONE else [NAME_PARAMETER]
     if request.sender is Sender.STOPPER or (request.body is not None and request.body.can_stop):
         parameters = [NAME_PARAMETER | {"schema": {"type": "string"}}]  # A stop ignores an invalid name.
-    operation: dict[str, Any] = {"summary": request.summary, "parameters": parameters, "responses": answers}
+    operation: dict[str, object] = {"summary": request.summary, "parameters": parameters, "responses": answers}
     if request.body is None:
         return operation
     schema = request.body.model_json_schema()

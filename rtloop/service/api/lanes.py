@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from enum import Enum
-from typing import Any
+from typing import TypeVar, TypeVarTuple
 
 import anyio.to_thread
 from anyio import CapacityLimiter
 
 from rtloop.values import count_text
 
+T = TypeVar("T")
+Ts = TypeVarTuple("Ts")
 RETRY_TEXT = "try again"
 
 
@@ -37,7 +39,7 @@ class Lanes:
         self._limiters = {lane: CapacityLimiter(lane.value[0]) for lane in Lane}
         self._pending_counts = dict.fromkeys(Lane, 0)
 
-    async def run(self, lane: Lane, action: Callable[..., Any], *arguments: Any) -> Any:
+    async def run(self, lane: Lane, action: Callable[[*Ts], T], *arguments: *Ts) -> T:
         """Run `action` in a thread of the lane, once one is free, and return its result.
 
         Raises TooManyRequests if the lane's largest number of requests run or wait, and the exceptions of the action.

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator, Sequence
-from typing import Any
 
 from prometheus_client import CollectorRegistry, generate_latest
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, HistogramMetricFamily, Metric
@@ -18,7 +17,8 @@ from rtloop.service.status import WINDOW_TICKS, newest_signals, timing
 from rtloop.supervision.recording_state import recording_state
 
 US_PER_S = 1e6
-Samples = Iterable[tuple[Any, ...]]
+Family = type[CounterMetricFamily | GaugeMetricFamily]
+Samples = Iterable[tuple[*tuple[str, ...], float | None]]
 """Tuples of label values and a value; values of None are left out."""
 
 
@@ -30,7 +30,7 @@ def metrics_text(service: Service) -> str:
     return generate_latest(registry).decode()
 
 
-def _family(kind: Any, name: str, text: str, samples: Samples, labels: Sequence[str] = ()) -> Metric:
+def _family(kind: Family, name: str, text: str, samples: Samples, labels: Sequence[str] = ()) -> Metric:
     """Return the metric `name` of class `kind` with the help `text`, without samples whose value is None.
 
     `labels` are the names of the label values in each sample.

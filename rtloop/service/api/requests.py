@@ -10,7 +10,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from enum import Enum
 from pathlib import Path
-from typing import Any
+from typing import Any, TypedDict, TypeVar
 
 from pydantic import ValidationError
 
@@ -43,6 +43,7 @@ from rtloop.service.service import Service, State
 from rtloop.service.status import running_configuration, status
 from rtloop.supervision.supervisor import Supervisor
 
+B = TypeVar("B")
 SMALL_BYTES = 1 << 16
 
 
@@ -66,7 +67,7 @@ class ApiRequest:
     method: str
     path: str
     summary: str
-    action: Callable[[Service, Any], Any]
+    action: Callable[[Service, Any], object]
     body: type[Body] | None = None
     """Fields of the JSON body, or of the query of a GET request."""
     lane: Lane | None = Lane.ORDINARY
@@ -84,7 +85,20 @@ class ApiRequest:
         return self.path.removeprefix("/")
 
 
-def _tick(action: Callable[[Service, Any], int]) -> Callable[[Service, Any], dict[str, int]]:
+class _LaneArgument(TypedDict):
+    """The lane that several requests share."""
+
+    lane: Lane | None
+
+
+class _Arguments(_LaneArgument):
+    """The arguments of ApiRequest that several requests share."""
+
+    sender: Sender
+    errors: tuple[int, ...]
+
+
+def _tick(action: Callable[[Service, B], int]) -> Callable[[Service, B], dict[str, int]]:
     """Return an action whose response is {tick: the tick that `action` returns}."""
     return lambda service, body: {"tick": action(service, body)}
 
@@ -103,7 +117,7 @@ def _require_running(service: Service, activity: str) -> tuple[Supervisor, LiveL
     return supervisor, live
 
 
-def _arm(service: Service, _: None) -> dict[str, Any]:
+def _arm(service: Service, _: None) -> dict[str, object]:
     """Arm the service. Returns {}; raises as `Service.arm`."""
     service.arm()
     return {}
@@ -146,7 +160,7 @@ def _play_waveform(service: Service, body: WaveformBody) -> int:
     return references.set_waveform(body.axis, body.columns, body.hold_ticks, body.repeat)
 
 
-def _measure_response(service: Service, body: ResponseBody) -> dict[str, Any]:
+def _measure_response(service: Service, body: ResponseBody) -> dict[str, object]:
     """Measure the response of the body's axis. Returns `LoopMeasurement.for_json`; the service stores the figures for
     `/status`.
 
@@ -159,7 +173,7 @@ def _measure_response(service: Service, body: ResponseBody) -> dict[str, Any]:
     return measurement.for_json()
 
 
-def _learn(service: Service, body: LearnBody) -> dict[str, Any]:
+def _learn(service: Service, body: LearnBody) -> dict[str, object]:
     """Learn the table for one period of the reference. Returns `LearnResult.for_json` after all cycles.
 
     With `keep` the best table plays on, else the loop returns to its setpoint. Raises Refusal unless the loop runs, and
@@ -170,7 +184,7 @@ def _learn(service: Service, body: LearnBody) -> dict[str, Any]:
         return learn(*running_loop, body.axis, body.learn_request, current_measurement.add_cycle).for_json()
 
 
-def _undo(service: Service, body: UndoBody) -> dict[str, Any]:
+def _undo(service: Service, body: UndoBody) -> dict[str, object]:
     """Undo the last change of an axis. Returns {tick, undone: the change in words}.
 
     Raises Refusal without a loop, and as `LiveLaw.undo`.
@@ -189,7 +203,7 @@ def _command_origin(service: Service, query: IdentityQuery) -> dict[str, str | N
     return {"name": name, "change": None if live is None else live.change_text(identity)}
 
 
-def _take_lock(service: Service, body: LockBody) -> dict[str, Any] | None:
+def _take_lock(service: Service, body: LockBody) -> dict[str, object] | None:
     """Take the lock for the current requester, or renew it; with the body's emergency key also from another holder.
 
     Returns the lock holder as in `Lock.holder`. Raises Refusal as `Lock.take`, with a key as `Lock.break_open`.
@@ -202,18 +216,18 @@ def _take_lock(service: Service, body: LockBody) -> dict[str, Any] | None:
     return service.lock.holder
 
 
-def _release_lock(service: Service, _: None) -> dict[str, Any]:
+def _release_lock(service: Service, _: None) -> dict[str, object]:
     """Release the requester's lock. Returns {}; raises as `Lock.release`."""
     service.lock.release(current_requester().name)
     return {}
 
 
-_READ: dict[str, Any] = {"lane": None, "sender": Sender.ANYONE, "errors": ()}
-_STATE_READ: dict[str, Any] = _READ | {"errors": (409,)}
-_QUERY_READ: dict[str, Any] = _READ | {"errors": (422,)}
-_BUILD: dict[str, Any] = {"lane": Lane.BUILD}
-_SAFETY: dict[str, Any] = {"lane": Lane.SAFETY}
-_LOCK: dict[str, Any] = {"lane": None, "sender": Sender.NAMED, "errors": (409, 413, 422)}
+_READ: _Arguments = {"lane": None, "sender": Sender.ANYONE, "errors": ()}
+_STATE_READ: _Arguments = {**_READ, "errors": (409,)}
+_QUERY_READ: _Arguments = {**_READ, "errors": (422,)}
+_BUILD: _LaneArgument = {"lane": Lane.BUILD}
+_SAFETY: _LaneArgument = {"lane": Lane.SAFETY}
+_LOCK: _Arguments = {"lane": None, "sender": Sender.NAMED, "errors": (409, 413, 422)}
 
 REQUESTS = (
     ApiRequest("GET", "/status", "Return state, rate, faults and newest signals.", lambda s, _: status(s), **_READ),

@@ -9,9 +9,10 @@ from __future__ import annotations
 
 import threading
 import time
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 
 from rtloop import signals
 from rtloop.engine.messages import MESSAGE, Kind, Origin
@@ -63,7 +64,7 @@ class ActiveReferences:
         self._staging, self._period_s = staging, 1.0 / plan.pacing.rate_hz
         self._lock = threading.Lock()
         self._cursor = 0
-        self._events: np.ndarray[Any, Any] = np.zeros(EVENTS_AT_ONCE, MESSAGE)
+        self._events: npt.NDArray[np.void] = np.zeros(EVENTS_AT_ONCE, MESSAGE)
         self._mode: Mode | None = plan.mode
         """The loop's mode after the last event that was read; None if unknown."""
         self._kinds: list[Generator | None] = [Generator(int(kind)) for kind in plan.generators["kind"]]
@@ -136,7 +137,7 @@ class ActiveReferences:
                 raise Refusal("the loop stands still after a change of the reference; try again when the loop runs")
             time.sleep(POLL_S)
 
-    def _apply_event(self, event: Any) -> None:
+    def _apply_event(self, event: np.void) -> None:
         """Apply one event, a MESSAGE record, to mode, references and trip; the lock must be held."""
         kind, tick, values = int(event["kind"]), int(event["tick"]), event["values"]
         if kind == Kind.SET_MODE:

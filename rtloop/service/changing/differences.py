@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Any
 
 from rtloop.configuration.axis import AxisOptions
 
@@ -24,7 +23,7 @@ def differences(before: AxisOptions, after: AxisOptions) -> str:
     return ", ".join(texts[:MAX_WRITTEN]) + omitted_text
 
 
-def _section_differences(section: str, before: Any, after: Any) -> Iterator[str]:
+def _section_differences(section: str, before: object, after: object) -> Iterator[str]:
     """Yield a text for each key that differs between two values of `section`, such as "limits.drive_v 10 → 9".
 
     If a value is no table, yield one text, without a key; nothing for equal values. For lists and tables the text is "…
@@ -45,7 +44,7 @@ def _section_differences(section: str, before: Any, after: Any) -> Iterator[str]
             yield f"{section}.{key} " + ("changed" if is_long else f"{_format_value(old)} → {_format_value(new)}")
 
 
-def _format_value(value: Any) -> str:
+def _format_value(value: object) -> str:
     """Return a value as a short text: six digits of a number, "none" for None, "a table" for a dict."""
     if isinstance(value, float | int) and not isinstance(value, bool):
         return f"{value:.6g}"

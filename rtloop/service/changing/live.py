@@ -7,7 +7,6 @@ import tomllib
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
-from typing import Any
 
 import numpy as np
 from pydantic import ValidationError
@@ -64,7 +63,7 @@ class LiveLaw:
         """Cached figures of axes, each with its configuration."""
 
     @property
-    def current_configuration(self) -> dict[str, Any]:
+    def current_configuration(self) -> dict[str, object]:
         """{folder: folder of the configuration's files, values: the configuration with all changes, as JSON values}."""
         configuration = self.prepared.configuration
         values = tomllib.loads(configuration.text)
@@ -79,7 +78,7 @@ class LiveLaw:
         """Return the change that a command made, in words, by the `identity` of its event; None if unknown."""
         return self._staging.desk.change_text(identity)
 
-    def tune(self, axis: str, section: str, changes: Mapping[str, Any]) -> int:
+    def tune(self, axis: str, section: str, changes: Mapping[str, object]) -> int:
         """Build and verify the law with other values of keys of [axis.SECTION], `changes`, and load it.
 
         Returns the tick of the load; `undo` takes the change back. Raises ConfigError for an unknown axis, a section
@@ -91,7 +90,7 @@ class LiveLaw:
         with self._build_lock:
             return self._apply_change(*self._axis_with_keys(axis, section, changes), f"{section}: {', '.join(changes)}")
 
-    def load_controller(self, axis: str, controller: Mapping[str, Any]) -> int:
+    def load_controller(self, axis: str, controller: Mapping[str, object]) -> int:
         """Replace [axis.controller] as a whole: build, verify and load it. Returns the tick of the load.
 
         `controller` are all its keys with their values; `undo` takes the change back. Raises as `tune`, ConfigError
@@ -102,7 +101,7 @@ class LiveLaw:
                 *self._axis_with_controller(self.axis_number(axis), controller, keep_other_keys=False), "controller"
             )
 
-    def preview(self, axis: str, section: str, changes: Mapping[str, Any]) -> dict[str, Figures]:
+    def preview(self, axis: str, section: str, changes: Mapping[str, object]) -> dict[str, Figures]:
         """Return {before, after}: `loop_figures` without and with a `tune`, with steps of equal length.
 
         The running law stays. Raises as `tune`, except for UnconfirmedCommand.
@@ -146,7 +145,7 @@ class LiveLaw:
         self._history.add(change)
         return tick
 
-    def _axis_with_keys(self, axis: str, section: str, changes: Mapping[str, Any]) -> tuple[int, AxisOptions]:
+    def _axis_with_keys(self, axis: str, section: str, changes: Mapping[str, object]) -> tuple[int, AxisOptions]:
         """Return number and options of the axis that owns the section, with the changes, for `_apply_change`.
 
         For the section "controller" that is the axis whose controller `axis` uses, else `axis` itself. Raises
@@ -164,7 +163,7 @@ class LiveLaw:
         return number, self._validated_axis(merged)
 
     def _axis_with_controller(
-        self, number: int, controller: Mapping[str, Any], keep_other_keys: bool
+        self, number: int, controller: Mapping[str, object], keep_other_keys: bool
     ) -> tuple[int, AxisOptions]:
         """Return number and options of the axis that owns the controller of axis `number`, with another controller.
 
@@ -258,7 +257,7 @@ class LiveLaw:
         plan = replace(self.prepared.plan, coefficients=coefficients)
         self.prepared = replace(self.prepared, configuration=configuration, plan=plan, checks=tuple(checks))
 
-    def _validated_axis(self, raw: Mapping[str, Any]) -> AxisOptions:
+    def _validated_axis(self, raw: Mapping[str, object]) -> AxisOptions:
         """Return the options of an axis from `raw`, the keys of its section [[axis]], with the name.
 
         They are checked against the laws that the loop has loaded. A user's laws are tried in the limited process

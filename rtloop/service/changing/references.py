@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from pydantic import ValidationError
@@ -22,13 +22,12 @@ from rtloop.configuration.references import (
 from rtloop.configuration.schedule import setpoint_fault
 from rtloop.engine.messages import Kind
 from rtloop.errors import ConfigError
+from rtloop.foundation.arrays import Real
 from rtloop.kernel.limits import USABLE_MAGNITUDE
 from rtloop.kernel.reference import Generator
 from rtloop.service.changing.active_references import ActiveReferences, Trip
 from rtloop.service.changing.staging import Staging
 from rtloop.service.desk import Refusal, UnconfirmedCommand
-
-Samples = np.ndarray[Any, Any]
 
 
 class Setting(NamedTuple):
@@ -39,7 +38,7 @@ class Setting(NamedTuple):
 
     values: tuple[float, ...]
     in_volts: bool
-    samples: Samples | None = None
+    samples: Real | None = None
 
 
 class ReferenceReplaced(Refusal):
@@ -70,7 +69,7 @@ class LiveReferences:
         self._activity = ""
         """Reason for refusing the references of clients, in words; empty while clients may set references."""
 
-    def set(self, axis: str, reference: Mapping[str, Any], *, restores: bool = False) -> int:
+    def set(self, axis: str, reference: Mapping[str, object], *, restores: bool = False) -> int:
         """Start a generator, {kind, …} as in [axis.reference], on the axis of this name. Returns its first tick.
 
         Its values are in µm, in raw mode in V. `restores`: the reference was active before, so a position interlock
@@ -85,7 +84,7 @@ class LiveReferences:
         with self._staging.lock:
             return self.play(axis_number(self._prepared(), axis), values, samples, restores=restores)
 
-    def set_waveform(self, axis: str, samples: Samples, hold_ticks: int, repeat: bool) -> int:
+    def set_waveform(self, axis: str, samples: Real, hold_ticks: int, repeat: bool) -> int:
         """Play samples (n, 1 or 2) in µm (V in raw mode), `hold_ticks` ticks each, once or endlessly (`repeat`).
 
         Played once, the last sample is held. The second column, µm, is added to the command. Returns the tick of the
@@ -103,7 +102,7 @@ class LiveReferences:
         with self._staging.lock:
             return self.play(axis_number(self._prepared(), axis), values, table.samples)
 
-    def play_raw(self, number: int, samples_v: Samples) -> int:
+    def play_raw(self, number: int, samples_v: Real) -> int:
         """Start drives `samples_v` (n,), V, once, a tick each, as reference of axis `number`; the caller sets mode raw.
 
         Limits are not checked. Returns the tick of the first sample. Raises Refusal, UnconfirmedCommand; ConfigError
@@ -112,7 +111,7 @@ class LiveReferences:
         with self._service_change(number):
             return self._submit_table(number, [Generator.TABLE, 0, samples_v.size, 1.0, 0.0], samples_v)
 
-    def play_once(self, number: int, samples: Samples, hold_ticks: int, replaces: int) -> int:
+    def play_once(self, number: int, samples: Real, hold_ticks: int, replaces: int) -> int:
         """Play samples (n, 1 or 2) once on axis `number`, `hold_ticks` ticks each, as `set_waveform` does.
 
         `replaces` is the axis's entry of `client_counts` when the caller decided to play; ReferenceReplaced is raised
@@ -121,7 +120,7 @@ class LiveReferences:
         """
         count, columns = samples.shape
         with self._service_change(number, replaces):
-            values = [Generator.TABLE, 0, count, hold_ticks, 0.0, float(columns == 2)]
+            values: list[float] = [Generator.TABLE, 0, count, hold_ticks, 0.0, float(columns == 2)]
             return self._submit_table(number, values, samples.T.ravel())
 
     def setting(self, number: int) -> Setting | None:
@@ -231,7 +230,7 @@ class LiveReferences:
             )
         return reference.value
 
-    def generator(self, options: ReferenceOptions) -> tuple[list[Any], Samples]:
+    def generator(self, options: ReferenceOptions) -> tuple[list[float], Real]:
         """Return [kind, *parameters] of a generator, and the samples (n,) of its table, column after column.
 
         The samples are empty for other kinds than steps and table. Raises ConfigError for a table that cannot be read
@@ -247,7 +246,7 @@ class LiveReferences:
             raise ConfigError("reference", [f"reference.{error}"]) from None
         return list(values), table.samples
 
-    def play(self, number: int, values: list[Any], samples: Samples, *, restores: bool = False) -> int:
+    def play(self, number: int, values: list[float], samples: Real, *, restores: bool = False) -> int:
         """Start a generator on axis `number` and return its first tick; the staging lock must be held.
 
         Table samples go to shared memory. `values` and `samples` as `generator` returns them, `restores` as in `set`.
@@ -299,7 +298,7 @@ class LiveReferences:
         if table:
             self._active_places[number] = 1 - self._active_places[number]
 
-    def _submit_table(self, number: int, values: list[Any], samples: Samples) -> int:
+    def _submit_table(self, number: int, values: list[float], samples: Real) -> int:
         """Copy `samples` to the free one of the axis's two places in the shared table, play them, and return the tick.
 
         `values` as in `play`; `values[1]`, the index of the first sample, is set here. Raises ConfigError for too many

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 
 class Progress(NamedTuple):
@@ -24,7 +24,7 @@ class CurrentMeasurement:
     def __init__(self) -> None:
         self._progress: Progress | None = None
 
-    def for_json(self) -> dict[str, Any] | None:
+    def for_json(self) -> dict[str, object] | None:
         """Return the progress as {activity, axis, rms_um, cycles}; None without a measurement.
 
         Of a learning, `rms_um` has the rms error of each finished cycle, in µm, and `cycles` is the number of cycles

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -63,7 +63,7 @@ class LearnResult(NamedTuple):
     table: Real
     end_reason: str
 
-    def for_json(self) -> dict[str, Any]:
+    def for_json(self) -> dict[str, object]:
         """Return {cycles: [{rms_um, largest_um}, …], ended: reason, reference_um, command_um: the table's columns}."""
         reference, command = self.table.T.tolist()
         cycles = [cycle._asdict() for cycle in self.cycles]

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import time
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import Any
@@ -65,7 +65,7 @@ class MeasurementHistory:
         """`LoopMeasurement.figures` and unix_time_s (s since 1970) of the last measurement; there must be one."""
         return self._figures[-1]
 
-    def for_json(self) -> dict[str, Any]:
+    def for_json(self) -> Mapping[str, object]:
         """Return the newest figures, and `resonance_trend`: [[time (s since 1970), Hz, its standard deviation], …] of
         the stored measurements that found a resonance, oldest first. There must be a measurement.
         """

@@ -12,11 +12,13 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
+import numpy.typing as npt
 
 from rtloop import signals
+from rtloop.foundation.arrays import Real
 from rtloop.recording.capture.rings import RingReader
 from rtloop.service.background import repeat_every
 from rtloop.service.measuring.condition import Condition, axis_condition
@@ -33,7 +35,6 @@ PEAK_LOOKS = 120
 LATENESS_US = (1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0, 200.0, 500.0, 1e3, 2e3, 5e3, 1e4, 1e5)
 """Upper bounds of the buckets of the lateness."""
 LIMIT_FLAGS = {"command": Flag.COMMAND_LIMITED, "drive": Flag.DRIVE_LIMITED, "slew": Flag.SLEW_LIMITED}
-Rows = np.ndarray[Any, Any]
 
 
 @dataclass
@@ -51,7 +52,7 @@ class AxisSums:
     condition: Condition | None = None
     """Condition at the newest update; None outside closed loop."""
 
-    def add(self, error_um: Rows, drive_v: Rows, is_closed_loop: Rows) -> None:
+    def add(self, error_um: Real, drive_v: Real, is_closed_loop: npt.NDArray[np.bool_]) -> None:
         """Add ticks: the error (µm) of those in closed loop, and the drive (V) of all.
 
         All arrays are (n,); `is_closed_loop` marks the ticks in closed loop. Values that are not finite are skipped.
@@ -84,7 +85,7 @@ class Quality:
         """Held while the sums change, and while they are read together."""
         self._supervisor: Supervisor | None = None
         self._reader: RingReader | None = None
-        self._rows: Rows = np.empty((0, 0))
+        self._rows: Real = np.empty((0, 0))
         self._last_trip_flags = 0
 
     def update(self, supervisor: Supervisor | None, limits: Sequence[LimitsOptions] = ()) -> None:
@@ -113,7 +114,7 @@ class Quality:
                     ):
                         self.axes[axis].condition = axis_condition(self._rows[:row_count], number, axis_limits)
 
-    def _add(self, rows: Rows, axes: tuple[str, ...]) -> None:
+    def _add(self, rows: Real, axes: tuple[str, ...]) -> None:
         """Add the records `rows` (n, columns) of a loop with these axes, n > 0, to all sums."""
         flags = rows[:, signals.FLAGS].astype(np.int64)
         self.ticks += len(rows)
@@ -131,7 +132,7 @@ class Quality:
             error, drive = (rows[:, signals.axis_column(number, signal)] for signal in (signals.ERROR, signals.DRIVE))
             self.axes.setdefault(axis, AxisSums()).add(error, drive, is_closed_loop)
 
-    def _count_trips(self, latched: Rows) -> None:
+    def _count_trips(self, latched: npt.NDArray[np.int64]) -> None:
         """Count each trip cause that was not latched one tick before, in the trip flags `latched` (n,) of successive
         ticks.
         """

@@ -15,7 +15,7 @@ import time
 from collections import deque
 from collections.abc import Callable
 from enum import StrEnum
-from typing import Any, NamedTuple, Protocol
+from typing import NamedTuple, Protocol
 
 from rtloop import signals
 from rtloop.configuration.file import Configuration
@@ -323,7 +323,7 @@ class Recovery:
             if self._steps and self._steps[0] is step:
                 self._steps.popleft()
 
-    def for_json(self) -> dict[str, Any] | None:
+    def for_json(self) -> dict[str, object] | None:
         """Return {state, left, confirmed, confirmations, causes, reason} for `/status`; None without [service.recover].
 
         `left` is the number of recoveries left within the hour; `confirmed` of the `confirmations` that are required

@@ -8,11 +8,14 @@ the best of each damping the grid is made finer twice (a matching pursuit, Malla
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TypeVar
 
 import numpy as np
+import numpy.typing as npt
 
 from rtloop.foundation.arrays import Complex, Real
+
+Number = TypeVar("Number", np.float64, np.complex128)
 
 DAMPINGS = (0.01, 0.05, 0.25, 0.8)
 GRID_SPACING = 2.0
@@ -111,6 +114,6 @@ def _pair_rates(sizes: Real, dampings: Real) -> Complex:
     return np.outer(sizes, -dampings + 1j * np.sqrt(1 - dampings**2)).ravel()
 
 
-def _block_sums(lines: Any, block_size: int) -> Any:
+def _block_sums(lines: npt.NDArray[Number], block_size: int) -> npt.NDArray[Number]:
     """Return the sums of `block_size` successive lines, (blocks,); the last block may be shorter."""
     return np.add.reduceat(lines, np.arange(0, lines.size, block_size))

@@ -7,12 +7,14 @@ meaning in words.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from enum import IntEnum
 from pathlib import PurePath
 from typing import Any
 from unicodedata import category
 
 import numpy as np
+import numpy.typing as npt
 
 from rtloop.engine.messages import ALL_AXES, MESSAGE, Kind, Origin
 from rtloop.recording.file.topics.recovery_steps import Note, step_meaning
@@ -50,7 +52,7 @@ def event_from_message(
     """
     values = [float(value) for value in message["values"]]
     kind, axis = int(message["kind"]), int(message["axis"])
-    meaning: dict[str, Any] = {}
+    meaning: dict[str, object] = {}
     if kind == Kind.SET_MODE:
         meaning = {"mode": _member_name(Mode, values[0])}
     elif kind == Kind.TRIPPED:
@@ -105,7 +107,7 @@ def _failure_text(code: int, value: float) -> str:
     )
 
 
-def message_from_event(event: Event, axes: Sequence[str]) -> np.ndarray[Any, Any] | None:
+def message_from_event(event: Event, axes: Sequence[str]) -> npt.NDArray[np.void] | None:
     """Return the record of MESSAGE, shape (1,), that `event` was made from; None for an event of the recorder.
 
     Raises ValueError for an unknown kind, and for an axis that is not in `axes`.
@@ -140,7 +142,7 @@ def is_kind_name(name: str) -> bool:
     return is_member_name(Kind, name) or is_member_name(Note, name)
 
 
-def is_member_name(kinds: Any, name: str) -> bool:
+def is_member_name(kinds: type[IntEnum], name: str) -> bool:
     """Whether `name`, in capitals or not, is a member of the enumeration `kinds`, or a number of at most 9 digits.
 
     A number stands for a member that this version does not know.
@@ -148,7 +150,7 @@ def is_member_name(kinds: Any, name: str) -> bool:
     return name.upper() in kinds.__members__ or (name.isascii() and name.isdigit() and len(name) < 10)
 
 
-def recorder_event(kind: str, tick: int, time_ns: int, details: dict[str, Any]) -> Event:
+def recorder_event(kind: str, tick: int, time_ns: int, details: Mapping[str, object]) -> Event:
     """Make an event of the recorder, `time_ns` after the start, for no axis; `details` becomes its `what`."""
     return {"tick": tick, "time_ns": time_ns, "kind": kind, "who": RECORDER, "axis": None, "what": details}
 
@@ -163,7 +165,7 @@ def _kind_value(name: str) -> int:
     return _member_value(Note if name.upper() in Note.__members__ else Kind, name)
 
 
-def _member_name(kinds: Any, value: float) -> str:
+def _member_name(kinds: type[IntEnum], value: float) -> str:
     """Name of member `value` of the enumeration `kinds` in lower case, or the number as text without such a member."""
     try:
         return str(kinds(int(value)).name).lower()
@@ -176,7 +178,7 @@ def _origin_value(who: str) -> int:
     return _member_value(Origin, who) if is_member_name(Origin, who) else int(Origin.OPERATOR)
 
 
-def _member_value(kinds: Any, name: str) -> int:
+def _member_value(kinds: type[IntEnum], name: str) -> int:
     """Number of the member `name` of the enumeration `kinds`, or the number of which `name` is the text.
 
     Raises ValueError if it is neither.
@@ -184,6 +186,6 @@ def _member_value(kinds: Any, name: str) -> int:
     return int(kinds[name.upper()]) if name.upper() in kinds.__members__ else int(name)
 
 
-def json_value(value: Any) -> Any:
+def json_value(value: object) -> object:
     """Return a value for JSON: a NaN or infinity, which JSON lacks, as "nan", "inf" or "-inf", any other unchanged."""
     return repr(value) if isinstance(value, float) and not math.isfinite(value) else value

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NotRequired, TypedDict
 
 import numpy as np
 import numpy.typing as npt
@@ -53,6 +53,74 @@ _EVENT = {
     },
 }
 _CONFIGURATION = {"title": "rtloop.Configuration", "type": "object"}
+
+
+class CutOrigin(TypedDict):
+    """Header field `cut`: the range of ticks from `first` to before `end` of the original `files`."""
+
+    first: int
+    end: int
+    files: list[str]
+
+
+class AroundEvents(TypedDict):
+    """Header field `around`: settings of a recording around events."""
+
+    before_s: float
+    after_s: float
+    on: list[str]
+    every_s: float
+
+
+class ImportOrigin(TypedDict):
+    """Header field `imported`: source file and import settings of signals from another program."""
+
+    file: str
+    sha256: str
+    time: str
+    mapping: dict[str, str]
+    units: dict[str, str]
+    notes: list[str]
+    position_first: NotRequired[bool]
+
+
+class Header(TypedDict):
+    """Fields of a recording's header that are read. Imported signals have None as `law`, and no `driver`."""
+
+    name: str
+    created_unix_ns: int
+    axes: list[str]
+    observed: list[str]
+    columns: list[str]
+    rate_hz: float
+    paced: bool
+    ticks_expected: NotRequired[int | None]
+    configuration: str
+    folder: NotRequired[str]
+    law: Any
+    driver: dict[str, Any]
+    realtime: dict[str, object]
+    versions: dict[str, str | None]
+    host: dict[str, Any]
+    extras: NotRequired[dict[str, list[dict[str, Any]]]]
+    sequence: NotRequired[int]
+    first_tick: NotRequired[int]
+    repeats_before: NotRequired[int]
+    cut: NotRequired[CutOrigin | None]
+    around: NotRequired[AroundEvents | None]
+    imported: NotRequired[ImportOrigin]
+
+
+class Totals(TypedDict):
+    """Totals in the event that ends a file."""
+
+    ticks_executed: int
+    ticks_logged: int
+    ticks_lost: int
+    events_lost: int
+    result: str
+    complete: bool
+    driver_error: NotRequired[str | None]
 
 
 def _varint(value: int) -> bytes:
@@ -118,7 +186,7 @@ def channels() -> list[Channel]:
     ]
 
 
-def tick_dtype(columns: Sequence[str]) -> np.dtype[Any]:
+def tick_dtype(columns: Sequence[str]) -> np.dtype[np.void]:
     """Type of a tick's whole MCAP message record, prefix included, without padding; columns by name."""
     fields = [("_opcode", "u1"), ("_length", "<u8"), ("_channel", "<u2"), ("_sequence", "<u4")]
     fields += [("_log_time", "<u8"), ("_publish_time", "<u8")]

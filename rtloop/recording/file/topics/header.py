@@ -6,7 +6,6 @@ import hashlib
 import io
 import struct
 from pathlib import Path
-from typing import Any
 
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
@@ -48,7 +47,7 @@ def header_payload(content: bytes) -> bytes:
     return messages[0].payload
 
 
-def read_header(path: Path, payload: bytes, content: bytes | None = None) -> dict[str, Any]:
+def read_header(path: Path, payload: bytes, content: bytes | None = None) -> format.Header:
     """Parse the header `payload` of a recording; compare it with the schemas in `content`, its unpacked first chunk.
 
     Without `content`, the schemas are not compared; `path` is the file named in errors.

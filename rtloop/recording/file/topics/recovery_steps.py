@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from enum import IntEnum
-from typing import Any
 
 from rtloop.signals import trip_causes
 
@@ -83,7 +82,7 @@ REASON_TEXTS = {
 }
 
 
-def step_meaning(values: Sequence[float]) -> dict[str, Any]:
+def step_meaning(values: Sequence[float]) -> dict[str, object]:
     """Return {step, left, reason, causes} of the values of a RECOVERY message.
 
     `step`: name of a RecoveryStep in lower case; `left`: number of recoveries left within the hour; `reason`: text, or
