@@ -109,6 +109,15 @@ def test_matlab_73(tmp_path: Path):
     assert table.time == "t"
 
 
+def test_a_named_type_in_a_matlab_file_is_passed_over(tmp_path: Path):
+    """A named type is an object without values; HDF5 stores it beside the arrays."""
+    with h5py.File(tmp_path / "a.mat", "w", userblock_size=512) as file:
+        file["t"], file["u"], file["kind"] = TIME[None], DRIVE[None], np.dtype("f8")
+    with (tmp_path / "a.mat").open("r+b") as file:
+        file.write(b"MATLAB 7.3 MAT-file".ljust(124) + b"\x00\x02IM")
+    assert has_columns(read_in_process(tmp_path / "a.mat"), t=TIME, u=DRIVE)
+
+
 def test_a_reference_to_itself_ends(tmp_path: Path):
     with h5py.File(tmp_path / "a.mat", "w", userblock_size=512) as file:
         cell = file.create_dataset("cell", (1, 1), h5py.ref_dtype)

@@ -35,8 +35,12 @@ def rewrite(
     rows: Callable[[Rows], Any] = lambda rows: None,
     law: Callable[[bytearray], Any] = lambda data: None,
     event: Callable[[dict[str, Any]], Any] = lambda event: None,
+    final_event: Callable[[dict[str, Any]], Any] | None = None,
 ) -> Path:
-    """Copy `source` to `target`; each function changes its argument in place. Returns `target`."""
+    """Copy `source` to `target`; each function changes its argument in place. Returns `target`.
+
+    `event` changes all events but the one that ends the file, which `final_event` changes.
+    """
     with Reader(source) as reader:
         header = {key: value for key, value in reader.header.items() if key != "configuration_sha256"}
         writer = Writer(target, header, header["created_unix_ns"])
@@ -54,7 +58,8 @@ def rewrite(
                 elif message.channel != CONFIGURATION:
                     changed_messages.append(_change(message, law, event))
             writer.write_messages(changed_messages)
-        writer.finish(lambda _: final_messages[-1])
+        final = final_messages[-1]
+        writer.finish(lambda _: final if final_event is None else _change(final, law, final_event))
     return target
 
 

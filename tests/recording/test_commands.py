@@ -147,6 +147,22 @@ def test_recover_writes_a_complete_file_once(eventful: Path, tmp_path: Path):
     assert all(index.message_index_offsets for index in summary.chunk_indexes)
 
 
+@pytest.mark.parametrize(("gaps", "complete"), [({}, False), ({"gaps": [[3, 5]]}, False), ({"gaps": []}, True)])
+def test_a_run_with_a_recovered_file_is_complete_if_the_file_says_that_it_has_no_gaps(
+    gaps: dict[str, list[list[int]]], complete: bool, parts: list[Path], tmp_path: Path
+):
+    def recover(event: dict[str, Any]) -> None:
+        """Change the event that ends a file into that of a recovered file with `gaps`."""
+        event["kind"] = "recovered"
+        event["what"] |= {"result": "recovered", "complete": False}
+        event["what"].pop("gaps", None)
+        event["what"].update(gaps)
+
+    first = rewrite(parts[0], tmp_path / parts[0].name, final_event=recover)
+    summary = answer("info", first, *parts[1:])
+    assert (summary["ticks_logged"], summary["ticks_lost"], summary["complete"]) == (TICKS, 0, complete)
+
+
 def test_a_complete_recording_is_not_recovered(eventful: Path, tmp_path: Path):
     result = run("recover", eventful, "--out", tmp_path / "copy.mcap")
     assert (result.exit_code, "is complete, nothing had to be recovered" in " ".join(result.stdout.split())) == (
