@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Annotated, Any, SupportsIndex
+from typing import Annotated, Any
 
 from pydantic import Field, PrivateAttr
 
 from rtloop.foundation.options import Options
 from rtloop.hysteresis.play_model import PlayModel
-
-if TYPE_CHECKING:
-    from rtloop.laws.registry import LawReference
 
 SHIPPED_PREFIX = "rtloop."
 """Prefix of the modules of this package; the module of a user law has another name."""
@@ -26,7 +23,7 @@ class LawOptions(Options):
     _law: Any = PrivateAttr(None)
 
     @classmethod
-    def __pydantic_init_subclass__(cls, **_: object) -> None:
+    def __pydantic_init_subclass__(cls, **_: Any) -> None:
         """Build the validator of a user law's options with their class, so that a fault is reported with its line."""
         if not cls.__module__.startswith(SHIPPED_PREFIX):
             cls.model_rebuild(raise_errors=False)  # A name that the text defines further down is no fault.
@@ -36,11 +33,11 @@ class LawOptions(Options):
         """`LawReference` of the law that has these options; None if `bind` was not called."""
         return self._law
 
-    def bind(self, law: LawReference) -> None:
+    def bind(self, law: Any) -> None:
         """Set the `LawReference` of the law that has these options, which are immutable otherwise."""
         self._law = law
 
-    def __reduce_ex__(self, protocol: SupportsIndex) -> str | tuple[object, ...]:
+    def __reduce_ex__(self, protocol: Any) -> Any:
         """Pickle the options of a user law as `LawReference` and values, other options as usual.
 
         Another process must first run the law's text, which defines the class of the options.

@@ -233,14 +233,18 @@ def test_it_is_verified_as_it_runs():
 
 
 @pytest.mark.usefixtures("few_simulated_steps")
-@pytest.mark.parametrize("command", [("check",), ("design", "verify")])
-def test_the_margins_of_all_axes_together_are_printed_once(command: tuple[str, ...]):
+@pytest.mark.parametrize(
+    ("command", "heading", "count"),
+    [(("check",), "x and y together", 1), (("design", "verify"), "All axes of this controller together", 2)],
+)
+def test_the_margins_of_all_axes_together_are_printed(command: tuple[str, ...], heading: str, count: int):
+    """`check` has one table of all axes, `design verify` repeats it in the section of each axis."""
     result = CliRunner().invoke(main, [*command, str(EXAMPLES["coupled"])])
     assert result.exit_code == 0, result.output
     margins = prepare_text(EXAMPLE).checks[0].together.margins
     words = " ".join(result.stdout.split())
-    assert words.count("x and y together") + words.count("All axes of this controller together") == 1
-    assert words.count(f"largest σ(S) {margins.max_sensitivity:.3f} at {margins.max_sensitivity_hz:.1f} Hz") == 1
+    assert words.count(heading) == count
+    assert words.count(f"largest σ(S) {margins.max_sensitivity:.3f} at {margins.max_sensitivity_hz:.1f} Hz") == count
     gain = (1 + margins.disk_margin / 2) / (1 - margins.disk_margin / 2)
     phase_deg = np.degrees(2 * np.arctan(margins.disk_margin / 2))
     assert f"disk margin, sensors {margins.disk_margin:.3f} at {margins.disk_margin_hz:.1f} Hz" in words
