@@ -139,6 +139,7 @@ def _print_compensation(report: dict[str, Any]) -> None:
         )
     if report["dead_band"] == "exact":
         out.print(
-            "these figures do not include dead_band = 'exact' of CONFIG; with this setting, less hysteresis remains"
+            f"these figures are computed without dead_band = 'exact', which {report['config']} sets; a run has it, and "
+            "less hysteresis remains"
         )
     print_files(out, report)

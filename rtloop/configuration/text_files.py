@@ -6,6 +6,7 @@ import errno
 import os
 import re
 import stat
+import sys
 import tomllib
 from pathlib import Path
 from typing import Any
@@ -105,7 +106,9 @@ def parse_toml(text: str) -> dict[str, Any]:
     except tomllib.TOMLDecodeError as error:
         raise ValueError(f"not valid TOML: {_QUOTED.sub('…', str(error))}") from None
     except ValueError:  # the interpreter's own limit, whose message is about the interpreter
-        raise ValueError("not valid TOML: an integer has too many digits (thousands); shorten it") from None
+        raise ValueError(
+            f"not valid TOML: an integer has more than {sys.get_int_max_str_digits()} digits; shorten it"
+        ) from None
     except RecursionError:
         raise ValueError(
             "not valid TOML: lists or tables are nested too deeply (hundreds of levels); use fewer levels"

@@ -142,8 +142,8 @@ class Layout:
             expected = int(axis["controller_axes"]) if slot == "controller" else 0
             if law.axes != expected:
                 raise ValueError(
-                    f"{slot}_law of {owner} is {law.name!r}, a law for {law.axes} axes; allowed: a law for {expected} "
-                    "axes (a feedforward counts as a law for 0 axes)"
+                    f"{slot}_law of {owner} is {law.name!r}, which states {law.axes} axes; allowed: {expected} axes "
+                    "here (a feedforward states 0, a controller the axes that it controls)"
                 )
             require_allowed(owner, slot_view(axis, slot, law.coefficients), law.allowed_coefficients)
             require_allowed(owner, slot_view(state, slot, law.state), law.allowed_state)
@@ -206,7 +206,8 @@ def require_owners(controller_axes: Sequence[int]) -> None:
         if (count == 0) != (number < owned_axes):
             owners = "no controller" if count == 0 else "two controllers"
             raise ValueError(
-                f"axis {number} has {owners}, because its controller_axes is {count}; allowed: one controller"
+                f"axis {number} has {owners}: its own field controller_axes is {count}, and controllers of axes before "
+                f"it cover {max(owned_axes - number, 0)} axes from it on; allowed: one controller"
             )
         owned_axes = max(owned_axes, number + count)
 
