@@ -118,7 +118,10 @@ def _attribute(options: object, path: str, key: str) -> object:
 
 
 def _choices_text(value: object) -> str:
-    """Return "; allowed: …" with the fields of Options, the keys of a table or the places of a tuple; else ""."""
+    """Return "; allowed: …" with the fields of Options, the keys of a table or the places of a tuple.
+
+    Return "; the list is empty" for an empty tuple, "" for an empty table and for every other value.
+    """
     names = list(type(value).model_fields) if isinstance(value, Options) else []
     names = list(value) if isinstance(value, Mapping) else names
     if isinstance(value, tuple):

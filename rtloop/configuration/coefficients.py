@@ -135,7 +135,8 @@ def _prefilter(options: PrefilterOptions) -> Mapping[str, object]:
 
 
 def limit_fields(options: LimitsOptions, output: Channel, period_s: float) -> Mapping[str, float]:
-    """Return fields of the limits, in V and µm, of the channel's `safe_v`, and of `bump_decay`, a factor per tick.
+    """Return by name: limits of the drive in V and of the command in µm, slews, `safe_v` of the channel, and
+    `bump_decay`, a factor per tick.
 
     Slews are in V per tick; `slew_v_per_tick` is infinite without `slew_v_per_s`. Raises ValueError for a drive beyond
     the channel's range, and for a trip's ramp from its far end to safe that takes longer than LONGEST_RAMP_S.

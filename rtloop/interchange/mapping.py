@@ -27,6 +27,8 @@ MAX_SUGGESTIONS = 3
 """Number of similar columns listed where one is not found."""
 MAX_NAME_CHARACTERS = 90
 LARGEST_FACTOR = 1e99
+ZERO = re.compile(r"[+-]?[0.]+([eE][+-]?\d+)?")
+"""A number of which all digits are 0; float reads 1e-400 as 0, too."""
 _NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
 _SOURCE = re.compile(
     r"(?P<column>.+?)(?:\s*\[(?P<unit>[^\[\]]*)\])?"
@@ -100,9 +102,10 @@ def _exact_factor(text: str) -> Fraction:
     Raises ValueError for a magnitude above LARGEST_FACTOR or below its reciprocal; 0 is allowed.
     """
     magnitude = abs(float(text))  # Fraction alone would compute all digits of 1e999999999.
-    if magnitude and not 1 / LARGEST_FACTOR <= magnitude <= LARGEST_FACTOR:
+    is_zero = ZERO.fullmatch(text) is not None
+    if not is_zero and not 1 / LARGEST_FACTOR <= magnitude <= LARGEST_FACTOR:
         raise ValueError(f"factor {text}; allowed: 0, or a magnitude from {1 / LARGEST_FACTOR:g} to {LARGEST_FACTOR:g}")
-    return Fraction(text) if magnitude else Fraction(0)
+    return Fraction(0) if is_zero else Fraction(text)
 
 
 def _product_unit(unit: str, sensitivity_unit: str) -> str:

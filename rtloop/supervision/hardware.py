@@ -127,10 +127,11 @@ def read_note(path: Path) -> Hardware | None:
 
 
 def configured_hardware(config: Path) -> Hardware:
-    """Return the hardware of a configuration file, which must be valid as a whole; its driver can be created.
+    """Return the hardware of a configuration file, which must be valid as a whole, after its driver was created once.
 
-    Raises InputFileError for a file that cannot be read, ConfigError for an invalid one, also if its driver cannot be
-    created or an axis's ramp takes too long, DriverError as for a missing library.
+    Raises InputFileError for a file that cannot be read, ConfigError for an invalid one, also if an axis's ramp takes
+    too long. An error while the driver is created is raised on if it is a DriverError, such as a missing library; each
+    other one becomes a ConfigError.
     """
     configuration = load(config)
     hardware = Hardware.from_configuration(configuration)

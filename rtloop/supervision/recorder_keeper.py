@@ -145,7 +145,10 @@ class RecorderKeeper:
         return new_removals
 
     def _send_removals(self) -> None:
-        """Send pending removals, as events of the recording, if the recorder has its orders; else they stay pending."""
+        """Send the recorder the removals of files that it shall record as events.
+
+        They stay pending while the recorder has no orders, and while it neither runs nor has failed.
+        """
         if self._unsent_removals and self._has_orders and self.state in (ProcessState.RUNNING, ProcessState.FAILED):
             lines = [json.dumps({"removed": removal.event_details}) + "\n" for removal in self._unsent_removals]
             self._child.send("".join(lines).encode())

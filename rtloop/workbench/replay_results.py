@@ -57,7 +57,7 @@ class ReplayResult(Result):
 
     @property
     def gaps(self) -> list[dict[str, int]]:
-        """Ticks that are in no file: first_tick and count of each gap.
+        """Ticks that are missing in the files, without those omitted around events: first_tick and count of each gap.
 
         A gap that the recording does not declare as lost is in `not_verified` too.
         """

@@ -117,6 +117,7 @@ def test_assumptions_about_units_are_reported():
         ("raw [parsec]", "unit 'parsec' is not known"),
         ("raw [V] * 1e400 µm/V", "x_position_um from column 'raw': factor 1e400; allowed: 0, or a magnitude"),
         ("raw [V] * 1e-320 µm/V", "factor 1e-320; allowed: 0, or a magnitude from 1e-99 to 1e"),
+        ("raw [V] * -.01e-400 µm/V", "factor -.01e-400; allowed: 0, or a magnitude from 1e-99 to 1e"),
         (
             "Piezo Uot",
             r"no column 'Piezo Uot'; the columns of the file include 'Piezo Out'.*\(left out: Remark \(text\)\)",

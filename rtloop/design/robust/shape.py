@@ -286,7 +286,10 @@ def _explain_no_taps(subject: Subject, programme: Programme) -> str:
 
 
 def _proof_failure(subject: Subject, settling_ms: float, proof: StepMeasures, plants: int) -> str:
-    """Return a sentence on the limits that the proof over `plants` plants misses."""
+    """Return the message that taps designed for a settling time of `settling_ms` failed the proof on `plants` plants.
+
+    It states the largest settling time and overshoot of `proof`, how far the command exceeds its limits, and a remedy.
+    """
     is_beyond = proof.excess > ALLOWED_EXCESS
     excess = f"exceeds its limits by {100 * proof.excess:.2g} % of a step" if is_beyond else "stays within its limits"
     return (

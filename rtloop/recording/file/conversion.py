@@ -157,7 +157,7 @@ class _Conversion:
             self._writer.close()
 
     def _begin(self, message: McapMessage) -> None:
-        """Begin the copy with the header of the recording, and log a warning.
+        """Begin the converted copy with the header of the recording; log the warning that another tool wrote it.
 
         Raises RecordingError for a second or a malformed header, OutputError if the copy cannot be created.
         """

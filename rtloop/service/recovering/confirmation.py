@@ -15,7 +15,10 @@ class Confirmation:
     """
 
     def __init__(self, supervisor: Supervisor, period_s: float, now_s: float) -> None:
-        """Begin the first period, which lasts `period_s`, at the monotonic time `now_s`, with the loop's next tick."""
+        """Begin the first period in which readings after a trip are judged, with the count of sound periods at 0.
+
+        It begins at the monotonic time `now_s`, with the loop's next tick, and lasts `period_s`.
+        """
         self.supervisor, self.count = supervisor, 0
         self._period_s, self._since_s, self._next_tick = period_s, now_s, supervisor.ticks
 

@@ -84,7 +84,7 @@ class Overview:
 
     @property
     def time_s(self) -> Real:
-        """Deadline of each interval's first tick (n,), in s since the start of the run."""
+        """Deadline of each interval's first tick (n,), in s since the run's start; it jumps over missed periods."""
         return self["deadline_ns"].least * 1e-9
 
     @property
