@@ -65,6 +65,7 @@ def test_units_are_recognised():
         ("x_position_um", "raw [V] * 2.5 µm/V - 3 µm", [-3.0, -0.5, 4.5]),
         ("x_position_um", "raw [mV] * -250 nm/mV + 1", [1.0, 0.75, 0.25]),
         ("x_position_um", "raw * 0.25 µm/mV", [0.0, 0.25, 0.75]),
+        ("x_position_um", "raw * -0.0e5 µm/mV", [0.0, 0.0, 0.0]),
         ("x_position_um", "pos_nm", [0.0, 0.001, 0.003]),
         ("temperature", "raw2 [°C]", [0.0, 1.0, 3.0]),
         ("temperature", "raw2 [°C] + 3 °C", [3.0, 4.0, 6.0]),
