@@ -221,7 +221,7 @@ def observe(coefficients, state):
 
 @jit
 def step(coefficients, state, input_um):
-    """Advance the modes in `state` by one period with the input held at `input_um` [µm]; return nothing."""
+    """Advance the modes in `state` by one period with the input held at `input_um` [µm], in place."""
     state.input_um = input_um
     real, imag = state.modes_real, state.modes_imag
     for block in range((coefficients.mode_count + 3) // 4):

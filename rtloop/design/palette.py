@@ -81,7 +81,7 @@ def draw_pictures(
 
 
 def _copy_layout(source: Figure, target: Figure) -> None:
-    """Place the panels of `target` where those of `source` lie; both have the same panels.
+    """Place the panels of `target` as the panels of `source`; both have the same panels.
 
     Colours move no panel, and the search for places takes half of the time of a picture.
     """

@@ -99,7 +99,7 @@ def runs(options: HarmonicOptions, setting: Setting) -> list[Run]:
 class HarmonicCurves(TypedDict):
     """Sweeps by mode, the band near the resonance in Hz, the model's curves and the claim."""
 
-    found: dict[str, Real]
+    measured: dict[str, Real]
     near_hz: tuple[float, float]
     modelled: list[Curve]
     claimed: ClaimOptions | None
@@ -152,7 +152,7 @@ def analyse(recordings: Sequence[RecordedRun], options: HarmonicOptions) -> Anal
         "[axis.model].",
     ]
     curves: HarmonicCurves = {
-        "found": sweeps, "near_hz": model.near_hz, "modelled": model.curves(shifts_db),
+        "measured": sweeps, "near_hz": model.near_hz, "modelled": model.curves(shifts_db),
         "claimed": run.specification.claims.get("resonance_hz"),
     }  # fmt: skip
     return Analysis(rows, curves, (Table("Every frequency", headings, table),), notes)
@@ -271,7 +271,7 @@ def _draw_column(panels: npt.NDArray[np.object_], curves: HarmonicCurves, ink: P
     """
     magnitude, phase, coherence = panels
     for mode, color in zip(MODES, (ink.error, ink.drive, ink.measured), strict=True):
-        hz, decibels, degrees, coherences = curves["found"][mode].T
+        hz, decibels, degrees, coherences = curves["measured"][mode].T
         mask = np.where(coherences >= MIN_COHERENCE, 1.0, np.nan)
         style = {"color": color, "markersize": 3, "linewidth": 0.9}
         magnitude.plot(hz, decibels * mask, "o-", label=NAMES[mode], **style)

@@ -71,7 +71,7 @@ def runs(options: RobustnessOptions, setting: Setting) -> list[Run]:
 
 
 class RobustnessCurves(TypedDict):
-    """Of each shift in %: the position in µm and the outcome as text; all outcomes."""
+    """Position in µm and outcome as text for each shift in %; all outcomes."""
 
     traces: list[tuple[float, Real, str]]
     outcomes: list[Outcome]

@@ -159,7 +159,7 @@ def _mean_error(run: RecordedRun, number: int) -> Real:
 
 
 class ScanCurves(TypedDict):
-    """Of each scan: frequency in Hz, rms error of each cycle in %, first and last error in µm."""
+    """Frequency in Hz, rms error of each cycle in %, first and last error in µm, for each scan."""
 
     traces: list[tuple[float, list[float], Real, Real]]
 

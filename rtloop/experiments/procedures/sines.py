@@ -53,7 +53,7 @@ def runs(options: SinesOptions, setting: Setting) -> list[Run]:
 
 
 class SinesCurves(TypedDict):
-    """Of each sine: frequency in Hz, cycles, reference and position in µm."""
+    """Frequency in Hz, cycles, reference and position in µm of each sine."""
 
     traces: list[tuple[float, Real, Real, Real]]
 

@@ -82,7 +82,7 @@ class _LawModel(_CheckedModel):
 
 
 class _DriverModel(_CheckedModel):
-    """Header field `driver`."""
+    """Header field `driver` of a run: its kind."""
 
     kind: Name
 
