@@ -21,8 +21,8 @@ from rtloop.service.service import Service
 from rtloop.workbench.axis_judgement import AxisJudgement
 from rtloop.workbench.check_text import print_axis
 from tests.command_line import answer, run
-from tests.one_axis import one_axis, wired
 from tests.paper_configuration import PAPER, RATE, TEXT
+from tests.stage_text import one_axis, wired
 from tests.unequal_stage import HIGHEST_V, LOWEST_V, STAGE, Plays, curve
 
 RAW = (RATE, f'{RATE}mode = "raw"\n')

@@ -8,15 +8,13 @@ from collections.abc import Iterable
 import numpy as np
 from scipy import optimize
 
+from tests.stage_text import resonance, wired
+
 THRESHOLDS_V = (0.0, 0.6, 1.2, 2.4, 3.6, 4.8)
 WEIGHTS_UM_PER_V = (2.682529, 0.430546, 0.287031, 0.430546, 0.287031, 0.287031)
 LOWEST_V, HIGHEST_V = -2.0, 10.0
 OMEGA, ZETA, RATE_HZ = 2 * np.pi * 800.0, 0.3, 10_000.0
-_DYNAMICS = f"""form = "factors"
-gain = {OMEGA**2}
-numerator = []
-denominator = [[1.0, {2 * ZETA * OMEGA}, {OMEGA**2}]]
-"""
+_DYNAMICS = resonance(OMEGA, ZETA)
 _PLAYS = f"""thresholds_v = {list(THRESHOLDS_V)}
 weights_um_per_v = {list(WEIGHTS_UM_PER_V)}
 """
@@ -26,10 +24,7 @@ rate_hz = {RATE_HZ}
 [driver]
 kind = "sim"
 seed = 4
-[driver.channels.x]
-input = "adc0"
-output = "dac0"
-um_per_v = 10.0
+{wired("adc0", "dac0")}
 [driver.plant.hysteresis]
 truth = "custom"
 {_PLAYS}

@@ -198,8 +198,8 @@ def _load_law(loop, first, is_new_controller):
     """Activate the staged coefficients of axis `first` and of the axes that share its controller, and order a snapshot.
 
     Returns False, without a change, for an axis that does not exist, counts that do not fit their records, or another
-    number of axes of the controller. A new controller continues from the command in force, a new pre-filter from the
-    reference in force.
+    number of axes of the controller. A new controller continues from the applied command (µm), a first pre-filter from
+    the reference in force.
     """
     law = law_record(loop)
     size = law.coefficients_bytes

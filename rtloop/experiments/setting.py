@@ -85,14 +85,14 @@ class Setting:
         return self.trip.magnitude
 
     def trip_towards(self, direction: float) -> Bound:
-        """Return the largest displacement before the dynamics, µm, up (`direction` 1) or down (−1), without a trip.
+        """Return the largest input of the dynamics in µm that trips no interlock, up (`direction` 1) or down (−1).
 
-        The interlocks of position and sensor count.
+        The bounds of position and sensor count, divided by the static gain of the dynamics.
         """
         return self._trip_bound(self.sensor_ends_um[1] if direction > 0 else -self.sensor_ends_um[0], "on this side")
 
     def _trip_bound(self, sensor_end_um: float, place: str) -> Bound:
-        """Return the largest displacement before the dynamics, µm, by position interlock and sensor: the smaller bound.
+        """Return the largest input of the dynamics in µm by position interlock and sensor: the smaller bound.
 
         The sensor's range ends at the position `sensor_end_um`; `place` says in the reason where, such as "about 0".
         """

@@ -180,7 +180,10 @@ def name_without_unit(name: str) -> str:
 
 
 def signal_name(text: str) -> str:
-    """Return a signal's full name: `x_drive_v` for `drive_v`; any other name unchanged."""
+    """Return a signal's full name: a signal of an axis without axis, such as `drive_v`, belongs to x: `x_drive_v`.
+
+    Any other name is unchanged.
+    """
     return f"{FIRST_AXIS}_{text}" if text in {signal.name for signal in AXIS_SIGNALS} else text
 
 

@@ -25,6 +25,7 @@ from tests.design.rigs import slow_sine
 from tests.kernel.oracle import Hysteresis
 from tests.recording.real_loop import record
 from tests.service.test_run import ROOT, run
+from tests.stage_text import one_axis, simulated_stage
 
 DEPLOY = ROOT / "deploy"
 
@@ -35,33 +36,18 @@ end_hz = 2000.0
 duration_s = 1.0
 offset = 0.0
 logarithmic = true"""
-LOOP = """[loop]
+
+
+def loop_text(omega_rad_s: float, damping: float, limit_um: float, reference: str) -> str:
+    """Return the configuration of a slow loop on a stage with one mode, with a limit of the command."""
+    return f"""[loop]
 rate_hz = 10000
-[driver]
-kind = "sim"
-seed = 5
-latency_ticks = 1
-[driver.channels.x]
-input = "adc0"
-output = "dac0"
-um_per_v = 10.0
-[driver.plant.hysteresis]
-truth = "custom"
-thresholds_v = [0.0]
-weights_um_per_v = [4.3]
+{simulated_stage(omega_rad_s, damping, 4.3, seed=5, latency_ticks=1)}
 [driver.plant.sensor]
 noise_um = 0.01
-[driver.plant.dynamics]
-form = "factors"
-gain = {c!r}
-denominator = [[1.0, {b!r}, {c!r}]]
-[[axis]]
-name = "x"
-[axis.feedforward]
-thresholds_v = [0.0]
-weights_um_per_v = [4.3]
+{one_axis()}
 [axis.limits]
-command_um = {limit}
+command_um = {limit_um}
 [axis.controller]
 kind = "pid"
 ki_per_s = 15.0
@@ -163,7 +149,7 @@ def test_the_dynamics_of_a_recorded_step(folder: Path, step: Path, section: Path
 def test_the_dynamics_of_a_loop_that_stays_closed(tmp_path: Path) -> None:
     """The reference excites the closed loop. A reference at rest is refused, and a limited command as the input."""
     omega = 2 * np.pi * 320.0
-    text = LOOP.format(b=2 * 0.01 * omega, c=omega**2, reference=CHIRP, limit=42.0)
+    text = loop_text(omega, 0.01, 42.0, CHIRP)
     path = record(tmp_path / "chirp.mcap", text, 10_000)[0]
     model = report("identify", "dynamics", path, "--order", "2", "--delay", "1", "--out", tmp_path / "model.toml")
     (mode,) = model["modes"]

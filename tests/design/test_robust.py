@@ -24,6 +24,7 @@ from rtloop.design.synthesis.specification import DesignOptions
 from rtloop.design.toml_text import write_section
 from rtloop.linear.discretise import discretise_controller
 from rtloop.linear.transfer import Transfer
+from tests.stage_text import resonance
 
 PERIOD_S = 1e-4
 OMEGA, RATIO = 2 * np.pi * 600.0, 0.01
@@ -32,10 +33,7 @@ WALLS = Walls(2.0, 3.0, 0.1, 5.0)
 RANGE = ScenarioOptions(resonance_percent=8.0, damping=(0.5, 2.0), gain_percent=5.0)
 SPEC = f"""
 [plant]
-form = "factors"
-gain = {OMEGA**2!r}
-denominator = [[1.0, {2 * RATIO * OMEGA!r}, {OMEGA**2!r}]]
-delay_ticks = 0
+{resonance(OMEGA, RATIO)}delay_ticks = 0
 [specification]
 overshoot_percent = 0.5
 [specification.disturbance]

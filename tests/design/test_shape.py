@@ -22,6 +22,7 @@ from rtloop.errors import NoDesign
 from rtloop.linear.discretise import discretise_controller
 from rtloop.linear.transfer import Transfer
 from tests.laws.test_shipped import DEPLOY
+from tests.stage_text import resonance, wired
 
 PERIOD_S, FINE = 1e-4, 10
 OMEGA, RATIO = 2 * np.pi * 600.0, 0.15
@@ -163,16 +164,13 @@ def test_bounds_let_every_step_between_allowed_levels_stay_within_the_drive() ->
         assert min(abs(min(commands_um) - bounds.low_um), abs(max(commands_um) - bounds.high_um)) < 1e-9
 
 
-CONFIG = """# my stage
+CONFIG = f"""# my stage
 [loop]
 rate_hz = 10000
 [driver]
 kind = "sim"
 latency_ticks = 1
-[driver.channels.x]
-input = "adc0"
-output = "dac0"
-um_per_v = 10.0
+{wired("adc0", "dac0")}
 [[axis]]
 name = "x"
 [axis.feedforward]
@@ -183,13 +181,11 @@ form = "zpk"
 gain = 500.0
 poles = [[0.0, 0.0]]
 [axis.model]
-form = "factors"
-gain = GAIN
-denominator = [[1.0, MIDDLE, GAIN]]
+{resonance(OMEGA, RATIO)}
 delay_ticks = 1
 [axis.limits]
 command_um = 60.0
-""".replace("GAIN", repr(OMEGA**2)).replace("MIDDLE", repr(2 * RATIO * OMEGA))
+"""
 SPEC = """[specification]
 overshoot_percent = 0.4
 [specification.command]

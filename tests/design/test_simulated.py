@@ -25,28 +25,14 @@ from rtloop.hysteresis.play_model import PlayModel
 from rtloop.hysteresis.residual_hysteresis import add_residual_hysteresis
 from rtloop.signals import axis_column, column_names
 from tests.recording.real_loop import ROOT, RealLoop, changed_configuration
+from tests.stage_text import one_axis, resonance, simulated_stage
 
 PAPER = load(ROOT / "deploy" / "paper.toml")
 OMEGA, ZETA, KI, RATE_HZ = 2 * np.pi * 400.0, 0.1, 200.0, 10_000.0
 LINEAR = f"""
 [loop]
 rate_hz = {RATE_HZ}
-[driver]
-kind = "sim"
-seed = 3
-[driver.channels.x]
-input = "adc0"
-output = "dac0"
-um_per_v = 5.0
-[driver.plant.hysteresis]
-truth = "custom"
-thresholds_v = [0.0]
-weights_um_per_v = [4.0]
-[driver.plant.dynamics]
-form = "factors"
-gain = {OMEGA**2}
-numerator = []
-denominator = [[1.0, {2 * ZETA * OMEGA}, {OMEGA**2}]]
+{simulated_stage(OMEGA, ZETA, 4.0, 5.0, seed=3)}
 [driver.plant.sensor]
 um_per_v = 5.0
 noise_um = 0.02
@@ -55,21 +41,14 @@ resolution_um = 0.0
 bits = 0
 [driver.plant.dac]
 bits = 0
-[[axis]]
-name = "x"
-[axis.feedforward]
-thresholds_v = [0.0]
-weights_um_per_v = [4.0]
+{one_axis(um_per_v=4.0)}
 [axis.controller]
 form = "transfer_function"
 numerator = [{KI}]
 denominator = [1.0, 0.0]
 method = "tustin"
 [axis.model]
-form = "factors"
-gain = {OMEGA**2}
-numerator = []
-denominator = [[1.0, {2 * ZETA * OMEGA}, {OMEGA**2}]]
+{resonance(OMEGA, ZETA)}
 [axis.limits]
 command_um = 30.0
 """

@@ -11,7 +11,7 @@ from rtloop.doctor.node_line import NetworkLine, SerialLine, find_line, find_net
 from rtloop.doctor.remedy import apply_remedies
 from rtloop.engine.plan import Pacing
 from tests.doctor.hosts import host
-from tests.one_axis import one_axis
+from tests.stage_text import one_axis
 
 PACING = Pacing(10_000.0, cpu=3)
 NET = "sys/class/net/eth1"

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from rtloop.drivers.can.options import CanOptions
-from tests.one_axis import one_axis
+from tests.stage_text import one_axis
 
 GROUP = "239.74.163.77"
 DRIVER = """

@@ -19,7 +19,7 @@ from rtloop.hil import board
 from tests.drivers.comedi_board import new_board, stub_library
 from tests.drivers.processes import board_memory, completed
 from tests.drivers.test_comedi_contract import comedi
-from tests.one_axis import one_axis, wired
+from tests.stage_text import one_axis, wired
 
 CONFIG = """
 [loop]

@@ -12,7 +12,7 @@ from click.testing import CliRunner, Result
 from rtloop.cli import main
 from rtloop.doctor.loopback import measure_pair
 from tests.drivers.comedi_board import new_board, output_v, stub_library
-from tests.one_axis import one_axis, wired
+from tests.stage_text import one_axis, wired
 
 DWELL, SETTLING = 100, 50
 LSB_V = 20.0 / 65535

@@ -24,7 +24,7 @@ from tests.drivers.node_bench import NodeProcess
 from tests.drivers.processes import ENVIRONMENT
 from tests.drivers.processes import rtloop as start_rtloop
 from tests.faults.evidence import wait_for
-from tests.one_axis import one_axis
+from tests.stage_text import one_axis
 
 PATIENT = {"watchdog_ms": 5000.0, "error_limit": 1_000_000, "hold_ticks": 1000}
 MASTERS = 8

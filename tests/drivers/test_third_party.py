@@ -16,7 +16,7 @@ from rtloop.drivers.registry import driver_class
 from rtloop.recording.replay.replay import replay
 from tests.drivers.installing import install
 from tests.drivers.processes import completed
-from tests.one_axis import one_axis
+from tests.stage_text import one_axis
 
 CONFIG = """
 [loop]

@@ -17,44 +17,27 @@ from caproto.sync import client
 from tests.faults.bench import Bench
 from tests.faults.configuration import ROOT
 from tests.faults.evidence import wait_for
+from tests.stage_text import one_axis, resonance, simulated_stage
 
 HOST, TIMEOUT_S = "127.0.0.1", 120.0
 SEARCHES = 240
 """Searches of a client for a channel within the time-out; with caproto's two, a lost datagram costs a minute."""
 client.search = functools.partial(client.search, max_retries=SEARCHES)
+OMEGA_RAD_S, DAMPING = 628.32, 0.3
 UM_PER_V = 4.3
 """Gain of the simulated actuator, which has no hysteresis."""
 CONFIGURATION = f"""
 [loop]
 rate_hz = 1000
-[driver]
-kind = "sim"
-[driver.channels.x]
-input = "adc0"
-output = "dac0"
-um_per_v = 10.0
-[driver.plant.hysteresis]
-truth = "custom"
-thresholds_v = [0.0]
-weights_um_per_v = [{UM_PER_V}]
-[driver.plant.dynamics]
-form = "factors"
-gain = 394784.0
-denominator = [[1.0, 377.0, 394784.0]]
-[[axis]]
-name = "x"
-[axis.feedforward]
-thresholds_v = [0.0]
-weights_um_per_v = [{UM_PER_V}]
+{simulated_stage(OMEGA_RAD_S, DAMPING, UM_PER_V)}
+{one_axis(um_per_v=UM_PER_V)}
 [axis.controller]
 form = "transfer_function"
 numerator = [60.0]
 denominator = [1.0, 0.0]
 method = "tustin"
 [axis.model]
-form = "factors"
-gain = 394784.0
-denominator = [[1.0, 377.0, 394784.0]]
+{resonance(OMEGA_RAD_S, DAMPING)}
 [axis.interlocks]
 position_um = 60.0
 [service]

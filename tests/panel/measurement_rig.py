@@ -7,16 +7,14 @@ from pathlib import Path
 import numpy as np
 
 from tests.service.test_response import CONFIGURATION, LOOP, SETPOINT_UM
+from tests.stage_text import resonance
 
 MODEL_HZ = LOOP.hz / 1.05
 """Resonance of the model; the resonance of the rig lies 5 % above it."""
 _OMEGA = 2 * np.pi * MODEL_HZ
 _MODEL = f"""
 [axis.model]
-form = "factors"
-gain = {_OMEGA**2!r}
-denominator = [[1.0, {2 * LOOP.damping * _OMEGA!r}, {_OMEGA**2!r}]]
-"""
+{resonance(_OMEGA, LOOP.damping)}"""
 _SPECIFICATION = """
 [specification]
 overshoot_percent = 1.0

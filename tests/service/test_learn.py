@@ -20,13 +20,11 @@ from tests.faults.bench import Bench
 from tests.faults.evidence import wait_for
 from tests.service.http import answer
 from tests.service.test_response import CONFIGURATION, LOOP, OMEGA, QUICK_REQUEST, SETPOINT_UM
+from tests.stage_text import resonance
 
 MODEL = f"""
 [axis.model]
-form = "factors"
-gain = {OMEGA**2!r}
-denominator = [[1.0, {2 * LOOP.damping * OMEGA!r}, {OMEGA**2!r}]]
-"""
+{resonance(OMEGA, LOOP.damping)}"""
 """Model of the plant without a delay; the loop's promise includes the delay of the rig's driver."""
 TICKS = 100
 SCAN_UM = SETPOINT_UM + 4.0 * np.sin(2 * np.pi * np.arange(TICKS) / TICKS)

@@ -28,7 +28,7 @@ from rtloop.supervision.hardware import Hardware as HardwareNote
 from rtloop.supervision.hardware import UnusableNote, configured_hardware, read_note, write_note
 from rtloop.supervision.paths import block_path, hardware_path
 from tests.faults.bench import Bench
-from tests.one_axis import one_axis, wired
+from tests.stage_text import one_axis, wired
 
 WITHOUT_RESTART = ("[recording]", "[service]\nrestarts = 0\n[recording]")
 SAFE_V = np.zeros(1)

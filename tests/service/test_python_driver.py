@@ -12,7 +12,7 @@ import numpy as np
 
 import rtloop
 from rtloop.recording.replay.replay import replay
-from tests.one_axis import one_axis
+from tests.stage_text import one_axis
 
 ROOT = Path(__file__).resolve().parents[2]
 

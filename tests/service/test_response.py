@@ -25,6 +25,7 @@ from tests.faults.bench import Bench
 from tests.faults.configuration import ROOT
 from tests.faults.evidence import wait_for
 from tests.service.http import answer
+from tests.stage_text import one_axis, simulated_stage
 
 DASHBOARD = ROOT / "deploy" / "grafana" / "rtloop.json"
 METRIC = re.compile(r"\brtloop_\w+")
@@ -35,27 +36,8 @@ QUICK_REQUEST = {"axis": "x", "duration_s": 1.0, "period_s": 0.25, "near_hz": 80
 CONFIGURATION = f"""
 [loop]
 rate_hz = {RATE_HZ:g}
-[driver]
-kind = "sim"
-seed = 3
-latency_ticks = {LOOP.delay_ticks}
-[driver.channels.x]
-input = "adc0"
-output = "dac0"
-um_per_v = 10.0
-[driver.plant.hysteresis]
-truth = "custom"
-thresholds_v = [0.0]
-weights_um_per_v = [4.3]
-[driver.plant.dynamics]
-form = "factors"
-gain = {OMEGA**2!r}
-denominator = [[1.0, {2 * LOOP.damping * OMEGA!r}, {OMEGA**2!r}]]
-[[axis]]
-name = "x"
-[axis.feedforward]
-thresholds_v = [0.0]
-weights_um_per_v = [4.3]
+{simulated_stage(OMEGA, LOOP.damping, 4.3, seed=3, latency_ticks=LOOP.delay_ticks)}
+{one_axis()}
 [axis.controller]
 kind = "pid"
 kp = {LOOP.kp}

@@ -18,6 +18,7 @@ from rtloop.cli.retune import retune_axis, swap_proposal
 from rtloop.client.retuning import RetuneRequest
 from rtloop.design.robust.shape import Subject
 from rtloop.errors import ConfigError, LoopFault, NoDesign
+from tests.stage_text import resonance, wired
 
 HZ, DAMPING, PERIOD_S = 600.0, 0.02, 1e-4
 LOW_GAIN = 0.95, 0.001
@@ -27,10 +28,7 @@ TEXT = f"""
 rate_hz = 10000
 [driver]
 kind = "sim"
-[driver.channels.x]
-input = "adc0"
-output = "dac0"
-um_per_v = 10.0
+{wired("adc0", "dac0")}
 [[axis]]
 name = "x"
 specification = "spec.toml"
@@ -43,10 +41,7 @@ numerator = [60.0]
 denominator = [1.0, 0.0]
 method = "tustin"
 [axis.model]
-form = "factors"
-gain = {OMEGA**2!r}
-denominator = [[1.0, {2 * DAMPING * OMEGA!r}, {OMEGA**2!r}]]
-"""
+{resonance(OMEGA, DAMPING)}"""
 SPECIFICATION = """
 [specification]
 overshoot_percent = 1.0

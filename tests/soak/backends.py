@@ -25,7 +25,7 @@ from rtloop.workbench.tables import table
 from tests.drivers.can_bench import GROUP, free_port
 from tests.drivers.installing import install
 from tests.drivers.node_bench import free_udp_port
-from tests.one_axis import one_axis
+from tests.stage_text import one_axis
 
 ROOT = Path(__file__).resolve().parents[2]
 DURATION_S = 8.0

@@ -180,8 +180,8 @@ class Programme:
             self.active[_worst_rows(violation, new_rows)] = True
 
     def _penalty_rows(self) -> Real:
-        """Return the rows (k, 2·taps) whose absolute values are penalised: changes of v on the model, then the taps
-        themselves.
+        """Return the rows (k, 2·taps) whose absolute values are penalised: changes of v from tick to tick on the
+        model, then the taps themselves.
         """
         v = self.command[: min(self.ticks, 2 * self.taps + 40)]
         return np.vstack([np.diff(v, axis=0, prepend=np.zeros((1, v.shape[1]))), np.eye(2 * self.taps)])

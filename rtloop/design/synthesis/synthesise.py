@@ -121,7 +121,7 @@ def synthesise_design(design: DesignOptions) -> Synthesis:
     ticks, output = design.required_plant.delay_ticks, design.controller
 
     def finish(controller: Transfer) -> Transfer | None:
-        """Return the controller without roots far beyond the rate, None if its loop cannot run."""
+        """Return the controller without roots far beyond the rate; None if it is not runnable (`is_runnable`)."""
         reduced = drop_fast_roots(controller, output.rate_hz)
         sensed_plant = design.sensor.add_sensor_lag(plant)
         return (

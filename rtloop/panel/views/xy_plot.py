@@ -34,6 +34,7 @@ class XyPlot:
     """Plot of drive against position for a subscription. Raises ValueError for an axis that the loop does not have."""
 
     def __init__(self, subscription: XySubscription, loop: Description) -> None:
+        """Show drive against position of the subscription's axis, over the subscription's time."""
         if subscription.axis not in loop.axes:
             raise ValueError(f"xy.axis: {subscription.axis!r}; allowed: {', '.join(loop.axes)}")
         self._subscription = subscription
