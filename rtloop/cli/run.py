@@ -53,7 +53,9 @@ def run(
     panel: bool,
     panel_port: int,
 ) -> int:
-    """Run the loop of CONFIG and record every tick, or those near events if recording.around is set.
+    """Run the loop of CONFIG and record it.
+
+    Every tick is recorded, or those near events if recording.around is set.
 
     Ctrl-C ramps down, finishes the recording and ends with exit code 0. With --panel the loop runs as with
     `rtloop serve`, with a control socket.
