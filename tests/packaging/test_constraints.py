@@ -1,0 +1,31 @@
+"""The pinned versions can be installed with the oldest Python that the project allows."""
+
+from __future__ import annotations
+
+import re
+import tomllib
+from importlib.metadata import PackageNotFoundError, distribution
+from pathlib import Path
+
+from packaging.specifiers import SpecifierSet
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+def test_every_installed_pin_accepts_the_oldest_python():
+    """Pins of tools that are not installed here, such as those of a release, are not tested."""
+    requirement = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]["requires-python"]
+    oldest = re.fullmatch(r">=(\d+\.\d+)", requirement)[1] + ".0"
+    pins = re.findall(r"^([\w.-]+)==(\S+)$", (ROOT / "constraints.txt").read_text(encoding="utf-8"), re.MULTILINE)
+    refused, installed = {}, 0
+    for name, version in pins:
+        try:
+            metadata = distribution(name).metadata
+        except PackageNotFoundError:
+            continue
+        installed += 1
+        assert metadata["Version"] == version, name
+        if not SpecifierSet(metadata["Requires-Python"] or "").contains(oldest):
+            refused[name] = metadata["Requires-Python"]
+    assert refused == {}
+    assert installed > 50
