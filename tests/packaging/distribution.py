@@ -56,7 +56,8 @@ def build(kind: str, source: Path, target: Path) -> Path:
 def unpack_sdist(sdist: Path, target: Path) -> Path:
     """Unpack a source archive; return its top folder."""
     with tarfile.open(sdist) as archive:
-        archive.extractall(target, filter="data")
+        safe = {"filter": "data"} if hasattr(tarfile, "data_filter") else {}  # Python below 3.11.4 has no filters
+        archive.extractall(target, **safe)
     return target / sdist.name.removesuffix(".tar.gz")
 
 
