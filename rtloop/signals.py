@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from enum import IntEnum, IntFlag
-from typing import NamedTuple, Self
+from typing import NamedTuple, Self, TypedDict
 
 
 class Signal(NamedTuple):
@@ -159,6 +159,13 @@ def column_names(axes: Sequence[str], observed: Sequence[str], extras: Sequence[
 def axis_column(axis: int, signal: int) -> int:
     """Return the index of the record's column with signal number `signal` (ADC … FEED) of axis number `axis`."""
     return COMMON_COUNT + axis * PER_AXIS_COUNT + signal
+
+
+class Trip(TypedDict):
+    """Tick of a trip, and the names of its causes."""
+
+    tick: int
+    causes: list[str]
 
 
 def trip_causes(flags: float) -> list[str]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import tomllib
 from functools import cached_property
 from pathlib import Path
-from typing import Any, TypedDict
+from typing import Any
 
 import numpy as np
 
@@ -22,17 +22,10 @@ from rtloop.foundation.arrays import Real
 from rtloop.hysteresis.play_model import PlayModel
 from rtloop.recording.errors import RecordingError
 from rtloop.recording.load import Recording
-from rtloop.signals import Flag
+from rtloop.signals import Flag, Trip
 
 CENTRED = ("reference_um", "position_um", "command_um")
 """Signals that are read relative to the middle of a run's motion."""
-
-
-class Trip(TypedDict):
-    """Tick of a trip, and its causes."""
-
-    tick: int
-    causes: list[str]
 
 
 class RecordedRun:

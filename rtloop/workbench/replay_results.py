@@ -14,12 +14,14 @@ from rtloop.recording.replay.verdict import ReplayReport
 from rtloop.recording.views.plot import draw_recording
 from rtloop.values import count_text, to_jsonable
 from rtloop.workbench.bar_picture import draw_bars
-from rtloop.workbench.replay_text import METRICS, Trip, print_differences, print_replay, print_resimulation
+from rtloop.workbench.replay_text import METRICS, print_differences, print_replay, print_resimulation
 from rtloop.workbench.result import Result
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from rich.console import Console
+
+    from rtloop.signals import Trip
 
 PLOTTED_S = 0.05
 """Time before and after the first difference that a picture shows, s."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypedDict
+from typing import TYPE_CHECKING, Any
 
 from rtloop.values import count_text
 from rtloop.workbench.tables import escape, format_number, print_problems, table
@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from rtloop.recording.replay.verdict import ReplayReport
+    from rtloop.signals import Trip
 
 METRICS = (
     ("rms_error_um", "rms error µm"),
@@ -25,13 +26,6 @@ STEP_METRICS = (
     ("settling_time_ms_worst", "settling ms (5 %), worst"),
     ("static_error_percent", "static error %, median"),
 )
-
-
-class Trip(TypedDict):
-    """The first trip of a law or a run."""
-
-    tick: int
-    causes: list[str]
 
 
 def print_replay(out: Console, path: Path, report: ReplayReport) -> None:

@@ -10,7 +10,7 @@ import numpy as np
 from rtloop import signals
 from rtloop.recording.replay.rerun import Rows
 from rtloop.recording.views.steps import step_metrics
-from rtloop.signals import AXIS_SIGNALS, TRIP_MASK, Mode
+from rtloop.signals import AXIS_SIGNALS, TRIP_MASK, Mode, Trip
 
 COMPARED_SIGNALS = (signals.POSITION, signals.ERROR, signals.COMMAND, signals.DEMAND, signals.DRIVE)
 STEP_ANALYSIS_TICKS = 3_000_000
@@ -27,7 +27,7 @@ class SignalDifferences:
         size = len(self._columns)
         self._largest, self._at_tick = np.zeros(size), np.zeros(size, np.int64)
         self._square_sum, self._count = np.zeros(size), np.zeros(size, np.int64)
-        self._trip: dict[str, object] | None = None
+        self._trip: Trip | None = None
 
     def add(self, recorded: Rows, replayed: Rows) -> None:
         """Update largest difference, its tick and sum of squares of each signal, and the first trip of the replay.
@@ -72,7 +72,7 @@ class TrackingPerformance:
         self._drive_v, self._error_um = np.zeros(len(axes)), np.zeros(len(axes))
         self._traces: list[Rows] = []
         self._trace_ticks = 0
-        self.trip: dict[str, object] | None = None
+        self.trip: Trip | None = None
 
     def add(self, rows: Rows) -> None:
         """Add rows (n, columns) of consecutive ticks; a NaN error in closed loop counts as 0.
@@ -116,7 +116,7 @@ class TrackingPerformance:
         ]
 
 
-def first_trip(rows: Rows) -> dict[str, object] | None:
+def first_trip(rows: Rows) -> Trip | None:
     """Return {tick, causes} of the first tripped row of `rows` (n, columns); None if no row is tripped."""
     tripped = np.flatnonzero(rows[:, signals.FLAGS].astype(np.int64) & TRIP_MASK)
     if not tripped.size:
