@@ -24,9 +24,9 @@ denominator = [[1.0, {b!r}, {c!r}]]
 def simulated_stage(
     omega_rad_s: float, damping: float, um_per_v: float, sensor_um_per_v: float = 10.0, **driver_keys: int
 ) -> str:
-    """Return a simulated rig without hysteresis, whose actuator moves `um_per_v`, with one mode, and its channels.
+    """Return [driver] of a simulated rig: an actuator of `um_per_v` without hysteresis, one mode, and the channels.
 
-    `driver_keys` are keys of [driver], such as `seed`.
+    The mode has `omega_rad_s` and `damping`; `driver_keys` are keys of [driver], such as `seed`.
     """
     keys = "".join(f"{key} = {value}\n" for key, value in driver_keys.items())
     return f"""[driver]

@@ -138,8 +138,9 @@ def limit_fields(options: LimitsOptions, output: Channel, period_s: float) -> Ma
     """Return by name: limits of the drive in V and of the command in µm, slews, `safe_v` of the channel, and
     `bump_decay`, a factor per tick.
 
-    Slews are in V per tick; `slew_v_per_tick` is infinite without `slew_v_per_s`. Raises ValueError for a drive beyond
-    the channel's range, and for a trip's ramp from its far end to safe that takes longer than LONGEST_RAMP_S.
+    Slews are in V per tick; `slew_v_per_tick` is infinite without `slew_v_per_s`. Raises ValueError for a limit
+    of the drive beyond the channel's range, and where the ramp after a trip, from the limit that is farther from
+    `safe_v`, takes longer than LONGEST_RAMP_S.
     """
     lowest_v, highest_v = output.minimum_v, output.maximum_v
     allowed = f"±{highest_v}" if lowest_v == -highest_v else f"{lowest_v} … {highest_v}"

@@ -83,10 +83,10 @@ def build_extras(
     facts: Facts,
     wiring: Mapping[str, Wiring],
 ) -> Extras:
-    """Return the names of the inputs, and the outputs with their ranges: without configured ones, the driver's.
+    """Return the names of the extra inputs, and the extra outputs with their ranges, by default the channels' ranges.
 
-    Raises ValueError for a channel that does not exist, an output's channel that is in use, a name that the record has
-    already, and a range beyond the channel's or without its safe voltage.
+    Raises ValueError for a channel that does not exist, an output's channel that an axis or another output uses, a name
+    that is a column already, and a range that exceeds the channel's or excludes the channel's safe voltage.
     """
     for name, input_options in inputs.items():
         _require_channel(f"inputs.{name}.channel", facts.inputs, input_options.channel)

@@ -87,7 +87,8 @@ class Setting:
     def trip_towards(self, direction: float) -> Bound:
         """Return the largest input of the dynamics in µm that trips no interlock, up (`direction` 1) or down (−1).
 
-        The bounds of position and sensor count, divided by the static gain of the dynamics.
+        It is the smaller one of two bounds, the position interlock's and the sensor range's, each divided by the
+        static gain of the dynamics.
         """
         return self._trip_bound(self.sensor_ends_um[1] if direction > 0 else -self.sensor_ends_um[0], "on this side")
 

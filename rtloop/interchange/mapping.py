@@ -180,7 +180,7 @@ def name_without_unit(name: str) -> str:
 
 
 def signal_name(text: str) -> str:
-    """Return a signal's full name: a signal of an axis without axis, such as `drive_v`, belongs to x: `x_drive_v`.
+    """Return a signal's name with its axis: `drive_v` and the other signals that each axis has get the prefix `x_`.
 
     Any other name is unchanged.
     """

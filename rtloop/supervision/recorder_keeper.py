@@ -145,9 +145,9 @@ class RecorderKeeper:
         return new_removals
 
     def _send_removals(self) -> None:
-        """Send the recorder the removals of files that it shall record as events.
+        """Tell the recorder which files were removed; it records each removal as an event.
 
-        They stay pending while the recorder has no orders, and while it neither runs nor has failed.
+        Removals stay pending until the recorder has received its orders, and while it is READY or has ended.
         """
         if self._unsent_removals and self._has_orders and self.state in (ProcessState.RUNNING, ProcessState.FAILED):
             lines = [json.dumps({"removed": removal.event_details}) + "\n" for removal in self._unsent_removals]

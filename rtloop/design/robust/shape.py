@@ -286,7 +286,7 @@ def _explain_no_taps(subject: Subject, programme: Programme) -> str:
 
 
 def _proof_failure(subject: Subject, settling_ms: float, proof: StepMeasures, plants: int) -> str:
-    """Return the message that taps designed for a settling time of `settling_ms` failed the proof on `plants` plants.
+    """Return the message that taps, designed to settle in `settling_ms`, failed a proof that tried `plants` plants.
 
     It states the largest settling time and overshoot of `proof`, how far the command exceeds its limits, and a remedy.
     """

@@ -258,7 +258,7 @@ def summarise(path: RecordingPaths, progress: ReportTicks | None = None) -> Summ
 
 
 def _is_seamless(end: Mapping[str, Any] | None) -> bool:
-    """Whether the totals `end` of a file say that it ends without loss: complete, or recovered with an empty `gaps`.
+    """Whether a file lost nothing by its totals `end`: it is complete, or it was recovered and its `gaps` are empty.
 
     False for None, an unfinished file.
     """
