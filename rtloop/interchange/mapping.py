@@ -180,7 +180,7 @@ def name_without_unit(name: str) -> str:
 
 
 def signal_name(text: str) -> str:
-    """Return a signal's name with its axis: `drive_v` and the other signals that each axis has get the prefix `x_`.
+    """Return a signal's name with its axis: `drive_v`, as each signal of an axis, belongs to axis x: `x_drive_v`.
 
     Any other name is unchanged.
     """

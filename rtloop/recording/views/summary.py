@@ -258,7 +258,7 @@ def summarise(path: RecordingPaths, progress: ReportTicks | None = None) -> Summ
 
 
 def _is_seamless(end: Mapping[str, Any] | None) -> bool:
-    """Whether a file lost nothing by its totals `end`: it is complete, or it was recovered and its `gaps` are empty.
+    """Whether a file has no loss by its totals `end`: it is complete, or it was recovered and its `gaps` are empty.
 
     False for None, an unfinished file.
     """
