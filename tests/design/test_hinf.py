@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.optimize import brentq
 
 from rtloop.design.paper import PAPER_D
 from rtloop.design.synthesis.hinf.assumptions import NoController
@@ -47,19 +46,9 @@ def scalar_plant(a: float) -> GeneralisedPlant:
 
 @pytest.mark.parametrize("a", [-30.0, -1.0, 0.0, 0.5, 4.0])
 def test_a_scalar_plant_in_closed_form(a) -> None:
-    """X = Y = (a + √(a² + 1 − γ⁻²))/(1 − γ⁻²) and X·Y = γ² at γ_opt; √2 for a = 0.
-
-    For a < 0, γ_opt is below 1: the test computes only the norm of the loop.
-    """
-
-    def gap(gamma: float) -> float:
-        slope = 1 - gamma**-2
-        return (a + math.sqrt(a * a + slope)) / slope / gamma - 1
-
-    expected = math.sqrt(2) if a == 0 else brentq(gap, 1 + 1e-9, 100, xtol=1e-12) if gap(1 + 1e-9) > 0 else None
+    """X = Y = 1/(√(a² + 1 − γ⁻²) − a), and X·Y = γ² at γ_opt: γ_opt = a + √(a² + 2)."""
     solution = synthesise_hinf(scalar_plant(a))
-    if expected is not None:
-        assert solution.gamma_opt == pytest.approx(expected, rel=1e-6)
+    assert solution.gamma_opt == pytest.approx(a + math.sqrt(a * a + 2), rel=1e-6)
     assert dense_norm(*scalar_plant(a).close_loop(solution.controller)) <= 1.002 * solution.gamma
 
 

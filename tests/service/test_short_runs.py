@@ -109,11 +109,12 @@ def test_a_run_of_a_tick_or_two(tmp_path: Path, change: tuple[str, str] | None, 
 def test_ctrl_c_before_the_loop_runs_ends_well(tmp_path: Path) -> None:
     """Ctrl-C at a random instant of the start leaves no file, or a readable recording."""
     process = start("run", ROOT / "deploy" / "paper.toml", "--out", tmp_path / "out", start_new_session=True)
-    time.sleep(random.SystemRandom().uniform(0.25, 3.5))
+    wait_s = random.SystemRandom().uniform(0.25, 3.5)
+    time.sleep(wait_s)
     os.killpg(process.pid, signal.SIGINT)
     _, err = process.communicate(timeout=120)
-    assert "Traceback" not in err, err
-    assert process.returncode == 0, err
+    assert "Traceback" not in err, f"Ctrl-C after {wait_s:.3f} s: {err}"
+    assert process.returncode == 0, f"Ctrl-C after {wait_s:.3f} s: {err}"
     recorded = list((tmp_path / "out").glob("*"))
     assert recorded or "nothing was driven, nothing is recorded" in err
     for path in recorded:

@@ -299,8 +299,11 @@ def test_a_flood_of_messages_is_read_slowly(browser: Browser):
     assert resident_mib(browser) < before_mib + 64
 
 
-def test_a_client_that_never_reads_is_dropped(browser: Browser):
-    """Other clients are served meanwhile, and the panel buffers no frames for the client that never reads."""
+def test_a_client_that_never_reads_delays_no_other(browser: Browser):
+    """Other clients are served meanwhile, and the panel buffers no frames for the client that never reads.
+
+    `test_stream` proves that the panel drops such a client.
+    """
     before_mib = resident_mib(browser)
     with socket.socket() as silent, browser.live() as other_live:
         silent.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 2048)
