@@ -48,7 +48,7 @@ class Coordinator:
 
         After a request to stop, the tasks that were submitted end and no other one starts. Raises the error of a task,
         such as OtherVersion; UnavailableError if the scheduler is gone; LoopFault if the nominal rig kills its workers;
-        OutputError if the store cannot be read or written. Results that came before are stored.
+        OutputError if the store cannot be read or written. Results that came before an error are stored.
         """
         missing = [(unit, self._store.missing(unit)) for unit in units]
         tasks = (
@@ -68,7 +68,7 @@ class Coordinator:
         return self._workers.submit(run_unit, self._campaign, [item.rig for item in items], self._facts)
 
     def store(self, items: tuple[UnitRig, ...], result: Sequence[CaseResult]) -> None:
-        """Store the results of rigs of one unit. Raises OutputError if the system refuses."""
+        """Store `result`, the results of rigs of one unit. Raises OutputError if the system refuses."""
         self._store.add(items[0].unit, result)
 
     def set_aside(self, item: UnitRig) -> None:

@@ -118,7 +118,7 @@ def _attribute(options: object, path: str, key: str) -> object:
 
 
 def _choices_text(value: object) -> str:
-    """Return "; allowed: …" with the fields of Options, the keys of a table or the places of a tuple.
+    """Return "; allowed: …" with the fields of Options, the keys of a table or the indices of a tuple.
 
     Return "; the list is empty" for an empty tuple, "" for an empty table and for every other value.
     """

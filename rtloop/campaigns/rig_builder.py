@@ -77,7 +77,7 @@ class RigBuilder:
     def driver(self, loop: Loop, values: Mapping[str, object], experiment: Experiment) -> SimDriver:
         """Return the driver, not opened, of a rig with `values` and with the disturbance of one experiment.
 
-        Of `values`, keys of the driver alone count. Raises ValueError for options that no rig fits.
+        Only the keys of the driver in `values` count. Raises ValueError for options that the driver does not allow.
         """
         changed = replace_values({"driver": self._tables["driver"]}, _rig_values(values))
         tables = self._add_disturbance(changed, experiment)
@@ -98,8 +98,9 @@ class RigBuilder:
         return write_section("", tables, [heading])
 
     def fingerprint(self, values: Mapping[str, object]) -> bytes:
-        """Return bytes that are equal for two sets of values with equal records and plans in every experiment.
+        """Return bytes that are equal for two sets of values with equal plans and, in every experiment, equal rigs.
 
+        A rig here is the coefficients and the state of the simulated rig at its start.
         Raises as `loop` and `driver`.
         """
         loop = self.loop(values)

@@ -35,7 +35,7 @@ Evaluate = Callable[[Sequence[tuple[int, Mapping[str, object]]]], Sequence[CaseR
 class SearchResult(NamedTuple):
     """Worst rig of a search, the value of the figure that was maximised, and the number of rigs that were tried.
 
-    `figure` is infinite where the rig has no finite value; the ratio of a rig that tripped has none.
+    `figure` is infinite where the rig tripped or its value is not finite.
     """
 
     worst: CaseResult
@@ -87,12 +87,12 @@ def evaluate_on(workers: Workers, campaign: Campaign) -> Evaluate:
 def find_worst(
     runner: CaseRunner, evaluate: Evaluate, rigs: int, figure: str = "", target: float = math.inf
 ) -> SearchResult:
-    """Return the rig with the largest `figure` among about `rigs` tried ones; without a name, the largest ratio.
+    """Return the rig with the largest `figure`, or with "" the largest ratio, among about `rigs` tried rigs.
 
-    Whole generations of differential evolution run, at least one; the search ends early once the figure reaches
-    `target`. A rig that is refused counts with the figure 0, one that trips or whose figure is not finite as the worst.
-    Raises ConfigError for an unknown figure, for keys without numbers, and for the ratio of a campaign without limits;
-    and as `evaluate` does.
+    Whole generations of differential evolution run, at least one; the search ends early after a generation whose figure
+    reaches `target`. A rig that is refused counts with the figure 0, one that trips or whose figure is not finite as
+    the worst. Raises ConfigError for an unknown figure, for keys without numbers, and for the ratio of a campaign
+    without limits; and as `evaluate` does.
     """
     from scipy.optimize import differential_evolution
 
@@ -180,9 +180,10 @@ def find_boundary(runner: CaseRunner, key: str, evaluate: Evaluate, tolerance: f
 def _bisect(
     failure: Callable[[float], str], passing: float, failing: float, cause: str, tolerance: float
 ) -> tuple[float, str]:
-    """Return the last value that passes between a passing and a failing one, and the cause of the nearest failure.
+    """Return, by bisection between `passing` and `failing`, the passing value next to a failure, and that one's cause.
 
-    `failure` returns the cause at a value, "" if it passes; `cause` belongs to `failing`.
+    `failure` returns the cause at a value, "" if it passes; `cause` belongs to `failing`. Bisection ends at `tolerance`
+    or after BISECTIONS halvings.
     """
     for _ in range(BISECTIONS):
         if abs(failing - passing) <= tolerance:

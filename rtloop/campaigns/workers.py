@@ -106,9 +106,9 @@ class ProcessWorkers:
 
 
 def _follow_coordinator() -> None:
-    """Leave Ctrl-C to the coordinator, which ends the workers after their functions, and end when it is killed.
+    """Prepare this worker: ignore Ctrl-C, end when the coordinator has died, keep the memory of one rig for the next.
 
-    Also keep the memory of one rig for the next one.
+    After Ctrl-C, the coordinator ends its workers once their functions have ended.
     """
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     keep_freed_memory()
