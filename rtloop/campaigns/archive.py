@@ -61,6 +61,7 @@ class Archive:
     """Examines the recordings that `table` lacks on `workers`."""
 
     def __init__(self, examination: Examination, table: VerdictTable, workers: Workers) -> None:
+        """Store the arguments; `run` begins the work."""
         self._examination, self._table, self._workers = examination, table, workers
 
     def run(self, on_progress: Callable[[int], None], is_stop_requested: Callable[[], bool]) -> None:

@@ -67,6 +67,7 @@ class CaseRunner:
     """
 
     def __init__(self, campaign: Campaign) -> None:
+        """Build the nominal loop, and check all uncertain keys and experiments. Raises ConfigError with all faults."""
         self.campaign, self.options = campaign, campaign.options
         self._builder, self._loops = RigBuilder(campaign), LoopsInProcess()
         self.keys = tuple(self.options.uncertain)

@@ -37,6 +37,7 @@ class Coordinator:
     """Runs the rigs that `store` lacks on `workers`; `crashed` has the numbers of rigs that were set aside."""
 
     def __init__(self, campaign: Campaign, runner: CaseRunner, store: Store, workers: Workers) -> None:
+        """Store the arguments and the package versions of this process; no rig is set aside yet."""
         self.crashed: list[int] = []
         self._campaign, self._runner, self._store, self._workers = campaign, runner, store, workers
         self._facts = WorkerFacts.of_this_process()

@@ -57,6 +57,7 @@ class Dispatcher(Generic[Item, Result]):
     """Runs the tasks of a job on workers."""
 
     def __init__(self, workers: Workers, job: Job[Item, Result]) -> None:
+        """Store workers and job; no task runs, and no item waits to run again alone."""
         self._workers, self._job = workers, job
         self._suspects: deque[Task[Item]] = deque()
         self._running: dict[Future[Result], Task[Item]] = {}

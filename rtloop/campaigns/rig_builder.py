@@ -47,6 +47,7 @@ class RigBuilder:
     """
 
     def __init__(self, campaign: Campaign) -> None:
+        """Build the nominal loop of a campaign. Raises ConfigError for a configuration that no campaign can run."""
         self._campaign = campaign
         self._tables = _tables_at_rest(campaign)
         self._nominal = self._build_loop(self._tables)

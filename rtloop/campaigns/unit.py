@@ -106,6 +106,7 @@ class _Hashed:
     """A campaign that is hashed and compared by its digest and its number of rigs."""
 
     def __init__(self, digest: str, campaign: Campaign) -> None:
+        """Store the campaign and its key: `digest` and its number of rigs."""
         self.key, self.campaign = (digest, campaign.options.rigs), campaign
 
     def __hash__(self) -> int:
