@@ -37,9 +37,9 @@ class VerdictTable:
     ) -> None:
         """Make and lock `folder`, and read the rows of unchanged recordings there; without a folder there are none.
 
-        `columns` are the names of the columns of the examination. A stored row whose verdict may change without the
-        file, one of REPEATED, is left out. Raises UnavailableError if another process writes to the folder, OutputError
-        if the system refuses.
+        `columns` are the names of the columns of the examination. A stored row with a verdict of REPEATED, which may
+        change without the recording, is left out. Raises UnavailableError if another process writes to the folder,
+        OutputError if the system refuses.
         """
         self._recordings, self._columns = recordings, columns
         self.rows: dict[str, Row] = {}

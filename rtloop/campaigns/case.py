@@ -27,7 +27,7 @@ from rtloop.signals import trip_causes
 SEED_KEY = "driver.seed"
 """Key of the noise's seed, of which every rig has its own unless the campaign names it."""
 NOMINAL = 0
-"""Number of the rig without a change."""
+"""Number of the nominal rig, whose keys have the configured values."""
 LOOP_ENDED = "the loop ended early"
 """Cause of a failure where a law raised an error in a tick."""
 SHARES_FOR_EFFECT = (0.25, 0.75)

@@ -19,7 +19,7 @@ FIXED_KEYS = ("driver.kind", "driver.channels", "loop.mode", "loop.enable_input"
 
 
 def is_rig_key(key: str) -> bool:
-    """Whether a key changes the driver's options alone: the laws and their coefficients stay."""
+    """Whether a key changes the driver's options alone; False for `driver.kind` and `driver.channels`, too."""
     return key.startswith(DRIVER) and not key.startswith(FIXED_KEYS)
 
 

@@ -196,7 +196,7 @@ def _nominal_text(nominal: Mapping[str, Any]) -> str:
     if not nominal:
         return ""
     reasons = f": {nominal['missed']}" if nominal["status"] in (FAILED, REFUSED) else ""
-    return f"The nominal rig, without a change, {NOMINAL_TEXTS[nominal['status']]}{reasons}."
+    return f"The nominal rig, with the configuration's own values, {NOMINAL_TEXTS[nominal['status']]}{reasons}."
 
 
 def _address(path: str) -> str:
@@ -277,7 +277,7 @@ def _is_numeric(values: npt.NDArray[np.generic]) -> bool:
 def _key_numbers(values: npt.NDArray[np.generic]) -> tuple[Real, tuple[str, ...]]:
     """Return values (rigs,) of a key as floats, and the texts for which the numbers 0, 1 … stand.
 
-    The texts are sorted; there are none, (), if the values are numbers.
+    The texts are sorted, truth values are "false" and "true"; there are no texts, (), if the values are numbers.
     """
     if _is_numeric(values):
         return values.astype(float), ()

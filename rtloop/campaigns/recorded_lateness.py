@@ -43,8 +43,8 @@ def recorded_lateness(path: Path) -> tuple[float, ...]:
 def _new_lateness(lateness_us: Real, missed: Real, period_us: float) -> Real:
     """Return the time from each tick's first deadline to its wake in µs, (n,); NaN where `lateness_us` is NaN.
 
-    The time is `lateness_us` plus the time of the `missed` periods. From the latter the part beyond one period of the
-    previous tick's lateness is subtracted, down to 0: it counts at the previous tick.
+    The time is `lateness_us` plus the duration of the `missed` periods. If the previous tick was more than a period
+    late, the excess over the period counts at that tick, and is subtracted from this duration, down to 0.
     """
     lost_us = np.concatenate([[0.0], np.nan_to_num(np.maximum(lateness_us[:-1] - period_us, 0.0))])
     return lateness_us + np.maximum(missed * period_us - lost_us, 0.0)

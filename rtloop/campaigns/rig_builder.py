@@ -47,7 +47,7 @@ class RigBuilder:
     """
 
     def __init__(self, campaign: Campaign) -> None:
-        """Build the nominal loop of a campaign. Raises ConfigError for a configuration that no campaign can run."""
+        """Build the nominal loop of a campaign. Raises ConfigError unless it can run on the simulated rig."""
         self._campaign = campaign
         self._tables = _tables_at_rest(campaign)
         self._nominal = self._build_loop(self._tables)
@@ -56,7 +56,7 @@ class RigBuilder:
 
     @property
     def rate_hz(self) -> float:
-        """Rate of the loop without a change, in Hz."""
+        """Rate of the nominal loop, in Hz."""
         return self._nominal.plan.pacing.rate_hz
 
     def nominal_value(self, key: str) -> Any:

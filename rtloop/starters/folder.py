@@ -105,6 +105,6 @@ def _first_command(text: str) -> str:
 
 
 def _add_schema_line(name: str, text: str) -> str:
-    """Return a configuration's text with SCHEMA_LINE before it; a text with a schema line, or of another file, as is."""
+    """Return `text` with SCHEMA_LINE before it if it is a configuration without a schema line, else unchanged."""
     is_configuration = name.endswith(".toml") and "\n[loop]\n" in text and not text.startswith("#:schema")
     return SCHEMA_LINE + text if is_configuration else text

@@ -110,7 +110,7 @@ def _sensor_min_line(sensor_min_v: float | None, noise_v: float) -> str:
     if sensor_min_v is None:
         return ""
     interlock_v = min(sensor_min_v + SENSOR_MARGIN_V, -max(SENSOR_MARGIN_V, NOISE_DEVIATIONS * noise_v))
-    return f"sensor_min_v = {_number(interlock_v)}           # the sensor reads from {sensor_min_v:g} V on\n"
+    return f"sensor_min_v = {_number(interlock_v)}           # the sensor's lowest reading is {sensor_min_v:g} V\n"
 
 
 def _travel_numbers(range_um: float, reach_um: float, remanence_um: float) -> dict[str, float]:

@@ -102,8 +102,8 @@ class XyPlot:
 
 
 def order_extremes(low: Real, high: Real) -> Real:
-    """Return the extremes (points,) of a signal as (2·points,): at each point low and high in the order that the
-    slope between points suggests; points with NaN are left out.
+    """Return the extremes (points,) of a signal as one curve (2·points,): low before high where the signal rises from
+    point to point, high before low where it falls. Points with NaN are left out.
     """
     valid = np.isfinite(low) & np.isfinite(high)
     low, high = low[valid], high[valid]
