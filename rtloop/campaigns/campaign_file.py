@@ -151,8 +151,9 @@ def load_campaign(path: Path, rigs: int | None = None, configuration: Path | Non
 def _limits(options: CampaignOptions, path: Path, configuration: Configuration) -> dict[str, float]:
     """Return the largest value of each limited figure, by "EXPERIMENT.FIGURE".
 
-    [limits] in the file has priority; for experiments with steps, the specification adds the limits STEP_LIMITS. The
-    specification is the campaign's, else the axis's; without one, [limits] alone counts. Raises InputFileError and
+    [limits] in the file has priority; for experiments with steps, the specification adds its limits of overshoot,
+    settling time and static error. The specification is the campaign's, else the axis's; without one, [limits] alone
+    counts. Raises InputFileError and
     ConfigError for an unreadable or invalid specification.
     """
     axis = next(axis for axis in configuration.axes if options.axis in ("", axis.name))

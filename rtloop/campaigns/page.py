@@ -205,7 +205,7 @@ def _address(path: str) -> str:
 
 
 def _select(columns: Columns, is_selected: npt.NDArray[np.bool_ | np.intp]) -> dict[str, np.ndarray]:
-    """Return the columns of the selected rigs: `is_selected` has truth values (rigs,), or indices of rigs in order."""
+    """Return the columns of the selected rigs: `is_selected` has truth values (rigs,), or indices, in this order."""
     return {name: values[is_selected] for name, values in columns.items()}
 
 

@@ -180,7 +180,8 @@ def find_boundary(runner: CaseRunner, key: str, evaluate: Evaluate, tolerance: f
 def _bisect(
     failure: Callable[[float], str], passing: float, failing: float, cause: str, tolerance: float
 ) -> tuple[float, str]:
-    """Return, by bisection between `passing` and `failing`, the passing value next to a failure, and that one's cause.
+    """Return the passing value next to a failure, by bisection between `passing` and `failing`, and the failure's
+    cause.
 
     `failure` returns the cause at a value, "" if it passes; `cause` belongs to `failing`. Bisection ends at `tolerance`
     or after BISECTIONS halvings.

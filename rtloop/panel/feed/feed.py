@@ -41,7 +41,7 @@ class Follower(Protocol):
         ...
 
     def end_run(self, past: TickHistory) -> None:
-        """End the run; `past` still holds its last ticks, and after this call another run."""
+        """End the run; `past` holds the last ticks of this run during the call, and of another run later."""
         ...
 
 
