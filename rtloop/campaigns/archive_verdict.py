@@ -181,7 +181,7 @@ def _unfinished_reason(path: Path) -> str:
 
 
 def _missing_files(paths: Sequence[Path]) -> list[str]:
-    """Return a message for each missing file of a rotated run; [] if none is missing.
+    """Return a message for each missing file of a rotated run; [] if none is missing, and for a single path.
 
     Raises RecordingError if a file cannot be opened.
     """
