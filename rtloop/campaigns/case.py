@@ -84,7 +84,7 @@ class CaseRunner:
     def sample_values(self, rig: int) -> dict[str, Any]:
         """Return the values of a rig's uncertain keys, by key, and under "driver.seed" the seed of its noise.
 
-        They are the configured ones for the rig NOMINAL, 0. Raises ValueError for a rig beyond the campaign's number of
+        The rig NOMINAL, 0, has the configured values. Raises ValueError for a rig beyond the campaign's number of
         rigs, and as `quantile_value`.
         """
         options = self.options
@@ -176,7 +176,7 @@ class CaseRunner:
     def _run_loop(self, plan: Plan, driver: SimDriver, ticks: int) -> dict[str, Real]:
         """Run a plan for `ticks`; return by name the recorded columns that figures and verdict need.
 
-        Each is (n,): n is `ticks`, or less if a law raised an error, which ends the loop early.
+        Each column is (n,): n is `ticks`, or less if a law raised an error, which ends the loop early.
         """
         names = (
             "flags",
@@ -247,8 +247,8 @@ class _Outcome(NamedTuple):
 def _require_equal(computed_um: Real, recorded_um: Real) -> None:
     """Raise ValueError unless the positions at ticks, computed from the record, are exactly the recorded ones.
 
-    They differ where the actuator moved in periods without a tick: by a drive that latency delayed, by creep or by a
-    fault.
+    The positions differ where the actuator moved in periods without a tick: by a drive that latency delayed, by creep
+    or by a fault.
     """
     if not np.array_equal(computed_um, recorded_um, equal_nan=True):
         raise ValueError(

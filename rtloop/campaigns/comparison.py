@@ -103,7 +103,7 @@ def compare_campaigns(first: Path, second: Path) -> Comparison:
 def mcnemar(only_first: int, only_second: int) -> float:
     """Return the two-sided p-value of McNemar's exact test for two counts of rigs that pass in one campaign alone.
 
-    It is 1 if both counts are 0.
+    The p-value is 1 if both counts are 0.
     """
     from scipy.stats import binomtest
 

@@ -69,7 +69,7 @@ def _step(node: object, part: str, key: str) -> object:
 
 
 def _list_index(entries: list[object], part: str, key: str) -> int:
-    """Return the index of an entry, by its name or by its number, from 0. Raises ValueError where there is none."""
+    """Return the index of an entry, by its name or its number, from 0. Raises ValueError if the list lacks it."""
     names = [entry.get("name") for entry in entries if isinstance(entry, dict)]
     if part in names:
         return names.index(part)

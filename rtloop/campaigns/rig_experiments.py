@@ -181,8 +181,8 @@ class WaveExperiment(ExperimentOptions):
     def measure(self, motion: Motion) -> tuple[float, ...]:
         """Return root mean square and largest magnitude of the error after `settle_periods`, in µm.
 
-        Both are infinite if a position after these periods is not finite. Raises ValueError if no tick comes after
-        them.
+        Both figures are infinite if a position after these periods is not finite. Raises ValueError if no tick comes
+        after them.
         """
         error_um = motion.error_um[motion.tick(self.settle_periods / self.frequency_hz) :]
         if not error_um.size:
@@ -243,11 +243,10 @@ class DisturbanceExperiment(ExperimentOptions):
         return ("error_peak_um", "error_rms_um", "settling_ms")
 
     def measure(self, motion: Motion) -> tuple[float, ...]:
-        """Return largest magnitude and root mean square (µm) of the error from `start_s` on, and settling time from
-        there (ms).
+        """Return largest magnitude and root mean square (µm) of the error from `start_s` on, and settling time (ms).
 
-        The time is 0 without a step, infinite if the error is outside the band at the end. All three are infinite if a
-        position is not finite.
+        The settling time counts from `start_s`. This time is 0 without a step, infinite if the error at the end is more
+        than SETTLING_BAND of the step. All three are infinite if a position from `start_s` on is not finite.
         """
         error_um = np.abs(motion.error_um[motion.tick(self.start_s) :]).ravel()
         if not np.all(np.isfinite(error_um)):

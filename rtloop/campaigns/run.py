@@ -30,9 +30,9 @@ def campaign(
 ) -> Any:
     """Run a campaign, record its worst rigs, and return its results: a row for each rig by rising number.
 
-    The nominal rig has the number 0; recordings are in the folder `worst` of `out`.
-    They are a DataFrame of pandas, or without pandas a dict of arrays (rigs,) by column: rig, status, missed, ratio,
-    the seed and the values of the keys, the figures, and the causes of each experiment's trip.
+    The nominal rig has the number 0; recordings are in the folder `worst` of `out`. The results are a DataFrame of
+    pandas, or without pandas a dict of arrays (rigs,) by column: rig, status, missed, ratio, the seed and the values of
+    the keys, the figures, and the causes of each experiment's trip.
 
     `file` is a CAMPAIGN.toml, `configuration` replaces its configuration, `rigs` its number of rigs. Results that `out`
     (campaigns/NAME by default) has already are not run again. `jobs` worker processes (None: one for each processor)

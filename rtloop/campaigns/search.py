@@ -103,7 +103,7 @@ def find_worst(
     def run_generation(_: object, candidates: Real) -> list[float]:
         """Run the rigs at `candidates` (rigs, keys), shares of the distributions; return the negative figures.
 
-        Stores the worst rig so far in `worst_cases`.
+        Stores the worst rig of all generations in `worst_cases`.
         """
         nonlocal count
         numbered = []
@@ -221,8 +221,8 @@ def _check_search(runner: CaseRunner, figure: str) -> None:
 def _height(case: CaseResult, figure: str) -> float:
     """Return the value that a search maximises: the case's `figure`, or its ratio if `figure` is empty.
 
-    It is TRIP_RATIO for a rig that tripped, whatever the figure, and where the value is not finite; 0 for a refused
-    rig, which never ran.
+    The value is TRIP_RATIO for a rig that tripped, whatever the figure, and in place of a value that is not finite; 0
+    for a refused rig, which never ran.
     """
     if case.refusal:
         return 0.0

@@ -66,7 +66,7 @@ def arrow() -> ModuleType:
 def crashed_case(rig: int, values: Mapping[str, object]) -> CaseResult:
     """Return the result of a rig whose worker died each time it ran the rig.
 
-    It has no figures and no trips, `missed` is (CRASHED,), and the ratio infinite.
+    The result has no figures and no trips, `missed` is (CRASHED,), and the ratio infinite.
     """
     return CaseResult(rig, values, {}, {}, (CRASHED,), float("inf"))
 
@@ -248,7 +248,7 @@ def _manifest(campaign: Campaign) -> Manifest:
 def read_manifest(folder: Path) -> Manifest:
     """Return the manifest of a campaign's folder, with _MANIFEST_KEYS at least.
 
-    Raises InputFileError where there is none that can be read.
+    Raises InputFileError if the manifest is missing, cannot be read or lacks one of these keys.
     """
     path = folder / MANIFEST
     try:

@@ -194,7 +194,7 @@ class DaskWorkers:
     def explain(self, error: BaseException) -> BaseException:
         """Return WorkerDied where a function killed its workers, UnavailableError where the scheduler is gone.
 
-        Signs of the latter are a cancelled function and a closed connection. Returns any other error itself.
+        A cancelled function or a closed connection means that the scheduler is gone. Returns any other error itself.
         """
         from concurrent.futures import CancelledError
 

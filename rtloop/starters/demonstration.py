@@ -88,7 +88,7 @@ def _configuration_file() -> Iterator[Path]:
 
 @contextlib.contextmanager
 def _board_process(config: Path) -> Iterator[None]:
-    """Run the board of a configuration during the block, from its first sample on. It ends when its stdin is closed.
+    """Run the board of a configuration during the block, from its first sample on; a closed stdin ends the board.
 
     Raises UnavailableError if it does not start.
     """

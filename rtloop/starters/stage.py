@@ -131,7 +131,7 @@ def _travel_numbers(range_um: float, reach_um: float, remanence_um: float) -> di
 def _levels_um(actuator: Actuator, position_um: float) -> list[float]:
     """Return the reference's four levels in µm: upper, middle, lower and again the middle one.
 
-    They are the middle of the reachable travel, and a quarter of this travel to each side, rounded to about three
+    The levels are the middle of the reachable travel, and a quarter of this travel to each side, rounded to about three
     digits of the travel. The position interlock, ±`position_um`, limits the reachable travel.
     """
     top_um = min(actuator.rise_um(actuator.highest_v), position_um)

@@ -61,8 +61,8 @@ class Actuator:
         """Return the lowest (≤ 0) and the highest (≥ 0) drive in V between which a slow motion from rest stays within
         ±`limit_um`.
 
-        Both lie within the actuator's range of drives. The motion begins upwards. It is assumed to go to the highest
-        drive before it goes to the lowest.
+        Both lie within the actuator's range of drives. The motion begins upwards, and is
+        assumed to reach the highest drive before the lowest.
         """
         highest_v = _largest(self.rise_um, self.thresholds_v, limit_um, self.highest_v)
         part = Actuator(self.lowest_v, highest_v, self.thresholds_v, self.weights_um_per_v)

@@ -40,7 +40,7 @@ class RestDetector:
         self.reset()
 
     def reset(self) -> None:
-        """Discard all ticks; until the next ones the axis counts as at rest."""
+        """Discard all ticks; until the next ticks the axis counts as at rest."""
         self.at_rest = True
         self._last: Real = np.zeros((2, 0))
         """Reference and mode of the newest tick, (2, 1); (2, 0) before the first."""

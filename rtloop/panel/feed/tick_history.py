@@ -33,7 +33,7 @@ class Points(NamedTuple):
 def history_ticks(columns: int, rate_hz: float) -> int:
     """Return the number of ticks to keep for a loop of `columns` signals: a multiple of BLOCK, at least one BLOCK.
 
-    They last for LONGEST_S + SPARE_S, or are as many as MAX_BYTES hold, if these are fewer.
+    The ticks last for LONGEST_S + SPARE_S, or are as many as MAX_BYTES hold if these are fewer.
     """
     memory_ticks = int(MAX_BYTES / (columns * 8 * (1 + 2 / BLOCK)))
     return BLOCK * max(min(memory_ticks, int((LONGEST_S + SPARE_S) * rate_hz)) // BLOCK, 1)
@@ -67,7 +67,7 @@ class TickHistory:
     def begin(self) -> int:
         """Number of the oldest tick that the history can still hold: `end` less its capacity, at least 0.
 
-        Ticks from there on that were lost, or came before the first append, are NaN.
+        Ticks from `begin` on that were lost, or came before the first append, are NaN.
         """
         return max(self.end - self._blocks * BLOCK, 0)
 

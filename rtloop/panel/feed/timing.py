@@ -116,7 +116,7 @@ class Timing:
         return self._seconds[-1]
 
     def _advice(self, seconds: list[TimingSecond], lateness: Real, worst_us: float, missed: int) -> list[str]:
-        """Return warnings about the host, by the limits of `rtloop doctor`; [] if there are none.
+        """Return warnings about late ticks and growing lateness, then a hint at `rtloop doctor`; [] without a warning.
 
         `lateness` is the histogram (bins,) of all ticks of `seconds`, `worst_us` their largest lateness, `missed` their
         number of missed periods.
@@ -142,7 +142,7 @@ class Timing:
 def quantile_us(counts: Real, fraction: float) -> float | None:
     """Return the quantile `fraction` (0 … 1), in µs, of a histogram `counts` (bins,) over EDGES_US.
 
-    It is linear within a bin; None if all counts are 0, as in virtual time.
+    The quantile is interpolated linearly within a bin; None if all counts are 0, as in virtual time.
     """
     cumulative = np.concatenate([[0.0], np.cumsum(counts)])
     return float(np.interp(fraction * cumulative[-1], cumulative, EDGES_US)) if cumulative[-1] else None

@@ -106,7 +106,7 @@ class RecordingFolder:
 def _summary(path: Path, size: int) -> Mapping[str, object]:
     """Return the values of UNKNOWN_SUMMARY's keys, as `RecordingFolder.listing` describes them, from a recording.
 
-    All are None if it is unreadable; `trips` is None for a `size` (bytes) above MAX_COUNTED_BYTES.
+    All values are None if the recording is unreadable; `trips` is None for a `size` (bytes) above MAX_COUNTED_BYTES.
     """
     try:
         with Reader(path, tolerant=True, opener=open_without_link) as reader:
