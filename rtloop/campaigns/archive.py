@@ -27,8 +27,10 @@ def examine(
     on_progress: Callable[[int], None],
     is_stop_requested: Callable[[], bool],
 ) -> dict[str, Any]:
-    """Examine recordings on workers; with `folder`, their rows are stored there, and stored ones are not repeated.
+    """Examine recordings on workers; with `folder`, store their rows in its file, and use the rows that count there.
 
+    A stored row counts if the recording is unchanged, this version of rtloop wrote the row, and its verdict depends on
+    the recording alone. A recording whose row counts is not examined again.
     Returns {recordings, pending, stored, counts, duration_s, rate_per_s, verdicts}: `verdicts` is the list of rows, in
     the order of `recordings`, `counts` the number of rows by verdict, `stored` the number of rows from earlier calls,
     `pending` the number of recordings without a row after a stop. A row is {path, files, size, mtime_ns, rtloop,
@@ -37,7 +39,7 @@ def examine(
     number of rows, stored ones included.
 
     Raises UnavailableError if the scheduler is gone, a worker has another version or another process uses the folder,
-    OutputError if a row cannot be stored. Rows that `folder` has by then stay there.
+    OutputError if the folder or a row cannot be written. Rows that were stored before the error stay in `folder`.
     """
     start_s = time.monotonic()
     with open_table(recordings, examination.columns, folder, examination.file_name) as table:
@@ -59,10 +61,11 @@ class Archive:
     """Examines the recordings that `table` lacks on `workers`."""
 
     def __init__(self, examination: Examination, table: VerdictTable, workers: Workers) -> None:
+        """Store the arguments; `run` begins the work."""
         self._examination, self._table, self._workers = examination, table, workers
 
     def run(self, on_progress: Callable[[int], None], is_stop_requested: Callable[[], bool]) -> None:
-        """Examine the recordings, and add their rows to the table; `on_progress` receives its number of rows.
+        """Examine the recordings that the table lacks, and add their rows; `on_progress` receives the number of rows.
 
         After a request to stop, the recordings that were submitted end and no other one starts. Raises UnavailableError
         if the scheduler is gone or a worker has another version, OutputError if a verdict cannot be stored.

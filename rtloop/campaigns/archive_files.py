@@ -32,19 +32,19 @@ def find_recordings(patterns: Iterable[Path]) -> list[ArchivedRecording]:
     """Return the recordings that patterns, files and folders name, sorted by path, each once; the files of a rotated
     run are one recording.
 
-    In a pattern, ** stands for any number of folders; a folder stands for all recordings below it. A subfolder that
-    cannot be read is returned like a recording. An unfinished file beside its recovered one is left out. Raises
-    RecordingError for a file of `patterns` itself that cannot be opened, and for a pattern or a folder without a match;
-    files that a pattern or a folder leads to are not tested.
+    In a pattern, ** stands for any number of folders; a folder stands for all recordings below it. A folder that cannot
+    be read is returned like a recording. An unfinished file whose recovered file exists is left out, unless `patterns`
+    has its own path. Raises RecordingError for a path in `patterns` that cannot be opened, and for a pattern or a
+    folder without a match; a file that a pattern or a folder leads to raises no error, readable or not.
     """
     paths = {os.path.abspath(path) for pattern in patterns for path in _expand(pattern)}
     return [_read_status(run) for run in sorted(_group_runs(sorted(paths)))]
 
 
 def _expand(pattern: Path) -> Iterator[str]:
-    """Yield the paths of the files that a pattern, a file or a folder names, some perhaps twice.
+    """Yield the paths of the files that a pattern, a file or a folder names, and of unreadable folders.
 
-    Raises as `find_recordings`.
+    A path may come twice. Raises as `find_recordings`.
     """
     if glob.has_magic(str(pattern)) and not os.path.exists(pattern):
         matches = glob.glob(str(pattern), recursive=True)
@@ -91,9 +91,9 @@ def _is_recovered(path: str) -> bool:
 
 
 def _group_runs(paths: Sequence[str]) -> Iterator[tuple[str, ...]]:
-    """Yield the files of each run; `paths` must be sorted, and the runs come in their order.
+    """Yield the files of each run; `paths` must be sorted, and the runs come in the order of their first files.
 
-    Files are of one run if their names differ in the number alone, and if `open_run` accepts them together. If it does
+    Files are of one run if their paths differ in the number alone, and if `open_run` accepts them together. If it does
     not, each of them is yielded as a run of one file.
     """
     candidates: defaultdict[str, list[str]] = defaultdict(list)
@@ -117,9 +117,9 @@ def _is_one_run(paths: Sequence[str]) -> bool:
 
 
 def _read_status(paths: tuple[str, ...]) -> ArchivedRecording:
-    """Return the recording of some files, with the total size and the latest time of the files.
+    """Return the recording of the files `paths`, with their total size and the time of their latest change.
 
-    A missing file has size 0 and time 0.
+    A missing file counts with size 0 and time 0.
     """
     sizes, times_ns = [], []
     for path in paths:

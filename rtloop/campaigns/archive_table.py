@@ -1,8 +1,8 @@
 """Verdicts of an archive's recordings, in memory and as lines of JSON in a folder, from which a later call continues.
 
 A line has the keys path, files, size, mtime_ns, rtloop (the version), verdict, the columns of the examination, and
-reason. It is on the disk before the next one is written. A line whose file has changed since, or that another version
-of rtloop wrote, does not count.
+reason. It is on the disk before the next one is written. A line does not count if its recording has changed since, if
+another version of rtloop wrote it, or if its verdict is one of REPEATED.
 """
 
 from __future__ import annotations
@@ -37,9 +37,9 @@ class VerdictTable:
     ) -> None:
         """Make and lock `folder`, and read the rows of unchanged recordings there; without a folder there are none.
 
-        `columns` are the names of the columns of the examination. A stored row whose verdict may change without the
-        file, one of REPEATED, is left out. Raises UnavailableError if another process writes to the folder, OutputError
-        if the system refuses.
+        `columns` are the names of the columns of the examination. A stored row with a verdict of REPEATED, which may
+        change without the recording, is left out. Raises UnavailableError if another process writes to the folder,
+        OutputError if the system refuses.
         """
         self._recordings, self._columns = recordings, columns
         self.rows: dict[str, Row] = {}
@@ -88,7 +88,7 @@ class VerdictTable:
                 close_descriptor(descriptor)
 
     def missing(self) -> list[ArchivedRecording]:
-        """Return the recordings that have no row, in order."""
+        """Return the recordings that have no row, in the order in which the table got them."""
         return [recording for recording in self._recordings if recording.paths[0] not in self.rows]
 
     def add(self, recording: ArchivedRecording, values: Row) -> None:
@@ -107,11 +107,11 @@ class VerdictTable:
         return {**_facts(recording), "verdict": None, **dict.fromkeys(self._columns), "reason": ""}
 
     def ordered_rows(self) -> list[Row]:
-        """Return the rows in the order of the recordings, of which some may have no row yet."""
+        """Return the rows in the order of the recordings; a recording without a row is left out."""
         return [self.rows[recording.paths[0]] for recording in self._recordings if recording.paths[0] in self.rows]
 
     def counts(self) -> dict[str, int]:
-        """Return the number of recordings by verdict, the most frequent first."""
+        """Return the number of rows by verdict, the most frequent verdict first."""
         return dict(Counter(row["verdict"] for row in self.ordered_rows()).most_common())
 
     def _append(self, rows: Iterable[Row]) -> None:
@@ -134,9 +134,9 @@ def _facts(recording: ArchivedRecording) -> Row:
 
 
 def _read_rows(path: Path) -> dict[str, Row]:
-    """Return the stored rows by path, the last one of each; {} without a file. Raises OSError.
+    """Return the stored rows by path, the last row of each path; {} without a file.
 
-    A line that is no row, as one that was cut off, is left out.
+    A line that is no row, such as a line that was cut off, is left out. Raises OSError if the file cannot be read.
     """
     try:
         with os.fdopen(open_own(path), "rb") as file:
@@ -161,7 +161,7 @@ def _parse_row(line: bytes) -> Row | None:
 def open_table(
     recordings: Sequence[ArchivedRecording], columns: Sequence[str], folder: Path | None, file_name: str
 ) -> Iterator[VerdictTable]:
-    """Open the table of recordings for a block; raises as VerdictTable does."""
+    """Open the table of recordings for a block, then close it. Raises as VerdictTable."""
     table = VerdictTable(recordings, columns, folder, file_name)
     try:
         yield table

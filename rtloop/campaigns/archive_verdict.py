@@ -100,7 +100,11 @@ def _row(verdict: str, reason: str = "", **values: object) -> Row:
 
 
 def _replay(paths: list[Path]) -> Row:
-    """Return the row of a recording from its replay in this process. Raises RecordingError if it cannot be read."""
+    """Return the row of a recording from its replay in this process.
+
+    Without a replay, an unfinished recording gets UNFINISHED, and one whose laws cannot be loaded NO_LAW or
+    OTHER_VERSION. Raises RecordingError if the recording cannot be read.
+    """
     if _is_unfinished(paths):
         return _row(UNFINISHED, _unfinished_reason(paths[0]))
     recording = load(paths)
@@ -177,7 +181,7 @@ def _unfinished_reason(path: Path) -> str:
 
 
 def _missing_files(paths: Sequence[Path]) -> list[str]:
-    """Return a message for each missing file of a rotated run; [] if none is missing.
+    """Return a message for each missing file of a rotated run; [] if none is missing, and for a single path.
 
     Raises RecordingError if a file cannot be opened.
     """

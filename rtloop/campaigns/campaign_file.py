@@ -60,7 +60,7 @@ class CampaignOptions(Options):
 
     @model_validator(mode="after")
     def _check(self) -> Self:
-        """Require different names of experiments, and limits of figures that they have."""
+        """Return the options; ValueError for two experiments of one name, and for a limit of an unknown figure."""
         labels = [experiment.label for experiment in self.experiment]
         for label in labels:
             if labels.count(label) > 1:
@@ -97,9 +97,10 @@ class Campaign:
 
     @property
     def digest(self) -> str:
-        """SHA-256, in hexadecimal, of all that determines a rig's results, except for `rigs` and `keep_worst`.
+        """SHA-256, in hexadecimal, of the options, the configuration's text, the limits, the laws and the lateness.
 
-        With Latin hypercubes the number of rigs counts, too.
+        Of the options, `keep_worst` and the paths of configuration and lateness do not count; `rigs` counts with Latin
+        hypercubes alone.
         """
         left_out = {"keep_worst"} if self.options.sampling == "latin_hypercube" else {"keep_worst", "rigs"}
         left_out |= {"configuration", "lateness"}  # their content counts, not their paths
@@ -117,8 +118,8 @@ class Campaign:
 def load_campaign(path: Path, rigs: int | None = None, configuration: Path | None = None) -> Campaign:
     """Return the campaign of the CAMPAIGN.toml at `path`, with the name "CAMPAIGN-CONFIGURATION".
 
-    `rigs` replaces the number of sampled rigs, `configuration` the path of the configuration; its axis's specification,
-    and so its limits, count then.
+    `rigs` replaces the number of sampled rigs, `configuration` the path of the configuration. Without a specification
+    in the CAMPAIGN.toml, the limits come from the specification of this configuration's axis.
 
     Raises InputFileError for an unreadable file; ConfigError with all faults of the file or of its configuration, and
     for a recording without lateness; RecordingError for a file of `lateness` that is no recording.
@@ -150,10 +151,10 @@ def load_campaign(path: Path, rigs: int | None = None, configuration: Path | Non
 def _limits(options: CampaignOptions, path: Path, configuration: Configuration) -> dict[str, float]:
     """Return the largest value of each limited figure, by "EXPERIMENT.FIGURE".
 
-    They are those of [limits] in the file; of steps, also those of the specification where [limits] has none.
-
-    The specification is the campaign's, else the axis's; without one, the file's limits alone count. Raises
-    InputFileError, ConfigError for its faults.
+    [limits] in the file has priority; for experiments with steps, the specification adds its limits of overshoot,
+    settling time and static error. The specification is the campaign's, else the axis's; without one, [limits] alone
+    counts. Raises InputFileError and
+    ConfigError for an unreadable or invalid specification.
     """
     axis = next(axis for axis in configuration.axes if options.axis in ("", axis.name))
     specification = path.parent / options.specification if options.specification else None
@@ -172,7 +173,7 @@ def _limits(options: CampaignOptions, path: Path, configuration: Configuration) 
 
 
 def _collect_keys() -> set[str]:
-    """Return all keys of the file, for suggestions where one is unknown."""
+    """Return all keys that a CAMPAIGN.toml may have, at any depth, for suggestions in place of an unknown key."""
     schema = CampaignOptions.model_json_schema()
     parts = [schema, *schema.get("$defs", {}).values()]
     return set().union(*(part.get("properties", {}) for part in parts))

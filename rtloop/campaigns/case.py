@@ -27,7 +27,7 @@ from rtloop.signals import trip_causes
 SEED_KEY = "driver.seed"
 """Key of the noise's seed, of which every rig has its own unless the campaign names it."""
 NOMINAL = 0
-"""Number of the rig without a change."""
+"""Number of the nominal rig, whose keys have the configured values."""
 LOOP_ENDED = "the loop ended early"
 """Cause of a failure where a law raised an error in a tick."""
 SHARES_FOR_EFFECT = (0.25, 0.75)
@@ -62,11 +62,12 @@ class CaseResult:
 class CaseRunner:
     """Runs rigs of one campaign in this process.
 
-    Raises ConfigError for a configuration that cannot run, and for an uncertain key that does not exist, is set by an
-    experiment or has no effect.
+    Raises ConfigError for a configuration that cannot run, for an uncertain key that does not exist, that the campaign
+    or an experiment sets or that has no effect, and for an experiment that the loop's rate does not allow.
     """
 
     def __init__(self, campaign: Campaign) -> None:
+        """Build the nominal loop, and check all uncertain keys and experiments. Raises ConfigError with all faults."""
         self.campaign, self.options = campaign, campaign.options
         self._builder, self._loops = RigBuilder(campaign), LoopsInProcess()
         self.keys = tuple(self.options.uncertain)
@@ -83,7 +84,7 @@ class CaseRunner:
     def sample_values(self, rig: int) -> dict[str, Any]:
         """Return the values of a rig's uncertain keys, by key, and under "driver.seed" the seed of its noise.
 
-        They are the configured ones for the rig NOMINAL, 0. Raises ValueError for a rig beyond the campaign's number of
+        The rig NOMINAL, 0, has the configured values. Raises ValueError for a rig beyond the campaign's number of
         rigs, and as `quantile_value`.
         """
         options = self.options
@@ -103,8 +104,8 @@ class CaseRunner:
     def quantile_value(self, key: str, share: float) -> Any:
         """Return the value of a key at a `share`, in (0, 1), of its distribution.
 
-        Raises ValueError for a relative distribution of a key that has no number, and for limits of a normal
-        distribution that it does not reach.
+        Raises ValueError for a relative distribution of a key that has no number, and for a normal distribution that
+        has practically no values between its limits.
         """
         distribution = self.options.uncertain[key]
         value = distribution.quantile(share)
@@ -175,7 +176,7 @@ class CaseRunner:
     def _run_loop(self, plan: Plan, driver: SimDriver, ticks: int) -> dict[str, Real]:
         """Run a plan for `ticks`; return by name the recorded columns that figures and verdict need.
 
-        Each is (n,): n is `ticks`, or less if a law raised an error, which ends the loop early.
+        Each column is (n,): n is `ticks`, or less if a law raised an error, which ends the loop early.
         """
         names = (
             "flags",
@@ -197,8 +198,8 @@ class CaseRunner:
     def _key_fault(self, key: str) -> str:
         """Return the fault of an uncertain key that is unknown, fixed, set by an experiment, or without effect.
 
-        A value at which the rig cannot run is a fault, too; tried are the quartiles, or each entry of a choice. Returns
-        "" for a key without a fault.
+        A value at which the rig cannot run is a fault, too; tried are the configured value, the quartiles and each
+        entry of a choice. Returns "" for a key without a fault.
         """
         if key.startswith(FIXED_KEYS):
             return (
@@ -246,7 +247,8 @@ class _Outcome(NamedTuple):
 def _require_equal(computed_um: Real, recorded_um: Real) -> None:
     """Raise ValueError unless the positions at ticks, computed from the record, are exactly the recorded ones.
 
-    They differ where the actuator moved in periods without a tick: by a drive on its way, by creep or by a fault.
+    The positions differ where the actuator moved in periods without a tick: by a drive that latency delayed, by creep
+    or by a fault.
     """
     if not np.array_equal(computed_um, recorded_um, equal_nan=True):
         raise ValueError(
@@ -260,10 +262,10 @@ def _require_equal(computed_um: Real, recorded_um: Real) -> None:
 def _judge(
     figures: Mapping[str, float], trips: Mapping[str, str], limits: Mapping[str, float]
 ) -> tuple[tuple[str, ...], float]:
-    """Return the names of missed limits with the trips as texts, and the largest ratio of a figure to its limit.
+    """Return the names of exceeded limits, then a text for each trip, and the largest ratio of a figure to its limit.
 
-    The ratio is infinite after a trip, and 0 without limits. Of a figure above a limit of 0 or less, 1 + the figure
-    counts; of one within it, 0.
+    The ratio is infinite after a trip, and 0 without limits. In place of the ratio to a limit of 0 or less, 1 + the
+    figure counts if the figure is above the limit, else 0.
     """
     missed = [name for name, limit in limits.items() if not figures[name] <= limit]
     missed += [f"{label} tripped: {trip}" for label, trip in trips.items() if trip]
@@ -275,7 +277,7 @@ def _judge(
 
 
 def _refusal_text(error: Exception) -> str:
-    """Return the faults of an error on one line."""
+    """Return the faults of an error on one line, separated by "; ", without the file's name."""
     if isinstance(error, ConfigError):
         return "; ".join(error.faults)
     if isinstance(error, ValidationError):

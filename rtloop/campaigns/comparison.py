@@ -74,7 +74,11 @@ def compare_campaigns(first: Path, second: Path) -> Comparison:
     if different or set(manifests[0]["keys"]) != set(manifests[1]["keys"]):
         unequal = different or sorted(set(manifests[0]["keys"]) ^ set(manifests[1]["keys"]))
         raise ConfigError(
-            source, [f"{', '.join(unequal)}: the rigs differ; run both campaigns with the same seed, sampling and keys"]
+            source,
+            [
+                f"{', '.join(unequal)}: the rigs differ between the campaigns in these keys; run both campaigns with "
+                "the same seed, sampling and keys"
+            ],
         )
     passed = [table["status"] == PASSED for table in paired]
     only_first, only_second = (int(np.count_nonzero(a & ~b)) for a, b in (passed, passed[::-1]))
@@ -99,7 +103,7 @@ def compare_campaigns(first: Path, second: Path) -> Comparison:
 def mcnemar(only_first: int, only_second: int) -> float:
     """Return the two-sided p-value of McNemar's exact test for two counts of rigs that pass in one campaign alone.
 
-    It is 1 if both counts are 0.
+    The p-value is 1 if both counts are 0.
     """
     from scipy.stats import binomtest
 
@@ -110,7 +114,7 @@ def mcnemar(only_first: int, only_second: int) -> float:
 def paired_difference(first: Real, second: Real, seed: int = 0) -> FigureDifference:
     """Return the median of `second` − `first` (n,) over the pairs that are finite, with its bootstrap interval (95 %).
 
-    The bootstrap draws with `seed`. The interval is NaN for less than two pairs, the median for none.
+    The bootstrap draws with `seed`. The interval is NaN for less than two pairs, the median is NaN for none.
     """
     from scipy.stats import bootstrap
 

@@ -37,6 +37,7 @@ class Coordinator:
     """Runs the rigs that `store` lacks on `workers`; `crashed` has the numbers of rigs that were set aside."""
 
     def __init__(self, campaign: Campaign, runner: CaseRunner, store: Store, workers: Workers) -> None:
+        """Store the arguments and the package versions of this process; no rig is set aside yet."""
         self.crashed: list[int] = []
         self._campaign, self._runner, self._store, self._workers = campaign, runner, store, workers
         self._facts = WorkerFacts.of_this_process()
@@ -48,7 +49,7 @@ class Coordinator:
 
         After a request to stop, the tasks that were submitted end and no other one starts. Raises the error of a task,
         such as OtherVersion; UnavailableError if the scheduler is gone; LoopFault if the nominal rig kills its workers;
-        OutputError if the store cannot be read or written. Results that came before are stored.
+        OutputError if the store cannot be read or written. Results that came before an error are stored.
         """
         missing = [(unit, self._store.missing(unit)) for unit in units]
         tasks = (
@@ -68,7 +69,7 @@ class Coordinator:
         return self._workers.submit(run_unit, self._campaign, [item.rig for item in items], self._facts)
 
     def store(self, items: tuple[UnitRig, ...], result: Sequence[CaseResult]) -> None:
-        """Store the results of rigs of one unit. Raises OutputError if the system refuses."""
+        """Store `result`, the results of rigs of one unit. Raises OutputError if the system refuses."""
         self._store.add(items[0].unit, result)
 
     def set_aside(self, item: UnitRig) -> None:

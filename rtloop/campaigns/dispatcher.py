@@ -57,6 +57,7 @@ class Dispatcher(Generic[Item, Result]):
     """Runs the tasks of a job on workers."""
 
     def __init__(self, workers: Workers, job: Job[Item, Result]) -> None:
+        """Store workers and job; no task runs, and no item waits to run again alone."""
         self._workers, self._job = workers, job
         self._suspects: deque[Task[Item]] = deque()
         self._running: dict[Future[Result], Task[Item]] = {}
@@ -66,9 +67,9 @@ class Dispatcher(Generic[Item, Result]):
     ) -> int:
         """Run the tasks; return the number of items that are stored or set aside.
 
-        `on_progress` receives their number so far after each end of tasks. After a request to stop, submitted tasks end
-        and are stored, and no other one starts. Raises the error of a task, UnavailableError if the scheduler is gone,
-        and the errors of the job. Results that came before are stored.
+        `on_progress` receives the number of such items of this call each time that tasks have ended. After a request to
+        stop, submitted tasks end and are stored, and no other one starts. Raises the error of a task, UnavailableError
+        if the scheduler is gone, and the errors of the job. Results that came before an error are stored.
         """
         waiting, done = iter(tasks), 0
         while self._fill(waiting, is_stop_requested()):
@@ -79,10 +80,11 @@ class Dispatcher(Generic[Item, Result]):
         return done
 
     def _fill(self, tasks: Iterator[Task[Item]], is_stopping: bool) -> int:
-        """Submit the next tasks; return the number of submitted tasks that have not ended, 0 at the end.
+        """Submit the next tasks; return the number of submitted tasks whose results are not yet stored, 0 at the end.
 
-        Each worker gets up to WAITING_FOR_EACH. Items whose worker died go first, alone, once no other task runs. While
-        `is_stopping`, none is submitted. Replaces dead workers; raises any other error of `Job.submit`.
+        Each worker gets up to WAITING_FOR_EACH tasks. Items whose worker died go first, alone, once no other task runs.
+        While `is_stopping`, no task is submitted. Replaces dead workers once no task runs; raises any other error of
+        `Job.submit`.
         """
         while not is_stopping and len(self._running) < WAITING_FOR_EACH * self._workers.count:
             if any(task.alone for task in self._running.values()) or (self._suspects and self._running):
@@ -104,9 +106,9 @@ class Dispatcher(Generic[Item, Result]):
     def _collect(self, completed: Iterable[Future[Result]]) -> int:
         """Store the results of tasks that ended; return the number of items that this call stored or set aside.
 
-        If a worker died, all other tasks are awaited and stored, since some workers die together. The workers are then
-        replaced, and the items of the dead ones run again, each alone, or are set aside. Raises the error of a task,
-        UnavailableError if the scheduler is gone, and the errors of the job.
+        If a worker died, the results of all other tasks are awaited and stored, since some workers die together. The
+        dead workers are then replaced; their items are queued to run again, each alone, or are set aside. Raises the
+        error of a task, UnavailableError if the scheduler is gone, and the errors of the job.
         """
         died: list[Task[Item]] = []
         done = sum(self._store_result(future, died) for future in completed)

@@ -19,7 +19,7 @@ FIXED_KEYS = ("driver.kind", "driver.channels", "loop.mode", "loop.enable_input"
 
 
 def is_rig_key(key: str) -> bool:
-    """Whether a key changes the driver's options alone: the laws and their coefficients stay."""
+    """Whether a key changes the driver's options alone; False for `driver.kind` and `driver.channels`, too."""
     return key.startswith(DRIVER) and not key.startswith(FIXED_KEYS)
 
 
@@ -69,7 +69,7 @@ def _step(node: object, part: str, key: str) -> object:
 
 
 def _list_index(entries: list[object], part: str, key: str) -> int:
-    """Return the index of an entry, by its name or by its number, from 0. Raises ValueError where there is none."""
+    """Return the index of an entry, by its name or its number, from 0. Raises ValueError if the list lacks it."""
     names = [entry.get("name") for entry in entries if isinstance(entry, dict)]
     if part in names:
         return names.index(part)
@@ -118,7 +118,7 @@ def _attribute(options: object, path: str, key: str) -> object:
 
 
 def _choices_text(value: object) -> str:
-    """Return "; allowed: …" with the fields of Options, the keys of a table or the places of a tuple.
+    """Return "; allowed: …" with the fields of Options, the keys of a table or the indices of a tuple.
 
     Return "; the list is empty" for an empty tuple, "" for an empty table and for every other value.
     """

@@ -115,7 +115,7 @@ def value_text(value: object) -> str:
 def percent_text(share: float) -> str:
     """Return a share, 0 … 1, in percent with four significant digits, without "%".
 
-    A share below 1 gets as many digits as it needs not to read as 100.
+    0 and 1 become "0" and "100". A share below 1 gets as many digits as it needs not to read as 100.
     """
     texts = [f"{100 * share:#.{digits}g}" for digits in range(4, 17)]
     return f"{100 * share:g}" if share in (0, 1) else next((t for t in texts if t[:3] != "100"), texts[-1])
@@ -189,14 +189,14 @@ def _campaign_section(folder: Path, summary: CampaignSummary, link: Link) -> dic
 
 
 def _nominal_text(nominal: Mapping[str, Any]) -> str:
-    """Return the verdict of the nominal rig as a sentence, with the reasons for a failure; "" without a result.
+    """Return the nominal rig's verdict as a sentence, with the reasons if it failed or was refused; "" without one.
 
     `nominal` is its row of results by column, {} without one.
     """
     if not nominal:
         return ""
     reasons = f": {nominal['missed']}" if nominal["status"] in (FAILED, REFUSED) else ""
-    return f"The nominal rig, without a change, {NOMINAL_TEXTS[nominal['status']]}{reasons}."
+    return f"The nominal rig, with the configuration's own values, {NOMINAL_TEXTS[nominal['status']]}{reasons}."
 
 
 def _address(path: str) -> str:
@@ -205,7 +205,7 @@ def _address(path: str) -> str:
 
 
 def _select(columns: Columns, is_selected: npt.NDArray[np.bool_ | np.intp]) -> dict[str, np.ndarray]:
-    """Return the columns of the rigs at which `is_selected`, (rigs,) truth values, is true."""
+    """Return the columns of the selected rigs: `is_selected` has truth values (rigs,), or indices, in this order."""
     return {name: values[is_selected] for name, values in columns.items()}
 
 
@@ -216,7 +216,7 @@ def _figure_values(columns: Columns, name: str, limit: float, nominal: Mapping[s
 
 
 def _range_text(values: np.ndarray) -> str:
-    """Return the least, the largest and the median of numbers (rigs,) as text, or all different values of other ones.
+    """Return "LEAST … LARGEST, median MEDIAN" for numbers (rigs,), or a list of the different texts or truth values.
 
     Returns "–" without a value.
     """
@@ -240,9 +240,9 @@ def abbreviate_keys(keys: Sequence[str]) -> dict[str, str]:
 def rank_keys(keys: Sequence[str], columns: Columns, summary: CampaignSummary) -> RankedKeys:
     """Return the keys by their importance for passing; `columns` are of the rigs that could run.
 
-    The measure is the total sensitivity index where it exists, else the largest difference between the distributions of
-    a key among passed and among failed rigs (Hornberger and Spear 1981, by the distance of Kolmogorov and Smirnov).
-    Without an index, and if all rigs pass or none does, the keys keep their order.
+    The measure is the total sensitivity index if it is finite for all keys, else the largest difference between the
+    distributions of a key among passed and among failed rigs (Hornberger and Spear 1981, by the distance of Kolmogorov
+    and Smirnov). Without the index, and if all rigs pass or none does, the keys keep their order.
     """
     totals = {key: index.total for key, index in summary.sensitivity.get("passed", {}).items()}
     passed = columns["status"] == PASSED
@@ -277,7 +277,7 @@ def _is_numeric(values: npt.NDArray[np.generic]) -> bool:
 def _key_numbers(values: npt.NDArray[np.generic]) -> tuple[Real, tuple[str, ...]]:
     """Return values (rigs,) of a key as floats, and the texts for which the numbers 0, 1 … stand.
 
-    The texts are sorted; there are none, (), if the values are numbers.
+    The texts are sorted, truth values are "false" and "true"; there are no texts, (), if the values are numbers.
     """
     if _is_numeric(values):
         return values.astype(float), ()
@@ -310,9 +310,10 @@ def _rigs_picture(
 def _recordings_picture(
     folder: Path, rig: int, figures: Sequence[str], link: Link
 ) -> tuple[dict[str, bytes] | None, list[tuple[str, str]], list[str]]:
-    """Return the picture of a rig's recordings or None, (file name, URL) of each, and the faults of unreadable ones.
+    """Return the picture of a rig's recordings, (file name, URL) of each file, and the faults of unreadable ones.
 
-    The recordings are those in folder "worst" of the experiments that `figures`, "EXPERIMENT.FIGURE", name.
+    The files are in the folder "worst" of `folder`, one run for each experiment in `figures`, "EXPERIMENT.FIGURE". The
+    picture is None without a readable recording.
     """
     labels = dict.fromkeys(figure.partition(SEPARATOR)[0] for figure in figures)
     runs = {label: run_files(folder / "worst" / f"rig-{rig:09d}-{label}.mcap", ".mcap") for label in labels}

@@ -102,7 +102,7 @@ def draw_motions(motions: Mapping[str, RecordedMotion]) -> dict[str, bytes]:
 
 
 def read_motion(recording: Recording) -> RecordedMotion:
-    """Read the motion of the axis whose true position moves farthest.
+    """Return the motion of the axis whose true position has the largest difference between its extremes.
 
     Raises RecordingError for a recording without a tick, and for one without true positions.
     """
@@ -123,13 +123,16 @@ def draw_pairs(pairs: Sequence[tuple[FigureValues, FigureValues]]) -> dict[str, 
 
 
 def _panels(figure: Figure, count: int) -> list[Any]:
-    """Add `count` panels to a figure of matplotlib, in rows of COLUMNS; return them."""
+    """Add `count` panels to a figure of matplotlib, at most COLUMNS in a row; return the panels, row by row."""
     grid = figure.add_gridspec(-(-count // COLUMNS), min(count, COLUMNS))
     return [figure.add_subplot(grid[divmod(number, COLUMNS)]) for number in range(count)]
 
 
 def _add_legend(figure: Figure, ink: Palette, entries: Mapping[str, Artist] | None = None) -> None:
-    """Add a legend below all panels; `entries` has the line or bar of each label, by default from the first panel."""
+    """Add a legend below all panels; `entries` has the line or bar of each label, None: as in the first panel.
+
+    Adds no legend without a label.
+    """
     if entries is None:
         handles, labels = figure.axes[0].get_legend_handles_labels()
         entries = dict(zip(labels, handles, strict=True))
@@ -141,7 +144,7 @@ def _add_legend(figure: Figure, ink: Palette, entries: Mapping[str, Artist] | No
 
 
 def _escape_math(text: str) -> str:
-    """Return a text of which matplotlib reads no part as mathematics."""
+    """Return the text with each "$" escaped, so that matplotlib reads no part of it as mathematics."""
     return text.replace("$", r"\$")
 
 
@@ -153,7 +156,8 @@ def _finite(*numbers: float) -> Real:
 def _scale_axis(panel: Axes, name: str, values: Real) -> bool:
     """Scale the axis `name`, "x" or "y", of a panel for finite values (n,); return whether it is logarithmic.
 
-    It is if all are positive and differ by LOGARITHMIC_RATIO or more. An axis of whole numbers has no other ticks.
+    The axis is logarithmic if all values are positive and the largest is at least LOGARITHMIC_RATIO times the least. A
+    linear axis of whole numbers has ticks at whole numbers only.
     """
     from matplotlib.ticker import LogLocator
 
@@ -267,7 +271,7 @@ def _draw_sensitivity(figure: Figure, indices: Mapping[str, Mapping[str, Sensiti
                 label="95 % interval" if column else None,
             )  # fmt: skip
         if not np.isfinite(values).any():
-            text = "no index: a rig has an infinite value,\nall rigs have the same value,\nor there are too few rigs"
+            text = "no index: a rig has no finite value,\nall rigs have the same value,\nor there are too few rigs"
             panel.text(0.5, 0.5, text, transform=panel.transAxes, ha="center", va="center", fontsize=8)
         low, high = np.nanmin([0.0, *values.ravel()]), np.nanmax([1.0, *values.ravel()])
         panel.set_xlim(low - 0.02 * (high - low), high + 0.02 * (high - low))

@@ -14,7 +14,7 @@ from rtloop.supervision.supervisor import Processes, Supervisor
 
 
 def record_rig(runner: CaseRunner, rig: int, folder: Path) -> list[Path]:
-    """Run all experiments of a rig in virtual time, each recorded in `folder`; a recording that exists is kept.
+    """Run all experiments of a rig in virtual time, each recorded in `folder`, unless its recording exists already.
 
     Returns the paths of all recordings, rig-NUMBER-EXPERIMENT.mcap with nine digits in NUMBER, in the order of the
     experiments. Raises ConfigError for a rig that cannot run, OutputError for a file that cannot be written,
@@ -37,7 +37,7 @@ def record_values(runner: CaseRunner, values: Mapping[str, object], name: str, f
 
 
 def _record(runner: CaseRunner, values: Mapping[str, object], experiment: Experiment, path: Path) -> Path:
-    """Record one experiment of a rig to `path`, unless that exists; return the path."""
+    """Run and record one experiment of a rig to `path`, unless this file exists; return the path."""
     if path.exists():
         return path
     source = f"{runner.campaign.name}, {path.stem}"

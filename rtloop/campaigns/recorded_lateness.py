@@ -21,10 +21,11 @@ US_PER_S, NS_PER_US = 1e6, 1e3
 
 
 def recorded_lateness(path: Path) -> tuple[float, ...]:
-    """Return the lateness of the ticks of a recording in µs, sorted, at most MAX_LATENESS_SAMPLES numbers.
+    """Return the lateness of the ticks of a recording in µs, rising, at most MAX_LATENESS_SAMPLES numbers.
 
-    Raises RecordingError for a file that is no recording; ConfigError for a recording without lateness, as of a run in
-    virtual time, and for a recording with a tick that is later than LARGEST_LATENESS_US.
+    A tick before its deadline counts as 0 µs late. Raises RecordingError for a file that is no recording; ConfigError
+    for a recording without lateness, as of a run in virtual time, and for a recording with a tick that is later than
+    LARGEST_LATENESS_US.
     """
     recording = load(path)
     lateness_us, missed = recording.read("lateness_us", "periods_missed")
@@ -42,8 +43,8 @@ def recorded_lateness(path: Path) -> tuple[float, ...]:
 def _new_lateness(lateness_us: Real, missed: Real, period_us: float) -> Real:
     """Return the time from each tick's first deadline to its wake in µs, (n,); NaN where `lateness_us` is NaN.
 
-    It is `lateness_us` and the `missed` periods of the tick, less the time by which the wake before was more than a
-    period late: that time counts at the wake before.
+    The time is `lateness_us` plus the duration of the `missed` periods. If the previous tick was more than a period
+    late, the excess over the period counts at that tick, and is subtracted from this duration, down to 0.
     """
     lost_us = np.concatenate([[0.0], np.nan_to_num(np.maximum(lateness_us[:-1] - period_us, 0.0))])
     return lateness_us + np.maximum(missed * period_us - lost_us, 0.0)

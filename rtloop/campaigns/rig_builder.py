@@ -47,6 +47,7 @@ class RigBuilder:
     """
 
     def __init__(self, campaign: Campaign) -> None:
+        """Build the nominal loop of a campaign. Raises ConfigError unless it can run on the simulated rig."""
         self._campaign = campaign
         self._tables = _tables_at_rest(campaign)
         self._nominal = self._build_loop(self._tables)
@@ -55,7 +56,7 @@ class RigBuilder:
 
     @property
     def rate_hz(self) -> float:
-        """Rate of the loop without a change, in Hz."""
+        """Rate of the nominal loop, in Hz."""
         return self._nominal.plan.pacing.rate_hz
 
     def nominal_value(self, key: str) -> Any:
@@ -77,7 +78,7 @@ class RigBuilder:
     def driver(self, loop: Loop, values: Mapping[str, object], experiment: Experiment) -> SimDriver:
         """Return the driver, not opened, of a rig with `values` and with the disturbance of one experiment.
 
-        Of `values`, keys of the driver alone count. Raises ValueError for options that no rig fits.
+        Only the keys of the driver in `values` count. Raises ValueError for options that the driver does not allow.
         """
         changed = replace_values({"driver": self._tables["driver"]}, _rig_values(values))
         tables = self._add_disturbance(changed, experiment)
@@ -98,8 +99,9 @@ class RigBuilder:
         return write_section("", tables, [heading])
 
     def fingerprint(self, values: Mapping[str, object]) -> bytes:
-        """Return bytes that are equal for two sets of values with equal records and plans in every experiment.
+        """Return bytes that are equal for two sets of values with equal plans and, in every experiment, equal rigs.
 
+        A rig here is the coefficients and the state of the simulated rig at its start.
         Raises as `loop` and `driver`.
         """
         loop = self.loop(values)

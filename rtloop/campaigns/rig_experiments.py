@@ -38,7 +38,7 @@ class Motion(NamedTuple):
         return self.reference_um[:, None] * (1 - shares) + ends_um[:, None] * shares - self.position_um
 
     def tick(self, time_s: float) -> int:
-        """Return the number of the tick nearest to `time_s`, counted from the first tick."""
+        """Return the number of the tick nearest to `time_s`; time and number are 0 at the first tick."""
         return round(time_s * self.rate_hz)
 
 
@@ -59,7 +59,7 @@ class ExperimentOptions(Options):
         raise NotImplementedError
 
     def ticks(self, rate_hz: float) -> int:
-        """Return the number of ticks of the experiment, rounded, at least 1."""
+        """Return the experiment's duration in ticks at `rate_hz`, rounded to a whole number, at least 1."""
         return max(round(self.duration_s * rate_hz), 1)
 
     @property
@@ -78,7 +78,7 @@ class ExperimentOptions(Options):
         raise NotImplementedError
 
     def measure(self, motion: Motion) -> tuple[float, ...]:
-        """Return the figures in the order of `figures`; infinity where a motion misses its reference altogether."""
+        """Return the figures in the order of `figures`; infinity where a position is not finite or misses its level."""
         raise NotImplementedError
 
 
@@ -99,7 +99,7 @@ class StepsExperiment(ExperimentOptions):
 
     @model_validator(mode="after")
     def _check(self) -> Self:
-        """Require levels of which each differs from the one before it, from 0 on."""
+        """Return the options; ValueError if the first level is 0 or a level equals the one before it."""
         if any(a == b for a, b in zip((0.0, *self.levels_um), self.levels_um, strict=False)):
             raise ValueError(
                 f"levels_um: {list(self.levels_um)}; allowed: a first level other than 0, and each further level "
@@ -130,7 +130,7 @@ class StepsExperiment(ExperimentOptions):
     def measure(self, motion: Motion) -> tuple[float, ...]:
         """Return the largest overshoot (%), settling time (ms) and static error (%) of all steps.
 
-        Overshoot and settling time are infinite if a step is not reached, all are if a position is not finite.
+        Overshoot and settling time are infinite if a step misses its level, all three if a position is not finite.
         """
         position_um, level_um, steps = motion.position_um.ravel(), 0.0, []
         dwell = POINTS * round(self.dwell_s * motion.rate_hz)
@@ -157,7 +157,7 @@ class WaveExperiment(ExperimentOptions):
 
     @model_validator(mode="after")
     def _check(self) -> Self:
-        """Require more periods than are left out."""
+        """Return the options; ValueError unless `settle_periods` is less than `periods`."""
         if self.settle_periods >= self.periods:
             raise ValueError(f"settle_periods: {self.settle_periods:g}; allowed: less than periods = {self.periods:g}")
         return self
@@ -181,7 +181,8 @@ class WaveExperiment(ExperimentOptions):
     def measure(self, motion: Motion) -> tuple[float, ...]:
         """Return root mean square and largest magnitude of the error after `settle_periods`, in µm.
 
-        Both are infinite if a position is not finite. Raises ValueError if no tick is left.
+        Both figures are infinite if a position after these periods is not finite. Raises ValueError if no tick comes
+        after them.
         """
         error_um = motion.error_um[motion.tick(self.settle_periods / self.frequency_hz) :]
         if not error_um.size:
@@ -216,7 +217,7 @@ class DisturbanceExperiment(ExperimentOptions):
 
     @model_validator(mode="after")
     def _check(self) -> Self:
-        """Require a step, a sine or both."""
+        """Return the options; ValueError if `step_um` and `sine_um` are both 0."""
         if not (self.step_um or self.sine_um):
             raise ValueError("step_um and sine_um are 0; allowed: at least one other than 0")
         return self
@@ -242,11 +243,10 @@ class DisturbanceExperiment(ExperimentOptions):
         return ("error_peak_um", "error_rms_um", "settling_ms")
 
     def measure(self, motion: Motion) -> tuple[float, ...]:
-        """Return largest magnitude and root mean square (µm) of the error from `start_s` on, and settling time from
-        there (ms).
+        """Return largest magnitude and root mean square (µm) of the error from `start_s` on, and settling time (ms).
 
-        The time is 0 without a step, infinite if the error is outside the band at the end. All three are infinite if a
-        position is not finite.
+        The settling time counts from `start_s`. This time is 0 without a step, infinite if the error at the end is more
+        than SETTLING_BAND of the step. All three are infinite if a position from `start_s` on is not finite.
         """
         error_um = np.abs(motion.error_um[motion.tick(self.start_s) :]).ravel()
         if not np.all(np.isfinite(error_um)):

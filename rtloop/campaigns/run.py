@@ -28,18 +28,19 @@ def campaign(
     jobs: int | None = None,
     scheduler: str | Client | None = None,
 ) -> Any:
-    """Run a campaign and return its results, a row for each rig in rising order; the nominal rig has number 0.
+    """Run a campaign, record its worst rigs, and return its results: a row for each rig by rising number.
 
-    They are a DataFrame of pandas, or without pandas a dict of arrays (rigs,) by column: rig, status, missed, ratio,
-    the seed and the values of the keys, the figures, and the causes of each experiment's trip.
+    The nominal rig has the number 0; recordings are in the folder `worst` of `out`. The results are a DataFrame of
+    pandas, or without pandas a dict of arrays (rigs,) by column: rig, status, missed, ratio, the seed and the values of
+    the keys, the figures, and the causes of each experiment's trip.
 
     `file` is a CAMPAIGN.toml, `configuration` replaces its configuration, `rigs` its number of rigs. Results that `out`
-    (campaigns/NAME by default) has already are not run again. `jobs` worker processes run the rigs, or the workers of
-    `scheduler`, an address or a `dask.distributed.Client`. A script that calls this function must do so below
-    `if __name__ == "__main__":`, because worker processes import it. Raises ConfigError, InputFileError and
-    RecordingError for the files that it reads, OutputError, MissingExtra without pyarrow or dask, UnavailableError for
-    a folder in use and a scheduler that cannot be used, OtherVersion for workers with other packages, LoopFault if the
-    nominal rig kills its workers. Results that came before an error stay in `out`.
+    (campaigns/NAME by default) has already are not run again. `jobs` worker processes (None: one for each processor)
+    run the rigs, or the workers of `scheduler`, an address or a `dask.distributed.Client`. A script that calls this
+    function must do so below `if __name__ == "__main__":`, because worker processes import it. Raises ConfigError,
+    InputFileError and RecordingError for the files that it reads, OutputError, MissingExtra without pyarrow or dask,
+    UnavailableError for a folder in use and a scheduler that cannot be used, OtherVersion for workers with other
+    packages, LoopFault if the nominal rig kills its workers. Results that came before an error stay in `out`.
     """
     loaded = load_campaign(Path(file), rigs, None if configuration is None else Path(configuration))
     folder = default_folder(loaded) if out is None else Path(out)

@@ -1,7 +1,8 @@
 """Samples: a number in (0, 1) for each rig and each uncertain key, which does not depend on worker or order.
 
-Each rig i and key K has a separate stream, so that its number depends on seed, i and K alone. Rigs added later leave
-those before as they are, except with Latin hypercubes; a key added at the end leaves the other keys' numbers.
+With "random", the number of rig i and key K depends on seed, i and K alone. Rigs added later leave the numbers of the
+rigs before, except with "latin_hypercube"; a key added at the end leaves the other keys' numbers, except with
+"saltelli".
 """
 
 from __future__ import annotations
@@ -100,9 +101,10 @@ def _order(word: int, total: int) -> npt.NDArray[np.int64]:
 
 
 def _sobol(keys: Sequence[str], first: int, count: int, seed: int) -> Real:
-    """Return points `first` … of Sobol's sequence, (count, keys) in (0, 1), shifted by a random number for each key.
+    """Return `count` points of Sobol's sequence from number `first` on, (count, keys) in (0, 1), shifted for each key.
 
-    The shift, an exclusive or of the bits, keeps the sequence's uniformity; each number is uniform.
+    The shift, an exclusive or with random bits from `seed` and key, keeps the sequence's uniformity; each number is
+    uniform.
     """
     from scipy.stats import qmc
 

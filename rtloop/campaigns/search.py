@@ -35,7 +35,7 @@ Evaluate = Callable[[Sequence[tuple[int, Mapping[str, object]]]], Sequence[CaseR
 class SearchResult(NamedTuple):
     """Worst rig of a search, the value of the figure that was maximised, and the number of rigs that were tried.
 
-    `figure` is infinite where the rig has no finite value; the ratio of a rig that tripped has none.
+    `figure` is infinite where the rig tripped or its value is not finite.
     """
 
     worst: CaseResult
@@ -87,12 +87,12 @@ def evaluate_on(workers: Workers, campaign: Campaign) -> Evaluate:
 def find_worst(
     runner: CaseRunner, evaluate: Evaluate, rigs: int, figure: str = "", target: float = math.inf
 ) -> SearchResult:
-    """Return the rig with the largest `figure` among about `rigs` tried ones; without a name, the largest ratio.
+    """Return the rig with the largest `figure`, or with "" the largest ratio, among about `rigs` tried rigs.
 
-    Whole generations of differential evolution run, at least one; the search ends early once the figure reaches
-    `target`. A rig that is refused counts with the figure 0, one that trips or whose figure is not finite as the worst.
-    Raises ConfigError for an unknown figure, for keys without numbers, and for the ratio of a campaign without limits;
-    and as `evaluate` does.
+    Whole generations of differential evolution run, at least one; the search ends early after a generation whose figure
+    reaches `target`. A rig that is refused counts with the figure 0, one that trips or whose figure is not finite as
+    the worst. Raises ConfigError for an unknown figure, for keys without numbers, and for the ratio of a campaign
+    without limits; and as `evaluate` does.
     """
     from scipy.optimize import differential_evolution
 
@@ -103,7 +103,7 @@ def find_worst(
     def run_generation(_: object, candidates: Real) -> list[float]:
         """Run the rigs at `candidates` (rigs, keys), shares of the distributions; return the negative figures.
 
-        Stores the worst rig so far in `worst_cases`.
+        Stores the worst rig of all generations in `worst_cases`.
         """
         nonlocal count
         numbered = []
@@ -180,9 +180,11 @@ def find_boundary(runner: CaseRunner, key: str, evaluate: Evaluate, tolerance: f
 def _bisect(
     failure: Callable[[float], str], passing: float, failing: float, cause: str, tolerance: float
 ) -> tuple[float, str]:
-    """Return the last value that passes between a passing and a failing one, and the cause of the nearest failure.
+    """Return the passing value next to a failure, by bisection between `passing` and `failing`, and the failure's
+    cause.
 
-    `failure` returns the cause at a value, "" if it passes; `cause` belongs to `failing`.
+    `failure` returns the cause at a value, "" if it passes; `cause` belongs to `failing`. Bisection ends at `tolerance`
+    or after BISECTIONS halvings.
     """
     for _ in range(BISECTIONS):
         if abs(failing - passing) <= tolerance:
@@ -219,8 +221,8 @@ def _check_search(runner: CaseRunner, figure: str) -> None:
 def _height(case: CaseResult, figure: str) -> float:
     """Return the value that a search maximises: the case's `figure`, or its ratio if `figure` is empty.
 
-    It is TRIP_RATIO for a rig that tripped, whatever the figure, and where the value is not finite; 0 for a refused
-    rig, which never ran.
+    The value is TRIP_RATIO for a rig that tripped, whatever the figure, and in place of a value that is not finite; 0
+    for a refused rig, which never ran.
     """
     if case.refusal:
         return 0.0

@@ -33,8 +33,8 @@ class SensitivityIndex(NamedTuple):
 def sensitivity_indices(figure: Real, keys: Sequence[str]) -> Mapping[str, SensitivityIndex]:
     """Return the indices of each key for a figure of the rigs of the design, (rigs,) in their order.
 
-    The first 2ᵐ whole blocks count. Indices are NaN where these have a figure that is not finite, or no variance, and
-    for less than two blocks.
+    The first 2ᵐ whole blocks count, with the largest possible m. All indices are NaN if a figure in these blocks
+    is not finite, if the figures of the rows of A and B are all equal, and for less than two blocks.
     """
     from scipy.stats import sobol_indices
 

@@ -66,7 +66,7 @@ def arrow() -> ModuleType:
 def crashed_case(rig: int, values: Mapping[str, object]) -> CaseResult:
     """Return the result of a rig whose worker died each time it ran the rig.
 
-    It has no figures and no trips, `missed` is (CRASHED,), and the ratio infinite.
+    The result has no figures and no trips, `missed` is (CRASHED,), and the ratio infinite.
     """
     return CaseResult(rig, values, {}, {}, (CRASHED,), float("inf"))
 
@@ -117,7 +117,8 @@ class Store:
     def _check_manifest(self, manifest: Manifest) -> None:
         """Write the manifest to a folder without one.
 
-        Raises ConfigError if the folder has another one, InputFileError if that cannot be read, OutputError.
+        Raises ConfigError if the folder has another manifest, InputFileError if that manifest cannot be read, and
+        OutputError if the new one cannot be written.
         """
         path = self.folder / MANIFEST
         if not path.exists():
@@ -128,8 +129,7 @@ class Store:
                 str(self.folder),
                 [
                     f"the folder has results of campaign {stored['campaign']!r}, which differs from this one in "
-                    f"{different}; "
-                    "choose another folder with --out"
+                    f"{different} (digest: SHA-256 of all settings); choose another folder with --out"
                 ],
             )
 
@@ -248,7 +248,7 @@ def _manifest(campaign: Campaign) -> Manifest:
 def read_manifest(folder: Path) -> Manifest:
     """Return the manifest of a campaign's folder, with _MANIFEST_KEYS at least.
 
-    Raises InputFileError where there is none that can be read.
+    Raises InputFileError if the manifest is missing, cannot be read or lacks one of these keys.
     """
     path = folder / MANIFEST
     try:
@@ -267,9 +267,10 @@ def read_manifest(folder: Path) -> Manifest:
 
 
 def read_tables(folder: Path) -> Iterator[pa.Table]:
-    """Yield the tables of a campaign's folder, by the number of the first rig.
+    """Yield the table of each file of results in a campaign's folder, sorted by the file's first rig.
 
-    Raises InputFileError for a folder without results and for a damaged file, MissingExtra without pyarrow.
+    Raises InputFileError for a folder without a manifest or results and for a damaged file, MissingExtra without
+    pyarrow.
     """
     library = arrow()
     read_manifest(folder)

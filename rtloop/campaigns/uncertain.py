@@ -31,7 +31,7 @@ class UncertainOptions(Options):
 
     @model_validator(mode="after")
     def _check(self) -> Self:
-        """Require one distribution, and intervals that are not empty."""
+        """Return the options; ValueError unless exactly one distribution is set, with numbers that it allows."""
         present = [kind for kind in KINDS if getattr(self, kind) is not None]
         if len(present) != 1:
             raise ValueError(f"{', '.join(present) or 'no distribution'}; allowed: exactly one of {', '.join(KINDS)}")
@@ -55,9 +55,10 @@ class UncertainOptions(Options):
         return not any(isinstance(value, bool | str) for value in self.choice or ())
 
     def quantile(self, share: float) -> Any:
-        """Return the value below which `share`, in (0, 1), of all draws lie; the entry of `choice` at that share.
+        """Return the value below which `share`, in (0, 1), of all draws lie; for `choice`, the entry at that share.
 
-        A relative value is the factor alone. Raises ValueError for `limits` that `normal` does not reach.
+        With `relative`, the value is the factor alone. Raises ValueError if `normal` has practically no values between
+        `limits`.
         """
         if self.uniform is not None:
             low, high = self.uniform
@@ -73,7 +74,7 @@ class UncertainOptions(Options):
     def _normal_quantile(self, mean: float, deviation: float, share: float) -> float:
         """Return the quantile of a normal distribution, cut off beyond `limits` unless these are None.
 
-        Raises ValueError if it does not reach them.
+        Raises ValueError if the distribution has practically no values between them.
         """
         from statistics import NormalDist
 

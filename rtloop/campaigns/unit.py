@@ -57,7 +57,7 @@ class WorkerFacts:
 def split_into_units(campaign: Campaign, rate_hz: float) -> list[Unit]:
     """Return the units of a campaign: the nominal rig alone, then `unit_rigs` rigs each.
 
-    Without that option, they have as many rigs as take about UNIT_S, at most MAX_RIGS. Their size depends on the
+    Without that option, they have as many rigs as take about UNIT_S, 1 to MAX_RIGS. Their size depends on the
     campaign's file and on `rate_hz` alone: further rigs leave full units as they are.
     """
     experiments = campaign.options.experiment
@@ -106,6 +106,7 @@ class _Hashed:
     """A campaign that is hashed and compared by its digest and its number of rigs."""
 
     def __init__(self, digest: str, campaign: Campaign) -> None:
+        """Store the campaign and its key: `digest` and its number of rigs."""
         self.key, self.campaign = (digest, campaign.options.rigs), campaign
 
     def __hash__(self) -> int:
@@ -119,7 +120,7 @@ class _Hashed:
 
 @lru_cache(RUNNERS_KEPT)
 def _runner(hashed: _Hashed) -> CaseRunner:
-    """Return the runner of a campaign, made at the first unit of it in this process; RUNNERS_KEPT are cached.
+    """Return the runner of a campaign; the RUNNERS_KEPT runners of this process that were used last are cached.
 
     Raises ConfigError for a campaign that cannot run here.
     """

@@ -106,9 +106,9 @@ class ProcessWorkers:
 
 
 def _follow_coordinator() -> None:
-    """Leave Ctrl-C to the coordinator, which ends the workers after their functions, and end when it is killed.
+    """Prepare this worker: ignore Ctrl-C, end when the coordinator has died, keep the memory of one rig for the next.
 
-    Also keep the memory of one rig for the next one.
+    After Ctrl-C, the coordinator ends its workers once their functions have ended.
     """
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     keep_freed_memory()
@@ -194,7 +194,7 @@ class DaskWorkers:
     def explain(self, error: BaseException) -> BaseException:
         """Return WorkerDied where a function killed its workers, UnavailableError where the scheduler is gone.
 
-        Signs of the latter are a cancelled function and a closed connection. Returns any other error itself.
+        A cancelled function or a closed connection means that the scheduler is gone. Returns any other error itself.
         """
         from concurrent.futures import CancelledError
 

@@ -4,8 +4,8 @@
                   ├── panel: `rtloop panel`
                   └── the service, in this process, with loop and recorder as its children
 
-The service parks on the board before the board ends. Both other processes end with their stdin, also if this process is
-killed. Configuration and recordings lie in a temporary folder, the board's memory in another.
+The service parks on the board before the board ends. Both other processes end when their stdin closes, also if this
+process is killed. Configuration and recordings lie in a temporary folder, the board's memory in another.
 """
 
 from __future__ import annotations
@@ -33,8 +33,8 @@ EXIT_TIMEOUT_S, POLL_S = 5.0, 0.2
 def demonstrate(port: int, announce: Callable[[str], None]) -> int:
     """Run board, service and panel until SIGINT or SIGTERM, then remove all their files. Returns the exit code.
 
-    `port` is the panel's, 0 for any free one; `announce` receives a line of text. Signal handlers of the process are
-    replaced. Raises RtloopError and DriverError as the service does.
+    `port` is the panel's, 0 for any free one; `announce` receives each line for the user. Signal handlers of the
+    process are replaced. Raises RtloopError and DriverError as the service does.
     """
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
@@ -59,7 +59,9 @@ def demonstrate(port: int, announce: Callable[[str], None]) -> int:
 
 
 def demonstration_text(memory: Path, recordings: Path) -> str:
-    """Return the configuration: the example board.toml with other paths, and with outputs that wait to be armed."""
+    """Return the configuration: the example board.toml with the board's file `memory`, the folder `recordings` and
+    outputs that wait to be armed.
+    """
     text = read_example("board.toml").replace('"/dev/shm/rtloop-board"', f'"{memory}"')
     return text.replace('"recordings"', f'"{recordings}"').replace("[service]\n", "[service]\narm = true\n")
 
@@ -86,7 +88,7 @@ def _configuration_file() -> Iterator[Path]:
 
 @contextlib.contextmanager
 def _board_process(config: Path) -> Iterator[None]:
-    """Run the board of a configuration during the block, from its first sample on. It ends when its stdin is closed.
+    """Run the board of a configuration during the block, from its first sample on; a closed stdin ends the board.
 
     Raises UnavailableError if it does not start.
     """
@@ -109,7 +111,7 @@ def _board_process(config: Path) -> Iterator[None]:
 
 
 def _wait_until_ready(notifications: socket.socket, process: subprocess.Popen[bytes]) -> None:
-    """Wait for the first message of a process, as long as it runs. Raises UnavailableError if it ends without one."""
+    """Wait for the first message on `notifications`. Raises UnavailableError if the process ends before a message."""
     while process.poll() is None:
         with contextlib.suppress(TimeoutError):
             notifications.recv(64)

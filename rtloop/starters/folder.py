@@ -43,7 +43,7 @@ def paper() -> Starter:
 def stage(figures: StageFigures) -> Starter:
     """Return files and first commands: a simulated stage with its controller, its two excitations, a specification.
 
-    The ranges of `figures` are checked already: StageFigures raises ValueError.
+    The constructor of StageFigures has checked the ranges of `figures`.
     """
     texts = stage_files(figures)
     excitations = [_first_command(texts[name]) for name in ("stage-sine.toml", "stage-step.toml")]
@@ -52,7 +52,8 @@ def stage(figures: StageFigures) -> Starter:
         "rtloop run stage.toml --duration 2",
         *excitations,
         "rtloop design auto sine/*.mcap step/*.mcap --specs stage-spec.toml --out designed.toml",
-        "rtloop design auto sine/*.mcap step/*.mcap --specs stage-spec.toml --robust --out robust.toml  # integrates",
+        "rtloop design auto sine/*.mcap step/*.mcap --specs stage-spec.toml --robust --out robust.toml"
+        "  # with integral action",
         "rtloop run designed.toml --duration 2",
     )
     return Starter(texts, commands)
@@ -80,10 +81,10 @@ def driver(kind: str) -> Starter:
 
 
 def write_starter(starter: Starter, folder: Path) -> list[Path]:
-    """Write all files of a starter to `folder`, which is created, and SCHEMA unless it is there. Returns new paths.
+    """Write all files of a starter to `folder`, which is created, and the schema SCHEMA unless this file exists.
 
-    Raises OutputError where another file exists already (none is written then), or if the system refuses (some may be
-    written then).
+    Returns the paths of the written files. Raises OutputError where a file of the starter exists already (none is
+    written then), or if the system refuses (some may be written then).
     """
     from rtloop.configuration.schema import schema_text
 
@@ -104,6 +105,6 @@ def _first_command(text: str) -> str:
 
 
 def _add_schema_line(name: str, text: str) -> str:
-    """Return the text of a configuration below SCHEMA_LINE, or below its own such line; any other text unchanged."""
+    """Return `text` with SCHEMA_LINE before it if it is a configuration without a schema line, else unchanged."""
     is_configuration = name.endswith(".toml") and "\n[loop]\n" in text and not text.startswith("#:schema")
     return SCHEMA_LINE + text if is_configuration else text

@@ -34,8 +34,8 @@ def class_name(name: str) -> str:
 def _stage_text(name: str, stage: Configuration) -> str:
     """Return the text of `stage` with the law of NAME.py as controller of the first axis, and without its pre-filter.
 
-    The law gets those of the keys kp and ki_per_s that the axis's controller has, if that is the shipped PI controller.
-    A missing ki_per_s becomes SLOW_KI_PER_S; a missing kp is left to the law's default.
+    The law gets the keys kp and ki_per_s of the axis's controller if that is the shipped controller "pid". A missing
+    ki_per_s becomes SLOW_KI_PER_S; a missing kp is left to the law's default.
     """
     from rtloop.design.stale_comments import remove_first_comments
     from rtloop.design.toml_text import edit_text

@@ -48,7 +48,7 @@ def stage_actuator(figures: StageFigures) -> Actuator:
 
 
 def _values(figures: StageFigures) -> dict[str, object]:
-    """Return the values of all templates by name: numbers, or texts as they stand in TOML."""
+    """Return the values of the names in all templates: numbers, or texts as they stand in TOML."""
     actuator = stage_actuator(figures)
     um_per_v = figures.sensor_um_per_v or figures.range_um / TRAVEL_V
     noise_um, resolution_um = _sensor_um(figures)
@@ -101,7 +101,8 @@ def _loop_numbers(figures: StageFigures, actuator: Actuator) -> dict[str, float]
 
 
 def _sensor_min_line(sensor_min_v: float | None, noise_v: float) -> str:
-    """Return the line of TOML with the interlock against a low reading; "" if `sensor_min_v`, the lowest one, is None.
+    """Return the line of TOML with the interlock against a low reading; "" if the lowest reading `sensor_min_v` is
+    None.
 
     The interlock lies SENSOR_MARGIN_V above `sensor_min_v`, or lower: always below the noise at rest, about 0 V, whose
     rms is `noise_v`.
@@ -109,7 +110,7 @@ def _sensor_min_line(sensor_min_v: float | None, noise_v: float) -> str:
     if sensor_min_v is None:
         return ""
     interlock_v = min(sensor_min_v + SENSOR_MARGIN_V, -max(SENSOR_MARGIN_V, NOISE_DEVIATIONS * noise_v))
-    return f"sensor_min_v = {_number(interlock_v)}           # the sensor reads from {sensor_min_v:g} V on\n"
+    return f"sensor_min_v = {_number(interlock_v)}           # the sensor's lowest reading is {sensor_min_v:g} V\n"
 
 
 def _travel_numbers(range_um: float, reach_um: float, remanence_um: float) -> dict[str, float]:
@@ -130,7 +131,7 @@ def _travel_numbers(range_um: float, reach_um: float, remanence_um: float) -> di
 def _levels_um(actuator: Actuator, position_um: float) -> list[float]:
     """Return the reference's four levels in µm: upper, middle, lower and again the middle one.
 
-    They are the middle of the reachable travel, and a quarter of this travel to each side, rounded to about three
+    The levels are the middle of the reachable travel, and a quarter of this travel to each side, rounded to about three
     digits of the travel. The position interlock, ±`position_um`, limits the reachable travel.
     """
     top_um = min(actuator.rise_um(actuator.highest_v), position_um)
@@ -153,8 +154,8 @@ def _headline(figures: StageFigures, actuator: Actuator) -> str:
 
 
 def _rate_hz(figures: StageFigures) -> float:
-    """Return the rate of `figures`; None there: the lowest of RATES_HZ with SAMPLES_PER_PERIOD samples in a period of
-    the resonance. StageFigures bounds the resonance, so that there is one.
+    """Return the rate of `figures`; if it is None, the lowest of RATES_HZ with SAMPLES_PER_PERIOD samples in a period
+    of the resonance. StageFigures bounds the resonance, so that such a rate exists.
     """
     least_hz = SAMPLES_PER_PERIOD * figures.resonance_hz
     return figures.rate_hz or next(rate_hz for rate_hz in RATES_HZ if rate_hz >= least_hz)

@@ -29,11 +29,11 @@ class Actuator:
     weights_um_per_v: tuple[float, ...]
 
     def rise_um(self, drive_v: float) -> float:
-        """Return the position at a drive ≥ 0 that is reached from rest."""
+        """Return the position, µm, at a drive of `drive_v` ≥ 0 that is reached from rest."""
         return _travel_um(self.weights_um_per_v, self.thresholds_v, drive_v)
 
     def fall_um(self, change_v: float) -> float:
-        """Return the distance by which the position falls, as the drive falls from `highest_v` by `change_v`.
+        """Return the distance, µm, by which the position falls while the drive falls from `highest_v` by `change_v`.
 
         `change_v` is at most twice `highest_v`: no play with a threshold above `highest_v` moves.
         """
@@ -41,12 +41,12 @@ class Actuator:
 
     @property
     def _turns_v(self) -> list[float]:
-        """Fall of the drive from `highest_v` at which each play begins to fall."""
+        """Fall of the drive, V, from `highest_v` after which each play operator begins to fall."""
         return [2 * threshold for threshold in self.thresholds_v]
 
     @property
     def lowest_um(self) -> float:
-        """Position at `lowest_v`, reached from `highest_v`: the lower end of the major loop."""
+        """Position in µm at `lowest_v`, reached from `highest_v`: the lower end of the major loop."""
         return self.rise_um(self.highest_v) - self.fall_um(self.highest_v - self.lowest_v)
 
     @property
@@ -61,8 +61,8 @@ class Actuator:
         """Return the lowest (≤ 0) and the highest (≥ 0) drive in V between which a slow motion from rest stays within
         ±`limit_um`.
 
-        Both lie within the actuator's range of drives. The motion begins upwards. It is assumed to go to the highest
-        drive before it goes to the lowest.
+        Both lie within the actuator's range of drives. The motion begins upwards, and is
+        assumed to reach the highest drive before the lowest.
         """
         highest_v = _largest(self.rise_um, self.thresholds_v, limit_um, self.highest_v)
         part = Actuator(self.lowest_v, highest_v, self.thresholds_v, self.weights_um_per_v)

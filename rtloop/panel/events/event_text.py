@@ -37,7 +37,8 @@ class RunState:
     def describe_change(self, event: Event) -> str:
         """Return the text of the run's next event, and store its reference or mode for the next change.
 
-        The text is such as `0 µm → 12.5 µm` or `closed loop → off`; without a known old value, as by `event_text`.
+        A change of reference or mode reads `0 µm → 12.5 µm` or `closed loop → off`. If the old value is unknown or the
+        mode is the same, and for every other event, the text is the result of `event_text`.
         """
         kind, text = event["kind"], event_text(event, unit=" V" if self._mode == RAW else UM)
         if kind == "set_reference":
@@ -77,7 +78,7 @@ def _started_reference(values: Sequence[float | None], text: str) -> PlayedRefer
 def reference_text(reference: dict[str, Any]) -> str:
     """Return the text of a configuration's table [axis.reference], with values in µm.
 
-    Empty for other kinds than hold, sine and triangle; a missing kind is hold, a missing value 0.
+    The text is "" for other kinds than hold, sine and triangle; a missing kind is hold, a missing value 0.
     """
     match reference.get("kind", "hold"):
         case "hold":
@@ -91,7 +92,8 @@ def reference_text(reference: dict[str, Any]) -> str:
 def event_text(event: Event, unit: str = "") -> str:
     """Return the text of an event of `event_from_message` or `LateEpisodes`.
 
-    Empty for a kind that needs no text, such as a reset. `unit`, such as " µm", follows each value of a reference.
+    The text is "" for a kind that needs no text, such as a reset. `unit`, such as " µm", follows each value of a
+    reference that is a position, or in mode raw a drive.
     """
     details = event["what"]
     match event["kind"]:
@@ -113,7 +115,8 @@ def event_text(event: Event, unit: str = "") -> str:
 def _generator_text(values: list[float], unit: str) -> str:
     """Return the text of a generator, "" for an unknown one.
 
-    `values` are its kind and at least four parameters; `unit` follows those that are positions, or drives in mode raw.
+    `values` are the generator's kind and at least four parameters; `unit` follows each one that is a position, or in
+    mode raw a drive.
     """
     kind, first, second, third, fourth, *_ = values
     match kind:

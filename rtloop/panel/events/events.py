@@ -49,6 +49,7 @@ class Events:
     """
 
     def __init__(self, service: Service) -> None:
+        """Begin with an empty list; `service` names the operators of commands."""
         self._service = service
         self._rows: deque[EventRow] = deque(maxlen=MAX_ROWS)
         self._late_row: tuple[EventRow, LateEpisodes] | None = None
@@ -72,8 +73,8 @@ class Events:
     def append(self, messages: npt.NDArray[np.void], loop: Description, run: int) -> None:
         """Add messages (n,) of MESSAGE, n ≥ 0, of the run `run` of a loop as rows, at most the last MAX_ROWS of them.
 
-        Messages about late ticks may extend a row. The service is asked for the operators, for QUERY_TIMEOUT_S at most
-        each, up to the first question that it does not answer; the rows without answer get theirs at a later call.
+        Messages about late ticks may extend a row. Requests the operator of each command from the service, waiting at
+        most QUERY_TIMEOUT_S each, up to the first request without a response; a later call completes the other rows.
         """
         is_answering = self._complete_pending()
         if run != self._run:
@@ -97,9 +98,9 @@ class Events:
                 self._pending_rows.append((self._rows[-1], identity))
 
     def _complete_pending(self) -> bool:
-        """Ask the service for operators and changes of the pending rows, oldest first, and add them to the rows.
+        """Request operators and changes of the pending rows from the service, oldest first, and add them to the rows.
 
-        Returns False at the first question that it does not answer; True also without pending rows.
+        Returns False at the first request without a response, else True, also without pending rows.
         """
         while self._pending_rows:
             row, identity = self._pending_rows[0]
@@ -114,9 +115,9 @@ class Events:
         return True
 
     def events_after(self, number: int) -> list[tuple[int, Event]]:
-        """Return (number, event) of the newest version of each row whose number is above `number`, in the list's order.
+        """Return (number, event) of the newest version of each row whose number is above `number`, oldest row first.
 
-        A changed row keeps its place, so that the numbers need not ascend.
+        A changed row keeps its place in this order and gets a new number, so that the numbers need not ascend.
         """
         with self._lock:
             return [(row.number, row.event) for row in self._rows if row.number > number]
@@ -152,8 +153,9 @@ class Events:
         return self._late_row if event["kind"] == LATE_END_KIND or self._late_row[0] is self._rows[-1] else None
 
     def _query_operator(self, identity: int) -> OperatorAnswer:
-        """Ask the service about the command with this identity; None in both fields if it does not know it or refuses.
+        """Return the service's response about the command `identity`; None in both fields for an unknown command.
 
+        Both are None also if the service refuses.
         Raises UnavailableError without an answer within QUERY_TIMEOUT_S, HostRefusal for a server that is not trusted.
         """
         status, _, data = self._service.client.exchange("GET", f"/asked_by?identity={identity}", None, QUERY_TIMEOUT_S)

@@ -28,6 +28,7 @@ class LateEpisodes:
     """
 
     def __init__(self, first: Event, rate_hz: float) -> None:
+        """Begin with the first episode, of which `first` reports the first tick; `rate_hz` is the loop's rate."""
         self._first_event, self._rate_hz = first, rate_hz
         self._ended = Episode()
         """Sum of all episodes before the last."""
@@ -36,7 +37,9 @@ class LateEpisodes:
         self.add(first)
 
     def add(self, event: Event) -> None:
-        """Add the event of an episode's first tick, or the last episode's final counts, which replace that tick's."""
+        """Add an event: the first tick of a new episode, or the final counts of the last episode, which replace its
+        earlier counts.
+        """
         details = event["what"]
         if event["kind"] == LATE_END_KIND:
             self._last = Episode(*(int(details[name] or 0) for name in Episode._fields))

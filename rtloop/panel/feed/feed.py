@@ -41,7 +41,7 @@ class Follower(Protocol):
         ...
 
     def end_run(self, past: TickHistory) -> None:
-        """End the run, before `past`, which has its last ticks, holds another run."""
+        """End the run; `past` holds the last ticks of this run during the call, and of another run later."""
         ...
 
 
@@ -49,6 +49,7 @@ class Feed:
     """Reads ticks in a thread and hands them to the viewers; `lock` guards viewers, `past` and `timing`."""
 
     def __init__(self, service: Service) -> None:
+        """Prepare the thread that reads the loop of `service`; `start` starts the thread."""
         self._service = service
         self.lock = threading.Lock()
         self.loop: Description | None = None
@@ -87,12 +88,12 @@ class Feed:
 
     @property
     def lost_ticks(self) -> int:
-        """Number of ticks that the loop overwrote before they were read, in all runs."""
+        """Number of ticks that the loop overwrote before this feed read them, in all runs."""
         return 0 if self._reader is None else self._reader.lost_ticks
 
     @property
     def age_s(self) -> float | None:
-        """Time since the newest tick arrived, s; None until a tick comes after those in the ring at the start."""
+        """Time since the newest tick was read, s; None until the loop adds a tick after the feed's first read."""
         return None if self._newest_tick_s is None else time.monotonic() - self._newest_tick_s
 
     def add_viewer(self, viewer: Follower) -> None:
@@ -103,7 +104,7 @@ class Feed:
                 viewer.begin(self.loop)
 
     def remove_viewer(self, viewer: Follower) -> None:
-        """Hand no more ticks to a viewer that `add_viewer` added; ValueError for any other."""
+        """Hand no more ticks to a viewer that `add_viewer` added. Raises ValueError for any other viewer."""
         with self.lock:
             self._viewers.remove(viewer)
 

@@ -17,6 +17,7 @@ class History:
     """
 
     def __init__(self, signals: Sequence[str], ticks: int) -> None:
+        """Begin without ticks, with room for the last `ticks` ticks. Raises ValueError for less than one tick."""
         if ticks < 1:
             raise ValueError(f"history: {ticks} ticks; allowed: at least 1")
         self.signals = tuple(signals)

@@ -13,7 +13,7 @@ MODE = "mode"
 
 
 def find_axis(signal: str, axes: Iterable[str]) -> str | None:
-    """Return the longest axis name that, with an underscore behind it, begins the signal's name; None without one."""
+    """Return the longest name in `axes` that begins the signal's name and precedes an underscore; None without one."""
     return max((axis for axis in axes if signal.startswith(f"{axis}_")), key=len, default=None)
 
 
@@ -36,10 +36,11 @@ class RestDetector:
     """Detector of whether an axis has been at rest in all ticks since `reset`."""
 
     def __init__(self) -> None:
+        """Begin without ticks: the axis counts as at rest."""
         self.reset()
 
     def reset(self) -> None:
-        """Discard all ticks; until the next ones the axis counts as at rest."""
+        """Discard all ticks; until the next ticks the axis counts as at rest."""
         self.at_rest = True
         self._last: Real = np.zeros((2, 0))
         """Reference and mode of the newest tick, (2, 1); (2, 0) before the first."""
@@ -47,7 +48,7 @@ class RestDetector:
     def feed(self, reference: Real, mode: Real) -> None:
         """Take reference and mode, each (n,), NaN for lost ticks, of the next ticks.
 
-        Sets `at_rest` to False, until `reset`, unless both stand still or the mode is off.
+        Sets `at_rest` to False, until `reset`, unless both are constant from the tick before on or the mode is off.
         """
         samples = np.hstack([self._last, [reference, mode]])
         self.at_rest = self.at_rest and is_at_rest(*samples)

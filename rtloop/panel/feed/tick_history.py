@@ -33,7 +33,7 @@ class Points(NamedTuple):
 def history_ticks(columns: int, rate_hz: float) -> int:
     """Return the number of ticks to keep for a loop of `columns` signals: a multiple of BLOCK, at least one BLOCK.
 
-    They last for LONGEST_S + SPARE_S, or are as many as MAX_BYTES hold, if these are fewer.
+    The ticks last for LONGEST_S + SPARE_S, or are as many as MAX_BYTES hold if these are fewer.
     """
     memory_ticks = int(MAX_BYTES / (columns * 8 * (1 + 2 / BLOCK)))
     return BLOCK * max(min(memory_ticks, int((LONGEST_S + SPARE_S) * rate_hz)) // BLOCK, 1)
@@ -48,6 +48,7 @@ class TickHistory:
     """The last `ticks` ticks, a multiple of BLOCK, of the signals of one run, and the extremes of their blocks."""
 
     def __init__(self, signals: Sequence[str], ticks: int) -> None:
+        """Begin without ticks, with room for the last `ticks` ticks, a multiple of BLOCK."""
         self.history = History(signals, ticks)
         self._blocks = ticks // BLOCK
         self._low, self._high = np.full((2, len(signals), self._blocks), np.nan)
@@ -66,7 +67,7 @@ class TickHistory:
     def begin(self) -> int:
         """Number of the oldest tick that the history can still hold: `end` less its capacity, at least 0.
 
-        Ticks from there on that were lost, or came before the first append, are NaN.
+        Ticks from `begin` on that were lost, or came before the first append, are NaN.
         """
         return max(self.end - self._blocks * BLOCK, 0)
 
@@ -94,8 +95,8 @@ class TickHistory:
     def points(self, signals: Sequence[str], first: int, end: int, pixels: int) -> Points:
         """Return the extremes of ticks `first` … `end` − 1 for `pixels` pixels; NaN for lost, too old and future ticks.
 
-        With many ticks for each pixel, points begin at multiples of BLOCK, the first at or before `first`. Raises
-        ValueError for an unknown signal.
+        With FINEST_BLOCKS blocks or more for each pixel, points are whole blocks: the first may begin before `first`,
+        and the last may end after `end`. Raises ValueError for an unknown signal.
         """
         rows = self._rows(signals)
         if end - first < FINEST_BLOCKS * BLOCK * pixels:

@@ -37,6 +37,7 @@ class TimingSecond:
     """
 
     def __init__(self, number: int) -> None:
+        """Begin second `number` of the run without ticks: all figures are 0."""
         self.number = number
         self.late, self.executed = np.zeros((2, EDGES_US.size - 1))
         self.worst_us = self.missed = self.beyond = 0.0
@@ -46,6 +47,7 @@ class Timing:
     """Figures of the last minute of one run."""
 
     def __init__(self, loop: Description) -> None:
+        """Begin a run of the described loop, without ticks."""
         self._period_us = 1e6 / loop.rate_hz
         self._seconds: deque[TimingSecond] = deque(maxlen=WINDOW_S)
         self._batch = Batch(loop.rate_hz)
@@ -73,7 +75,7 @@ class Timing:
     def frame(self) -> bytes:
         """Return the binary message "timing" with the figures of the last minute, up to the newest tick.
 
-        Header: `window_s` (number of seconds with ticks), `ticks` (those with a lateness), `periods_missed`;
+        Header: `window_s` (number of seconds with ticks), `ticks` (number with a lateness), `periods_missed`;
         `worst_us`, `p50_us` and `p99_us` of the lateness; `exec_p50_us` and `exec_p99_us` of the execution time;
         `advice`, a list of warnings. Quantiles are None and `worst_us` is 0 if no tick has a measured time, as in
         virtual time. Arrays: `counts` (bins,), the histogram of the lateness, over `edges_us` (bins + 1,).
@@ -114,14 +116,16 @@ class Timing:
         return self._seconds[-1]
 
     def _advice(self, seconds: list[TimingSecond], lateness: Real, worst_us: float, missed: int) -> list[str]:
-        """Return warnings about the host, by the limits of `rtloop doctor`; [] if there are none.
+        """Return warnings about late ticks and growing lateness, then a hint at `rtloop doctor`; [] without a warning.
 
         `lateness` is the histogram (bins,) of all ticks of `seconds`, `worst_us` their largest lateness, `missed` their
         number of missed periods.
         """
         ticks, advice, beyond = lateness.sum(), [], sum(second.beyond for second in seconds)
         if ticks and beyond / ticks >= LATE_SHARE:
-            advice.append(f"{100 * beyond / ticks:.2f} % of the ticks were late by more than a period")
+            advice.append(
+                f"{100 * beyond / ticks:.2f} % of the ticks of the last minute were late by more than a period"
+            )
         elif worst_us > self._period_us:
             advice.append(f"a tick was {worst_us:.0f} µs late, and {missed} periods were missed")
         recent_us = quantile_us(_sum(second.late for second in seconds[-RECENT_S:]), 0.99) or 0.0
@@ -138,7 +142,7 @@ class Timing:
 def quantile_us(counts: Real, fraction: float) -> float | None:
     """Return the quantile `fraction` (0 … 1), in µs, of a histogram `counts` (bins,) over EDGES_US.
 
-    It is linear within a bin; None if all counts are 0, as in virtual time.
+    The quantile is interpolated linearly within a bin; None if all counts are 0, as in virtual time.
     """
     cumulative = np.concatenate([[0.0], np.cumsum(counts)])
     return float(np.interp(fraction * cumulative[-1], cumulative, EDGES_US)) if cumulative[-1] else None

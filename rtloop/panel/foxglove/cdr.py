@@ -44,7 +44,7 @@ def event_schema() -> str:
 def event_message(stamp_ns: int, tick: int, *texts: str) -> bytes:
     """Return the CDR message of an event; `stamp_ns` is a UNIX time.
 
-    `texts` are the values of EVENT_TEXTS in order; characters NUL in them are left out.
+    `texts` are the values of the fields EVENT_TEXTS, in this order; characters NUL in them are left out.
     """
     message = struct.pack("<iIQ", *divmod(stamp_ns, NS_PER_S), tick)
     for text in texts:

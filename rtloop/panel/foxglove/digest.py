@@ -34,6 +34,7 @@ class Digest:
     """
 
     def __init__(self) -> None:
+        """Begin without signals and without ticks, before the first loop."""
         self.names: tuple[str, ...] = ()
         self.generation = 0
         self._columns: list[int] = []

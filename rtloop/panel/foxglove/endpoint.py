@@ -94,6 +94,7 @@ class _Viewer:
     """Connection of one viewer: its subscriptions, and the number of the newest event that it received."""
 
     def __init__(self, socket: WebSocket, feed: Feed, name: str) -> None:
+        """Begin without subscriptions; earlier events than the connection are not sent. `name` is the server's name."""
         self._socket, self._feed, self._name = socket, feed, name
         self._digest = Digest()
         self._live: Channel | None = None
@@ -118,7 +119,9 @@ class _Viewer:
             self._feed.remove_viewer(self._digest)
 
     async def _listen(self) -> None:
-        """Carry out the viewer's messages, one each 1/REQUESTS_PER_S, until it disconnects; report invalid ones to it.
+        """Carry out the viewer's messages, at most REQUESTS_PER_S a second, until it disconnects.
+
+        An invalid message is reported to the viewer.
 
         Messages that come faster wait unread.
         """

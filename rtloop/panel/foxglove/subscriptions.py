@@ -21,6 +21,7 @@ class Subscriptions:
     """Subscriptions of one viewer to the advertised channels, `channel_ids`."""
 
     def __init__(self) -> None:
+        """Begin without advertised channels and without subscriptions."""
         self.channel_ids: set[int] = set()
         self._channels: dict[int, int] = {}
         """Channel by the number of the subscription."""

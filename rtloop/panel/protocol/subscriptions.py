@@ -77,7 +77,7 @@ FIELD_TYPES: dict[str, TypeAdapter[Any]] = {
 def read_message(text: str) -> dict[str, object]:
     """Return the fields of a JSON message by name, not yet validated.
 
-    Raises ValueError unless it is a JSON object without NaN and infinity.
+    Raises ValueError for a text that is no JSON object, and for NaN or infinity in it.
     """
     fields = from_json(text, allow_inf_nan=False)
     if not isinstance(fields, dict):

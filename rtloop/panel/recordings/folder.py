@@ -43,17 +43,19 @@ class RecordingFolder:
     """The recordings in `folder`."""
 
     def __init__(self, folder: Path) -> None:
+        """Store the folder, which need not exist; no file is read yet."""
         self.folder = folder
         self._summaries: dict[RecordingFile, Mapping[str, object]] = {}
         self._lock = threading.Lock()
 
     def listing(self) -> list[dict[str, object]]:
-        """Return a dictionary for each of the last MAX_LISTED recordings, the newest first.
+        """Return a dictionary for each of the newest MAX_LISTED recordings, the newest first.
 
-        Keys: file (`shown_name`), bytes (size), captured (whether a capture made it), complete, ticks and trips
-        (numbers), duration_s, created_unix_s, begins_unix_s (time of the first tick), cut ({first, end, files} that a
-        cut was made for, else None), around (whether only ticks around events are in it). A value is None if it is
-        unknown, or not read yet: a call reads new files for BUDGET_S, the others wait for a later call.
+        Keys: file (`shown_name`), bytes (size), captured (whether a capture made it), complete (whether its end is
+        recorded and no tick of it is lost), ticks and trips (numbers), duration_s, created_unix_s, begins_unix_s (time
+        of the first tick), cut ({first, end, files}: ticks and files from which a cut was made, else None), around
+        (whether only ticks around events are in it). A value is None if it is unknown, or not read yet: a call reads
+        new files for BUDGET_S, the other files wait for a later call.
         """
         with self._lock:
             files = sorted(self._recording_files(), key=lambda file: file.modified_ns, reverse=True)[:MAX_LISTED]
@@ -104,7 +106,7 @@ class RecordingFolder:
 def _summary(path: Path, size: int) -> Mapping[str, object]:
     """Return the values of UNKNOWN_SUMMARY's keys, as `RecordingFolder.listing` describes them, from a recording.
 
-    All are None if it is unreadable; `trips` is None for a `size` (bytes) above MAX_COUNTED_BYTES.
+    All values are None if the recording is unreadable; `trips` is None for a `size` (bytes) above MAX_COUNTED_BYTES.
     """
     try:
         with Reader(path, tolerant=True, opener=open_without_link) as reader:

@@ -25,6 +25,7 @@ class ProcessFailed(RtloopError):
     """
 
     def __init__(self, error: str, code: int | None = None) -> None:
+        """Store the message and the exit code that the process reported."""
         super().__init__(error)
         self.code = code
 
@@ -38,6 +39,7 @@ class ProcessRunner:
     def __init__(
         self, max_running: int = MAX_RUNNING, max_unfinished: int = MAX_PENDING, timeout_s: float = TIMEOUT_S
     ) -> None:
+        """Store the limits; no process runs yet."""
         self._slots = asyncio.Semaphore(max_running)
         self._max_unfinished, self._timeout_s = max_unfinished, timeout_s
         self._pending = 0

@@ -50,6 +50,7 @@ class Service:
     """Access to the service whose control socket is at `path`; the service may be stopped or start later."""
 
     def __init__(self, path: Path) -> None:
+        """Make the client of the control socket at `path`; no description is cached yet."""
         self.client = Client(path)
         self._cached: tuple[float, Description] | None = None
 

@@ -20,6 +20,7 @@ class StateListener:
     """Receives `/watch` in a thread, and connects again when the connection ends."""
 
     def __init__(self, client: Client) -> None:
+        """Prepare the thread that receives states through `client`; `start` starts the thread."""
         self._client = client
         self._status: dict[str, object] = {}
         self._heard_s = float("-inf")

@@ -1,4 +1,4 @@
-"""Samples on an even grid of time, as a spectrum needs them: short holes are bridged, long ones split the record.
+"""Samples on an even grid of time, as a spectrum needs them: short holes are bridged, long ones split the samples.
 
 A loop that misses a period has no sample of it. A straight line in its place changes the density of white noise by the
 share of bridged samples; a spectrum that started again at each hole would never reach its low frequencies.
@@ -15,6 +15,7 @@ class EvenGrid:
     """Puts samples on an even grid of time; a straight line bridges holes of up to `longest_hole` samples."""
 
     def __init__(self, longest_hole: int) -> None:
+        """Begin without samples; `longest_hole` is the number of missing samples up to which a hole is bridged."""
         self._longest_hole = longest_hole
         self._last: tuple[float, float] | None = None
         """Grid index and value of the newest sample."""
@@ -22,11 +23,12 @@ class EvenGrid:
         """Samples that a straight line replaced."""
 
     def add(self, values: Real, grid_indices: Real) -> list[tuple[bool, Real]]:
-        """Add samples. Returns the new pieces of evenly spaced samples, oldest first: (is_continuation, samples (m,)).
+        """Add samples; return the new sequences of evenly spaced ones, oldest first: (is_continuation, samples (m,)).
 
-        `values` (n,) stand at the whole numbers `grid_indices` (n,); values that are not finite are holes. Samples on a
-        line over a short hole are part of their piece, and counted in `bridged_count`. `is_continuation` is True for
-        a piece that follows the last sample of the call before; it may be empty. [] without a finite value.
+        `values` (n,) stand at the whole numbers `grid_indices` (n,); values that are not finite are holes. A long hole,
+        or an index that does not rise, begins a new sequence. Samples on a line over a short hole are part of their
+        sequence, and counted in `bridged_count`. `is_continuation` is True for a sequence that follows the last sample
+        of the call before; it may be empty. Returns [] without a finite value.
         """
         finite = np.isfinite(values)
         values, grid_indices = values[finite], grid_indices[finite]

@@ -77,6 +77,7 @@ class Spectrum:
     """
 
     def __init__(self, rate_hz: float, unit: str, segment: int = SEGMENT) -> None:
+        """Begin without averages; `unit` µm becomes nm. Raises ValueError unless `rate_hz` is above 0."""
         if not rate_hz > 0:
             raise ValueError(f"spectrum: a rate of {rate_hz:g} Hz; allowed: above 0")
         self._rate_hz, self._segment = rate_hz, segment
@@ -108,9 +109,10 @@ class Spectrum:
                 self._feed_stages(samples)
 
     def density(self, min_averages: int = 1) -> Density:
-        """Return the density of all stages with at least `min_averages` averages, and not less than one.
+        """Return the density of all stages with at least `min_averages` averages, or at least one if that is less.
 
-        Without such a stage it has no bands: `edges_hz` is (1,), all other arrays are empty, and every rms is 0.
+        Without such a stage the density has no bands: `edges_hz` is (1,), all other arrays are empty, and every rms is
+        0.
         """
         stages = [stage for stage in self._stages if stage.averages >= max(min_averages, 1)]
         hz, edges, amplitude, averages, powers = [], [np.array([self._rate_hz / 2])], [], [], []
@@ -154,6 +156,7 @@ class _Stage:
     """A stage of the cascade: averages periodograms and decimates its samples."""
 
     def __init__(self, segment: int) -> None:
+        """Begin without averages; `segment` is the number of samples of a periodogram."""
         self._segment = segment
         self._window = np.sin(np.pi / segment * np.arange(segment)) ** 2
         self._power = np.zeros(segment // 2 + 1)
@@ -203,9 +206,10 @@ class _Stage:
 
 
 def _blend_weight(frequency_ratio: Real) -> Real:
-    """Return the weight of a stage where the next one overlaps; `frequency_ratio` is f divided by the next one's rate.
+    """Return the weight of a stage's power at frequencies that the next stage, of lower rate, also resolves.
 
-    It is 0 up to half of PASSBAND_RATIO, grows linearly, and is 1 from PASSBAND_RATIO on.
+    `frequency_ratio` is the frequency divided by the next stage's rate. The weight is 0 up to half of PASSBAND_RATIO,
+    grows linearly, and is 1 from PASSBAND_RATIO on.
     """
     return np.clip(2 * frequency_ratio / PASSBAND_RATIO - 1, 0.0, 1.0)
 

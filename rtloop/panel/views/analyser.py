@@ -19,6 +19,7 @@ class Analyser:
     """
 
     def __init__(self, subscription: SpectrumSubscription, loop: Description) -> None:
+        """Begin without averages. Raises ValueError for a signal that the loop does not have."""
         self._subscription, self._rate_hz = subscription, loop.rate_hz
         self._spectrum = Spectrum(loop.rate_hz, loop.unit(subscription.signal))
         self._batch = Batch(loop.rate_hz)
@@ -55,9 +56,9 @@ class Analyser:
         """Return the binary message "spectrum" of all ticks since the last reset; its arrays may be empty.
 
         The arrays have a value for each frequency band: `hz` (centre), `amplitude` (density in `unit`/√Hz), `averages`
-        (their number). The header has the subscription, `unit`, the `rms` from low_hz to high_hz, `averages_least`,
-        `averages_most`, `bridged` (missing samples that a straight line replaced), and `at_rest`: whether the signal's
-        axis rested all the time, False for a signal of no axis.
+        (number of averaged periodograms). The header has the subscription, `unit`, the `rms` from low_hz to high_hz,
+        `averages_least` and `averages_most` of all bands (0 without a band), `bridged` (missing samples that a straight
+        line replaced), and `at_rest`: whether the signal's axis rested all the time, False for a signal of no axis.
         """
         self._average(self._batch.take())
         density, subscription = self._spectrum.density(), self._subscription

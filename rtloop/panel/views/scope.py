@@ -38,6 +38,7 @@ class Scope:
     """
 
     def __init__(self, subscription: ViewSubscription, loop: Description) -> None:
+        """Make the screen and, except in mode roll, its trigger. Raises ValueError as the class says."""
         limit_s = longest_view_s(len(loop.columns), loop.rate_hz)
         if subscription.seconds > limit_s:
             raise ValueError(
@@ -110,7 +111,7 @@ class Scope:
     def end_run(self, past: TickHistory) -> None:
         """End the run: close the open sweep, and make the newest sweep's message now, before `past` holds another run.
 
-        The next call of `frame` returns this message.
+        The next call of `frame` returns this message, unless an earlier call returned it already.
         """
         self._commands.clear()
         if self._trigger is not None and (sweep := self._trigger.close()) is not None and sweep.end > sweep.trigger:
@@ -122,8 +123,8 @@ class Scope:
     def frame(self, past: TickHistory) -> bytes | None:
         """Return the binary message "sweep" of the newest sweep, or of an open one that lasts longer than GROWING_S.
 
-        The ticks are taken from `past`; in mode roll they are its last ones. After `end_run`, the message made there
-        comes first. None without a sweep of the run in `past`, and if the same message was returned before.
+        The ticks are taken from `past`; in mode roll they are its last ones. The message that `end_run` made comes
+        first. None without a sweep of the run in `past`, and if nothing has changed since the message before.
         """
         if self._ready_frame is not None:
             frame, self._ready_frame = self._ready_frame, None
@@ -141,7 +142,7 @@ class Scope:
 
     def _pack_sweep(self, sweep: Sweep, past: TickHistory, is_complete: bool) -> bytes:
         """Return the binary message "sweep": arrays NAME:low and NAME:high, the extremes of each signal at each point
-        of the screen, and `offset`, each point's first tick, counted from the trigger (below 0 before it).
+        of the screen, and `offset`, each point's first tick, counted from the trigger, negative before the trigger.
 
         The header has the fields of `sweep` (`cause` is "roll" in mode roll), `mode`, `number` (of sweeps that ended),
         `complete`, `rate_hz` and `signals`. `is_complete` is False for a sweep that still grows.

@@ -33,6 +33,7 @@ class Viewer:
     """The views of one client of the panel."""
 
     def __init__(self, feed: Feed, state: StateListener) -> None:
+        """Begin without subscriptions; ticks and events come from `feed`, the service's state from `state`."""
         self._feed, self._state = feed, state
         self._subscriptions: dict[str, ViewSubscription | SpectrumSubscription | XySubscription | None] = dict.fromkeys(
             ("view", "spectrum", "xy")
@@ -91,7 +92,7 @@ class Viewer:
         """Carry out a JSON message of the client, field by field.
 
         An invalid field keeps its old value, and a message "refused" is queued for it. A text that is not a JSON object
-        changes nothing, and one "refused" with the field "message" is queued.
+        has no effect except that a "refused" with the field "message" is queued.
         """
         try:
             fields = read_message(text)
@@ -172,7 +173,7 @@ class Viewer:
     def _state_frame(self) -> bytes:
         """Return the binary message "state": the keys of `StateListener.status`, and of the feed `unix_s` (now),
         `age_s` (time since the newest tick, s; None if unknown), `lost` (ticks, in all runs), `run`, `fault` (None if
-        there is none) and `references` (those that play).
+        there is none) and `references` (`Events.references`).
         """
         feed = self._feed
         feed_fields = {"age_s": feed.age_s, "lost": feed.lost_ticks, "run": feed.run, "fault": feed.fault}

@@ -49,9 +49,10 @@ class XyPlot:
         """Return the binary message "xy" of the last seconds; None while less than 1/NEW_PART of its ticks is new.
 
         Its arrays are `drive_v` and `position_um`, empty if all ticks were lost; with a hysteresis model also its
-        curve, `model_drive_v` and `model_position_um`, moved by `offset_um` to the mean of the measured one. The header
-        also has `axis`, `run`, `end` (the tick after the last), `at_rest`, and `loop_percent`, the relative height
-        100·h/H of the measured loop: None at rest, without motion and without a whole loop.
+        curve, `model_drive_v` and `model_position_um`, moved by `offset_um` in the header to the measured mean
+        position. The header also has `axis`, `run`, `end` (the tick after the last), `at_rest`, and `loop_percent`, the
+        height of the measured loop in percent of the position's range: None at rest, for a constant drive, without a
+        whole loop.
         """
         first, end = past.end - self._ticks, past.end
         if self._shown[0] == past.run and end < self._shown[1] + self._ticks / NEW_PART:
@@ -88,8 +89,8 @@ class XyPlot:
     def _earlier_drive(self, past: TickHistory, first: int) -> Real:
         """Return the drive before tick `first`, V (m,), oldest first, over at most four times the shown duration.
 
-        It has the extremes of whole blocks, then the ticks after the last block, without lost ticks; empty if
-        `first` ≤ 0.
+        It has the extremes of about WARM_BINS time bins, which end at a multiple of BLOCK, then each tick from there to
+        `first`, without lost ticks; empty if `first` ≤ 0.
         """
         if first <= 0:
             return np.zeros(0)
@@ -101,8 +102,8 @@ class XyPlot:
 
 
 def order_extremes(low: Real, high: Real) -> Real:
-    """Return the extremes (points,) of a signal as (2·points,): at each point low and high in the order that the
-    slope between points suggests; points with NaN are left out.
+    """Return the extremes (points,) of a signal as one curve (2·points,): low before high where the signal rises from
+    point to point, high before low where it falls. Points with NaN are left out.
     """
     valid = np.isfinite(low) & np.isfinite(high)
     low, high = low[valid], high[valid]
@@ -115,7 +116,7 @@ def order_extremes(low: Real, high: Real) -> Real:
 def play_model(axis: dict[str, Any]) -> PlayModel | None:
     """Return the hysteresis model of the feedforward in the table [axis] of a configuration.
 
-    None for a feedforward of another kind or with invalid options.
+    None for a feedforward of another kind than `KIND` or with invalid options; a missing kind is `KIND`.
     """
     feedforward = axis.get("feedforward") or {}
     if feedforward.get("kind", KIND) != KIND:

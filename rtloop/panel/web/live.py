@@ -50,6 +50,7 @@ class Live:
     """The endpoint `/live` of all clients."""
 
     def __init__(self, feed: Feed, state: StateListener) -> None:
+        """Store the sources of ticks and of the service's state; no client is connected yet."""
         self._feed, self._state = feed, state
         self._streams = 0
         self._limiter = CapacityLimiter(BUILDERS)
@@ -82,7 +83,7 @@ class Live:
         tasks.cancel()
 
     async def _listen(self, socket: WebSocket, viewer: Viewer) -> None:
-        """Pass the client's messages to `viewer`, one each 1/MESSAGES_PER_S; return when the client disconnects.
+        """Pass the client's messages to `viewer`, at most MESSAGES_PER_S a second; return when the client disconnects.
 
         Messages that come faster wait unread.
         """

@@ -11,7 +11,7 @@ def describe_loop(loop: Description) -> dict[str, object]:
     """Return {name, rate_hz, axes, columns, units, longest_s, defaults: {limits, interlocks}} of a loop.
 
     `axes` are names, `columns` the signals of a record as {name, unit, meaning}, `units` by signal; the longest screen
-    lasts `longest_s`.
+    lasts `longest_s`. `defaults` are the default limits and interlocks of an axis.
     """
     return {
         "name": loop.name,

@@ -17,9 +17,9 @@ MAX_SIGNALS = 8
 def signal_figures(feed: Feed, run: int, first: int, end: int, signals: list[str]) -> dict[str, dict[str, float]]:
     """Return {signal: {rms, mean, std, low, high, peak_to_peak}} over ticks `first` … `end` − 1, in the signal's unit.
 
-    Lost ticks are left out. Raises RequestRefused (410) for ticks that are no longer or not yet in memory, of another
-    run, or all lost, and for a signal without a finite value in them; ValueError for no signal, more than MAX_SIGNALS
-    or an unknown one, and for an `end` that is not above `first`.
+    `low` and `high` are the least and the largest value. Lost ticks are left out. Raises RequestRefused (410) for ticks
+    that are no longer or not yet in memory, of another run, or all lost, and for a signal without a finite value in
+    them; ValueError for no signal, more than MAX_SIGNALS or an unknown one, and for an `end` that is not above `first`.
     """
     if not 0 < len(signals) <= MAX_SIGNALS:
         raise ValueError(f"signals: {len(signals)} names; allowed: 1 to {MAX_SIGNALS}")

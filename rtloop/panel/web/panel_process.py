@@ -13,10 +13,10 @@ EXIT_TIMEOUT_S = 2.0
 
 @contextlib.contextmanager
 def run_panel_process(socket: Path, port: int) -> Iterator[None]:
-    """Run a panel of the service at `socket` during the block, without waiting for service or panel.
+    """Run a panel of the service at `socket` during the block; service and panel may still be starting in the block.
 
-    The panel has a separate process group, so that Ctrl-C reaches the loop alone, and it ends with its stdin, also if
-    this process is killed. After the block, a panel that has not ended within EXIT_TIMEOUT_S is killed.
+    The panel has a separate process group, so that Ctrl-C reaches the loop alone. It ends when its stdin closes: after
+    the block, and if this process is killed. A panel that has not ended EXIT_TIMEOUT_S after the block is killed.
     """
     command = [sys.executable, "-m", "rtloop", "panel", str(socket), "--port", str(port), "--until-stdin-ends"]
     process = subprocess.Popen(command, stdin=subprocess.PIPE, process_group=0)

@@ -36,6 +36,7 @@ class Proxy:
     """
 
     def __init__(self, service: Service) -> None:
+        """Prepare the threads, and the limit of commands from all pages: 50 a second on average, 100 at once."""
         self._service, self._lanes = service, Lanes()
         self._rate = RateLimit(per_s=50.0, burst=100)
 

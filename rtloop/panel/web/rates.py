@@ -25,6 +25,7 @@ class RateLimit:
     """A rate limit: on average `per_s` requests a second, and up to `burst` at once."""
 
     def __init__(self, per_s: float, burst: int, now_s: Callable[[], float] = time.monotonic) -> None:
+        """Allow `burst` requests at once; `now_s` returns the time in s."""
         self._per_s, self._burst, self._now_s = per_s, burst, now_s
         self._allowance, self._updated_s = float(burst), now_s()
 
@@ -33,7 +34,7 @@ class RateLimit:
         return f"{self._per_s:g} a second"
 
     def allows(self) -> bool:
-        """Return whether another request is within the limit, and count it if so; a refused one costs nothing."""
+        """Return whether another request is within the limit, and count it if so; a refused request does not count."""
         now_s = self._now_s()
         self._allowance = min(self._allowance + (now_s - self._updated_s) * self._per_s, float(self._burst))
         self._updated_s = now_s
@@ -44,9 +45,10 @@ class RateLimit:
 
 
 class ClientRateLimits:
-    """A RateLimit for each client, by any hashable key; only the newest MAX_CLIENTS are kept."""
+    """A RateLimit for each client, by any hashable key; only the MAX_CLIENTS with the latest requests are kept."""
 
     def __init__(self, per_s: float, burst: int, now_s: Callable[[], float] = time.monotonic) -> None:
+        """Begin without clients; each gets a RateLimit with these arguments at its first request."""
         self._make_limit = partial(RateLimit, per_s, burst, now_s)
         self._rates: OrderedDict[Hashable, RateLimit] = OrderedDict()
 

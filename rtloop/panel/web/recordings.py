@@ -133,7 +133,9 @@ class Recordings:
         body = validate_request(CaptureBody, await limited_body(request, MAX_BODY_BYTES))
         if body.run not in (None, self._current_run()):
             raise RequestRefused(
-                410, f"run {body.run}: the loop was started again since this run; the run's recording is in the list"
+                410,
+                f"run {body.run}: the loop was started again since this run; the run's recording is in the list of "
+                "recordings",
             )
         run = await self._run_in_thread(lambda: current_run(self._service.client))
         first, end = await self._run_in_thread(lambda: self._tick_range(body, run))
@@ -195,6 +197,7 @@ class OpenFileResponse(FileResponse):
     """A download of an open file, also of ranges; the file is closed afterwards."""
 
     def __init__(self, file: IO[bytes], name: str) -> None:
+        """Send the content of the open `file` as a download; `name` is the file name that the browser gets."""
         path, status = f"/proc/self/fd/{file.fileno()}", os.fstat(file.fileno())
         super().__init__(path, filename=name, media_type="application/octet-stream", stat_result=status)
         self._file = file

@@ -19,6 +19,7 @@ class RequestRefused(Exception):
     """A refusal of a request: HTTP status `code`, and the reason."""
 
     def __init__(self, code: int, error: str) -> None:
+        """Store the HTTP status and the reason."""
         super().__init__(error)
         self.code = code
 

@@ -1,7 +1,8 @@
 """`/api/retune` and `/api/swap`: `rtloop ctl retune` for pages, in a process beside the panel.
 
-A page first gets a proposal: the resonance was measured, and the taps stay. The user's consent is a second request
-that contains the proposal. A measurement ends when its page disconnects; a swap, once begun, is completed.
+A page first gets a proposal of new taps, from a measurement of the resonance; the loop keeps its taps. The user's
+consent is a second request that contains the proposal. A measurement ends when its page disconnects; a swap, once
+begun, is completed.
 """
 
 from __future__ import annotations
@@ -49,7 +50,7 @@ class TapsBody(Body):
 
 
 class SwapBody(Body):
-    """Body of `/api/swap`: the new taps of a proposal, and the taps in force that it was compared with."""
+    """Body of `/api/swap`: the new taps of a proposal, `prefilter`, and the loop's taps that they replace."""
 
     axis: Name
     replaces: TapsBody
@@ -60,6 +61,7 @@ class Retuning:
     """Runs one `rtloop ctl retune` at a time."""
 
     def __init__(self, service: Service) -> None:
+        """Prepare the runner of the command: one at a time, each for LONGEST_S at most."""
         self._service = service
         self._processes = ProcessRunner(max_running=1, max_unfinished=1, timeout_s=LONGEST_S)
 
@@ -75,7 +77,7 @@ class Retuning:
         return await self._respond(request, RetuneBody, ends_with_page=True)
 
     async def _swap(self, request: Request) -> Response:
-        """Swap in the taps of a proposal, also if the page disconnects meanwhile; respond with the command's JSON."""
+        """Give the loop the taps of a proposal, also if the page disconnects; respond with the command's JSON."""
         return await self._respond(request, SwapBody, ends_with_page=False)
 
     @with_error_responses
@@ -94,7 +96,8 @@ class Retuning:
     async def _run_command(self, name: str, body: RetuneBody | SwapBody) -> dict[str, object]:
         """Run `rtloop ctl retune` for the body, under a client's `name`, and return the JSON object that it prints.
 
-        Raises TooManyRequests while another one runs, RequestRefused (409, 503 or 422) with the command's error.
+        Raises TooManyRequests while another such command runs, RequestRefused (409, 503 or 422) with the command's
+        error.
         """
         ctl = ["ctl", f"--socket={self._service.client.path}", f"--as={name}", "retune", "--json"]
         if isinstance(body, SwapBody):

@@ -40,6 +40,7 @@ class Sessions:
     """
 
     def __init__(self, token: str, port: int) -> None:
+        """Store the token and name the cookie after the panel's port; no session is open yet."""
         self._token, self.cookie = token, f"rtloop-{port}"
         self._secrets: OrderedDict[str, None] = OrderedDict()
 
@@ -75,6 +76,7 @@ class Guard:
     def __init__(
         self, app: ASGIApp, sessions: Sessions, is_admitted: Callable[[Scope], bool] = lambda _: False
     ) -> None:
+        """Store the application behind the guard, its sessions and the test `is_admitted`, by default always False."""
         self._app, self._sessions, self._is_admitted = app, sessions, is_admitted
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
@@ -105,7 +107,8 @@ class Guard:
         """Return HTTP status and reason of a refusal; None to admit.
 
         403 for a Host header that does not name this host. Unless `is_admitted`: 403 for an origin that is not the
-        panel's page, 401 without a session on a path that is not public.
+        panel's page, 403 for a WebSocket or a command without an origin (a command with `sec-fetch-site: same-origin`
+        is admitted), 401 without a session on a path that is not public.
         """
         headers, path = Headers(scope=scope), scope["path"]
         host, origin = headers.get("host", ""), headers.get("origin")

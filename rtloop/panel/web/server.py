@@ -46,8 +46,9 @@ def serve(control: Path, port: int, token_file: Path | None, print_address: Call
     """Serve the panel of the service at `control` on 127.0.0.1:`port` until SIGINT or SIGTERM. Returns 0.
 
     `port` 0 is any free one. `token_file` None: a new token for each start. `print_address` receives the address with
-    the token, and with `foxglove` that for viewers. The process gets a low CPU priority, and handles both signals.
-    Raises UnavailableError for a used port, and OutputError and HostRefusal as `read_or_make_token`.
+    the token, and with `foxglove` also the address for viewers. The process gets a low CPU priority, and handles both
+    signals. Raises UnavailableError for a port that cannot be used, and OutputError and HostRefusal as
+    `read_or_make_token`.
     """
     token = secrets.token_urlsafe(TOKEN_BYTES) if token_file is None else read_or_make_token(token_file)
     listener = _listen(port)
@@ -116,7 +117,10 @@ def _read_or_make_token(file: Path) -> str:
     if stat.S_IMODE(mode) & 0o007:
         raise OutputError(f"{file}: other users may read or write the panel's token; use chmod {TOKEN_MODE:o}")
     if len(token) < TOKEN_BYTES:
-        raise OutputError(f"{file}: the token has {len(token)} characters; allowed: at least {TOKEN_BYTES}")
+        raise OutputError(
+            f"{file}: the token has {len(token)} characters; allowed: at least {TOKEN_BYTES}; remove the file, so "
+            "that the panel makes a new token"
+        )
     return token
 
 
