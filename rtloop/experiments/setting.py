@@ -159,7 +159,7 @@ class Setting:
 
     @property
     def reach_v(self) -> float:
-        """Largest slow drive in V to both sides of 0, within its limits, below the interlocks of position/sensor."""
+        """Largest slow drive in V to both sides of 0 that keeps the drive's limits and trips no interlock."""
         low_v, high_v = self.drive_range_v
         return min(-low_v, high_v)
 
