@@ -80,8 +80,9 @@ def drivers(
 def list_drivers() -> Sequence[Mapping[str, object]]:
     """Return a dict for each registered kind of driver: kind, defined_in, real, max_rate_hz, problem.
 
-    `defined_in` is its module. With default options, `real` is whether it moves hardware, `max_rate_hz` its highest
-    rate (None: any). `problem` is the reason that prevents its use, else None; with a problem, those two are None.
+    `defined_in` is the driver's module. `real` is whether the driver with default options moves hardware, `max_rate_hz`
+    its highest rate (None: any). `problem` is the reason that prevents the driver's use, else None; with a problem,
+    `real` and `max_rate_hz` are None.
     """
     from rtloop.drivers.errors import DriverError
     from rtloop.drivers.registry import driver_class, kinds
@@ -128,7 +129,10 @@ def _print_report(report: dict[str, Any]) -> None:
             f"{exchange['max_us']:.1f} µs; {exchange['late']} of {exchange['count']} exchanges took longer "
             f"than a period, {exchange['lost']} got no answer"
         )
-        out.print(f"the margins of `rtloop check` include this delay beyond the model's: {exchange['added_us']:.1f} µs")
+        out.print(
+            f"the margins of `rtloop check` include {exchange['added_us']:.1f} µs of delay for this exchange, in "
+            "addition to the model's delay"
+        )
     for rate in report["rates"]:
         out.print(f"{rate['rate_hz']:g} Hz: {rate['missed_share']:.2%} of the periods missed")
     highest = report["highest_rate_hz"]
