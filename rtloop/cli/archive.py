@@ -30,7 +30,7 @@ WORDS = ("column", "trips")
 
 
 def _add_options(command: Callable[..., object]) -> Callable[..., object]:
-    """Add the patterns and the options of all commands of this group. Returns the command."""
+    """Add to a command the argument PATTERN and the options of all commands of `archive`. Returns the command."""
     for option in (
         JSON,
         click.option(

@@ -264,7 +264,7 @@ def _record_all(
 def _record(
     planned: PlannedRun, folder: Path, paced: bool, interruption: Interruption, progress: RunsProgress
 ) -> RunResult:
-    """Recover recordings of killed runs in `folder`, record one run of the loop there, and return its result.
+    """Recover recordings of killed runs in `folder`, run the loop once, recorded in `folder`, and return the result.
 
     Shows the run's progress, and lets `interruption` stop it. Raises RtloopError or DriverError if it cannot start.
     """
@@ -317,7 +317,7 @@ def _write_report(
     """Write report.html, report.json and a PNG of each picture in each theme to `folder`; return the paths, HTML first.
 
     Existing files are overwritten. `recordings` are the paths, by file name, to which the HTML page links; `skipped`
-    are reasons by experiment. Raises OutputError if a file cannot be written; those before it are written then.
+    are reasons by experiment. Raises OutputError if a file cannot be written; the files before it remain.
     """
     from rtloop.experiments.page import render_report
 

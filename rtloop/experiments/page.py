@@ -8,7 +8,7 @@ from typing import Any
 
 from rtloop.values import render_page
 
-HEADINGS = {"asked": "asked", "claimed": "claimed", "model": "the model gives"}
+HEADINGS = {"asked": "required", "claimed": "claimed", "model": "the model gives"}
 
 
 def render_report(content: Mapping[str, Any], pictures: Mapping[str, Mapping[str, bytes]], links: Mapping[str, str],

@@ -162,7 +162,7 @@ def _analyse(experiment: Experiment, runs: Sequence[RecordedRun]) -> Analysis:
 
 
 def _configuration_name(run: RecordedRun) -> str:
-    """Name of the configuration that the run was derived from."""
+    """Name of the configuration from which the run was derived, by the name in the recording's header."""
     return run.recording.header["name"].rsplit(f"-{run.experiment}", 1)[0]
 
 

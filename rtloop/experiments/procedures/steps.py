@@ -98,7 +98,9 @@ def analyse(recordings: Sequence[RecordedRun], _: StepsOptions) -> Analysis:
         run.row(
             "static_error_percent", "static error, median", "%", median_figures[2], model_figures[2], STATIC_TOLERANCE
         ),
-        run.row("peak_command", "peak of v per step, median", "1", median_figures[3], model_figures[3], PEAK_TOLERANCE),
+        run.row(
+            "peak_command", "peak of v per unit step, median", "1", median_figures[3], model_figures[3], PEAK_TOLERANCE
+        ),
     ]
     shown_ticks = round(
         min(SHOWN_SETTLINGS * max(median_figures[1], 1.0) / 1e3, run.shortest_duration_s("level")) * run.rate_hz
@@ -165,7 +167,7 @@ def _steps_table(steps: Sequence[Step]) -> Table:
     """
     rows = [[f"{step.before_um:g} → {step.level_um:g} µm", *(f"{value:.{digits}f}" for value, digits in
              zip(step.figures, (2, 1, 3, 2), strict=True))] for step in steps]  # fmt: skip
-    headings = ("step", "overshoot / %", "settling / ms", "static error / %", "peak of v per step")
+    headings = ("step", "overshoot / %", "settling / ms", "static error / %", "peak of v per unit step")
     return Table("Every step", headings, rows)
 
 
