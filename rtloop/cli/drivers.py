@@ -59,7 +59,7 @@ def drivers(
 
     The test measures gain, offset, noise, delay and the highest rate, and the exchange with a node.
 
-    The self-test moves outputs: disconnect fragile loads first. Exit 1 where it fails.
+    The self-test moves outputs: disconnect fragile loads first. Exit 1 where the self-test fails.
     """
     if config is None:
         entries = list_drivers()

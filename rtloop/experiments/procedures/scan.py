@@ -107,7 +107,10 @@ def _period_ticks(hz: float, rate_hz: float) -> int:
     """Return the period of `hz` in ticks. Raises ConfigError unless it is a whole number of ticks, 4 or more."""
     ticks = round(rate_hz / hz)
     if ticks < 4 or abs(rate_hz / ticks / hz - 1) > 1e-9:
-        faults = [f"scan.frequencies_hz: {hz:g} Hz; allowed: periods of 4 or more whole ticks of {1 / rate_hz:g} s"]
+        faults = [
+            f"scan.frequencies_hz: {hz:g} Hz; allowed: frequencies with a period of 4 or more whole ticks, each of "
+            f"{1 / rate_hz:g} s"
+        ]
         raise ConfigError("parameters of the experiments", faults)
     return ticks
 
