@@ -253,7 +253,5 @@ def _print_summary(summary: CampaignSummary, folder: Path) -> None:
 
 
 def value_text(value: object) -> str:
-    """Return the value of a configuration's key as text for rich: a float with four significant digits, brackets
-    escaped.
-    """
+    """Return a configuration's value as text for rich: a float with four significant digits, brackets escaped."""
     return f"{value:.4g}" if isinstance(value, float) else escape(value)

@@ -57,7 +57,8 @@ def drivers(
 ) -> int:
     """List the backends, or test the channels of a configuration.
 
-    The test measures gain, offset, noise, delay and the highest rate, and the exchange with a node.
+    With --selftest, measures gain, offset, noise and delay of each channel, the highest rate, and the exchange with a
+    node.
 
     The self-test moves outputs: disconnect fragile loads first. Exit 1 where the self-test fails.
     """

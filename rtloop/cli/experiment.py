@@ -74,7 +74,7 @@ class RunOptions(TypedDict):
 
 
 def run_options(command: Callable[..., None]) -> Callable[..., None]:
-    """Add to a command the parameters of `run_experiments` except `names`, as RUN_OPTIONS. Returns the command."""
+    """Add RUN_OPTIONS to a command: the parameters of `run_experiments` except `names`. Returns the command."""
     for option in reversed(RUN_OPTIONS):
         command = option(command)
     return command
@@ -368,8 +368,8 @@ def _duration_text(seconds: float) -> str:
 def _print_report(content: Mapping[str, Any], skipped: Mapping[str, str]) -> None:
     """Print the verdicts of every experiment in a report's `content`, then the reasons for skipped experiments.
 
-    The notes of an experiment are printed if a verdict misses or differs; the notes on middle and reduced
-    defaults always. `skipped` are the reasons by the experiment's name.
+    The notes of an experiment are printed if a verdict misses or differs; the notes on middle and reduced defaults
+    always. `skipped` are the reasons by the experiment's name.
     """
     from rtloop.experiments.page import HEADINGS, comparison_cell, comparison_keys, format_number, second_value_cell
 

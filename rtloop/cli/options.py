@@ -79,7 +79,7 @@ class MatchingText(click.ParamType):
         self.name, self._pattern, self._rule = name, pattern, rule
 
     def convert(self, value: str, param: click.Parameter | None, ctx: click.Context | None) -> str:
-        """Return the text. Fails with a usage error where it does not match."""
+        """Return `value` unchanged. Fails with a usage error unless the pattern matches it as a whole."""
         if not re.fullmatch(self._pattern, value):
             self.fail(f"value is {value!r}; allowed: {self._rule}", param, ctx)
         return value

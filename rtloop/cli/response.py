@@ -119,8 +119,8 @@ def recording_response(
 ) -> None:
     """Compute L, S, margins and mode from a recorded response.
 
-    The response is that of a closed loop to a multisine. RUN is a recording made during `rtloop ctl response`, or by
-    the experiment `response`.
+    RUN is a recording of a closed loop that a multisine excited: made during `rtloop ctl response`, or by the
+    experiment `response`.
     """
     from rtloop.design.identification.model_sections import require_new
     from rtloop.design.identification.recorded_response import recorded_measurement

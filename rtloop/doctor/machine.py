@@ -53,7 +53,7 @@ def virtualisation(host: Host, pacing: Pacing) -> Finding:
 def processors(host: Host, pacing: Pacing) -> Finding:
     """Return the finding on the number of processors that this process may use: good for two or more.
 
-    The loop need not share one with the recorder and the service then.
+    With two, the loop need not share a processor with the recorder and the service.
     """
     count = len(host.allowed_cpus)
     return Finding(

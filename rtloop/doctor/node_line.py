@@ -52,7 +52,7 @@ def find_line(configuration: Configuration) -> NetworkLine | SerialLine | None:
 
 
 def find_network_line(host: str, port: int, bind: str | None) -> NetworkLine:
-    """Return the network interface by which the system would send to a node at `host` and `port`, with its settings.
+    """Return the NetworkLine by which the system would send to a node at `host` and `port`: interface and settings.
 
     `bind` is the address of this computer from which it would send, None: any. No datagram is sent to the node.
     `interface` is "" without a route, also for an unknown `host` or `bind`.

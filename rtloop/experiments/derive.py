@@ -90,11 +90,11 @@ def store_tables(run: Run, folder: Path) -> None:
 def read_metadata(configuration: str) -> dict[str, Any] | None:
     """Return the description of an experiment's run from the first line of a configuration's text; None without one.
 
-    Unchecked keys, as `derive_configuration` writes them: name (of the experiment), run (the
-    run's label), runs (number of the experiment's runs), axis, may_trip, ticks, middle_um (middle of the run's motion;
-    an absent key means 0), parameters, asked (the axis's specification without its defaults), beside (whether the run
-    belongs to the second configuration), reduced (a text for each default that a limit reduced), segments (each a list
-    of the fields of Segment).
+    Unchecked keys, as `derive_configuration` writes them: name (of the experiment), run (the run's label), runs (number
+    of the experiment's runs), axis, may_trip, ticks, middle_um (middle of the run's motion; an absent key means 0),
+    parameters, asked (the axis's specification without its defaults), beside (whether the run belongs to the second
+    configuration), reduced (a text for each default that a limit reduced), segments (each a list of the fields of
+    Segment).
     """
     first_line = configuration.partition("\n")[0].removeprefix("# ")
     if not first_line.startswith(METADATA_PREFIX):

@@ -128,8 +128,8 @@ def largest_part_of_drive(setting: Setting) -> Bound:
 def largest_true(condition: Callable[[float], bool], upper: float) -> float:
     """Return a number from 0 to `upper` for which `condition` holds, at most 10⁻⁹ `upper` below the largest one.
 
-    By bisection: `condition` must be true up to one number, and false above it. `upper` if it is true there, 0 if it is
-    true nowhere.
+    The search is a bisection: `condition` must be true up to one number, and false above it. Returns `upper` if
+    `condition` is true for `upper`, 0 if it is true for no number above 0.
     """
     if condition(upper):
         return upper

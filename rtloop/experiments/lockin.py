@@ -39,7 +39,7 @@ class Response(NamedTuple):
 def tone(signal: Real, hz: float, rate_hz: float) -> Tone:
     """Return the complex amplitude of the part of `signal` (samples,) at `hz`, and its fraction of the signal's power.
 
-    The phase refers to the first sample; the power is that about the mean. Raises ValueError for a frequency that is
+    The phase refers to the first sample; the power is about the mean. Raises ValueError for a frequency that is
     not between 0 and half the rate, and for fewer than MIN_CYCLES cycles or three samples.
     """
     if not 0 < hz < rate_hz / 2:

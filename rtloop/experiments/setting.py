@@ -159,7 +159,10 @@ class Setting:
 
     @property
     def reach_v(self) -> float:
-        """Largest slow drive in V to both sides of 0 that keeps the drive's limits and trips no interlock."""
+        """Largest slow drive in V to both sides of 0 V.
+
+        It is within the drive's limits, and trips neither the position interlock nor the sensor's.
+        """
         low_v, high_v = self.drive_range_v
         return min(-low_v, high_v)
 

@@ -137,7 +137,7 @@ def hold(value: float) -> Reference:
 def sine(amplitude: float, frequency_hz: float, offset: float = 0.0, phase_deg: float = 0.0) -> Reference:
     """Return the reference {kind: "sine", amplitude, frequency_hz, offset, phase_deg}, in V in mode raw, else in µm.
 
-    The sine is about `offset`; for phase 0 it begins there and rises.
+    The sine is about `offset`; with a phase of 0, it begins at `offset` and rises.
     """
     return {
         "kind": "sine",

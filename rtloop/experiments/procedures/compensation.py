@@ -61,7 +61,8 @@ def analyse(recordings: Sequence[RecordedRun], options: CompensationOptions) -> 
     """Evaluate the output y = x/D(0) of the compensation over the command v, both in µm, from one recording.
 
     x is the position relative to rest, D(0) the static gain of the dynamics. Rows: height h of the remaining loop, µm,
-    and h over its range H, %; largest |v − y|; slope ρ of y over v after half a cycle; largest |Ω| = |y − ρ v|.
+    and h over its range H, %; largest |v − y|; slope ρ of y over v, fitted without the first half cycle; largest
+    |Ω| = |y − ρ v|.
     """
     (run,) = recordings
     reference, position, drive = run.read("reference_um", "position_um", "drive_v")
