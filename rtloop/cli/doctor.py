@@ -51,7 +51,8 @@ def doctor(config: Path | None, seconds: float, change: bool, png: Path | None, 
 
     Checks the conditions that make ticks late, and states the cost of each and the command that corrects it. Measures
     the lateness of the loop's own clock, and compares it with the loop's period and margins. With CONFIG, stores the
-    lateness for the margins of `rtloop check`. Touches no hardware; changes settings only with --apply.
+    lateness, which `rtloop check` compares with the delay margin. Touches no hardware; changes settings only with
+    --apply.
     """
     from rtloop.configuration.file import load
     from rtloop.configuration.prepare import prepare

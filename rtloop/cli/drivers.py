@@ -131,8 +131,8 @@ def _print_report(report: dict[str, Any]) -> None:
             f"than a period, {exchange['lost']} got no answer"
         )
         out.print(
-            f"the margins of `rtloop check` include {exchange['added_us']:.1f} µs of delay for this exchange, in "
-            "addition to the model's delay"
+            f"this exchange adds {exchange['added_us']:.1f} µs to the model's delay; `rtloop check` compares the added "
+            "delay with the loop's delay margin"
         )
     for rate in report["rates"]:
         out.print(f"{rate['rate_hz']:g} Hz: {rate['missed_share']:.2%} of the periods missed")
