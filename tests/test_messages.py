@@ -117,7 +117,11 @@ def test_a_configuration_without_the_controller_is_a_fault_of_it(axis: str, file
     ("command", "content", "fault"),
     [
         ("waveform", "1.0\n\nabc\n", ", line 3: 'abc'; allowed: numbers"),
-        ("learn", "1.0, 0.1\n2.0, 0.2\n", ": two numbers in every line; allowed: one, the reference"),
+        (
+            "learn",
+            "1.0, 0.1\n2.0, 0.2\n",
+            ": two numbers in every line, as in a learned table; allowed: one number in every line, the reference",
+        ),
     ],
 )
 def test_a_file_of_wrong_numbers_is_a_usage_error(command: str, content: str, fault: str, tmp_path: Path) -> None:

@@ -30,7 +30,7 @@ WORDS = ("column", "trips")
 
 
 def _add_options(command: Callable[..., object]) -> Callable[..., object]:
-    """Add the patterns and the options of all commands of this group. Returns the command."""
+    """Add to a command the argument PATTERN and the options of all commands of `archive`. Returns the command."""
     for option in (
         JSON,
         click.option(
@@ -61,7 +61,8 @@ def replay(patterns: tuple[Path, ...], jobs: int | None, scheduler: str | None, 
     """Replay each recording, and list all that are not identical.
 
     The verdict of a recording is identical, differs (at a tick, in a column), damaged, not verified, unfinished, other
-    version, no law, cannot be read, or crashed its worker. Ctrl-C lets the recordings end that are replayed.
+    version, no law, cannot be read, or crashed its worker. After Ctrl-C, the replays that run are finished, and no
+    other begins.
 
     Exit 1 if a recording is not identical.
     """
@@ -76,8 +77,9 @@ def replay(patterns: tuple[Path, ...], jobs: int | None, scheduler: str | None, 
 def info(patterns: tuple[Path, ...], jobs: int | None, scheduler: str | None, out: Path | None, as_json: bool) -> int:
     """Summarise each recording in one line.
 
-    Number of ticks, duration, lost ticks, trips, and the verdict: readable, damaged, unfinished, other version, cannot
-    be read, or crashed its worker. Ctrl-C lets the recordings end that are read.
+    The line has number of ticks, duration, lost ticks, trips, and the verdict: readable, damaged, unfinished, other
+    version, cannot be read, or crashed its worker. After Ctrl-C, the recordings that are being read are finished, and
+    no other begins.
 
     Exit 1 if a recording is not readable.
     """
@@ -114,7 +116,9 @@ def _examine(
     print_result(report, as_json, lambda report: _print_report(report, examination.columns, examination.good_verdict))
     if report["pending"]:
         remedy = (
-            "To continue, run the same command again" if out else "Without --out FOLDER, the same command begins again"
+            "To continue, run the same command again"
+            if out
+            else "Without --out FOLDER, the same command begins with all recordings again"
         )
         click.echo(f"stopped, {count_text(report['pending'], 'recording')} not examined yet. {remedy}", err=True)
         return STOPPED
@@ -124,7 +128,8 @@ def _examine(
 def _print_report(report: Mapping[str, Any], columns: tuple[str, ...], good_verdict: str) -> None:
     """Print a row for each recording, then the number of recordings by verdict, the duration and the rate.
 
-    For a replay, whose `columns` include "tick", a recording with `good_verdict` and without a reason has no row.
+    `columns` are the keys of a verdict that are shown. If "tick" is among them, as for a replay, a recording with
+    `good_verdict` and without a reason has no row.
     """
     out = console()
     rows = [
@@ -148,7 +153,7 @@ def _print_report(report: Mapping[str, Any], columns: tuple[str, ...], good_verd
 def _path_text(row: Mapping[str, Any]) -> str:
     """Return the path of a row's recording as text for rich, with its number of files if there are several.
 
-    The path is relative if it lies below the present folder.
+    The path is relative if it lies below the current folder. "?" replaces characters that cannot be printed.
     """
     path = os.path.relpath(row["path"])
     path = row["path"] if path.startswith("..") else path
@@ -157,7 +162,7 @@ def _path_text(row: Mapping[str, Any]) -> str:
 
 
 def _cell(value: object) -> str:
-    """Return a value of a row as text for rich: a list of trips as `tick 5: causes; …`, "" for None."""
+    """Return a value of a row as text for rich: a list of trips as "tick 5: CAUSE, CAUSE; …", "" for None."""
     if isinstance(value, list):
         return "; ".join(f"tick {trip['tick']}: {', '.join(trip['causes'])}" for trip in value)
     if isinstance(value, float):

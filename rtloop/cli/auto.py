@@ -93,12 +93,13 @@ def auto(
 def write_design(
     hysteresis: Path, step: Path, specs: Path, out: Path, axis: str | None = None, order: int | None = None
 ) -> Chain:
-    """Identify the stage from two recordings, synthesise a controller, write the new file `out`.
+    """Identify the stage from two recordings, synthesise a controller, write the new configuration file `out`.
 
     Returns the Chain of all results: `stage`, `design` and `synthesis`. `hysteresis` records a slow sine from rest,
-    `step` a step; `specs` is the specification. `axis` None: the only one; `order` None: searched. Raises NoDesign if
-    no controller exists, OutputError for an existing `out`, ConfigError for an invalid specification or a result that
-    cannot run, other RtloopError for files that are unreadable or unsuitable; then nothing is written.
+    `step` a step; `specs` is the specification file. `axis` None: the only axis; `order`, the number of poles of the
+    dynamics, None: found by a search. Raises NoDesign if no controller exists, OutputError for an existing `out`,
+    ConfigError for an invalid specification or a result that cannot run, other RtloopError for files that are
+    unreadable or unsuitable; then nothing is written.
     """
     from rtloop.design.chain import configuration_text, design_controller, identify_stage
     from rtloop.design.identification.axis_recording import read_axis_recording
@@ -117,11 +118,11 @@ def write_robust_design(
     hysteresis: Path, step: Path, specs: Path, out: Path, axis: str | None = None, order: int | None = None,
     progress: Progress = lambda _: None,
 ) -> RobustChain:  # fmt: skip
-    """Write a configuration as `write_design` does, with a controller that damps the resonance, and with taps.
+    """Identify the stage, and write a configuration with a controller that damps the resonance and with taps.
 
-    Takes the parameters of `write_design`, and `progress`, which receives lines of text. Returns the RobustChain of all
-    results, and raises as `write_design`; but where a controller exists and taps do not, it writes the configuration
-    without taps, and then raises NoDesign.
+    The parameters are as for `write_design`; `progress` receives lines of text. Returns the RobustChain of all results.
+    Raises the errors of `write_design`; if a controller exists but no taps, the configuration is written without taps,
+    and NoDesign is raised.
     """
     from rtloop.design.chain import identify_stage
     from rtloop.design.identification.axis_recording import read_axis_recording

@@ -67,8 +67,9 @@ def run(
 ) -> int:
     """Run a campaign and report its yield.
 
-    The same command continues a campaign that was interrupted, and adds rigs where --rigs is larger than before. Ctrl-C
-    lets the rigs end that run. Results are Parquet files in the folder; the worst rigs are recorded there, too.
+    The same command continues a campaign that was interrupted, and adds rigs where --rigs is larger than before. After
+    Ctrl-C, the rigs that run are finished, and no other begins. Results are Parquet files in the folder of --out, with
+    recordings of the worst rigs.
 
     Exit 1 if a rig failed, tripped or crashed its worker, and if no rig passed.
     """
@@ -126,7 +127,10 @@ def report(folder: Path, worst_count: int, page: Path | None, as_json: bool) -> 
 def rerun(
     campaign: Path, rig: int, config: Path | None, out: Path | None, rigs: int | None, record: bool, as_json: bool
 ) -> int:
-    """Repeat one rig here, and compare it with its stored result. Exit 1 if they differ."""
+    """Repeat one rig here, and compare it with its stored result.
+
+    RIG is the number of the rig: 0 is the nominal rig, 1 and above are the sampled ones. Exit 1 if the results differ.
+    """
     require_readable(campaign)
     from rtloop.campaigns.campaign_file import load_campaign
     from rtloop.campaigns.case import CaseRunner
@@ -165,7 +169,7 @@ class CampaignView(StatusLine):
     _begin: tuple[float, int] | None = None
 
     def show(self, progress: Progress) -> None:
-        """Show the progress; rate and time left count from the first call on."""
+        """Show number of rigs with results, rate and time left; the rate counts from the first call on."""
         now_s = time.monotonic()
         begin_s, begin_done = self._begin = self._begin or (now_s, progress.done)
         text = f"{progress.done:,} of {progress.total:,} rigs"
@@ -187,8 +191,9 @@ def _report(folder: Path, worst_count: int, as_json: bool, page: Path | None) ->
     """Print the summary of a campaign's results in `folder`, with its `worst_count` worst rigs; then write it as HTML
     to `page`, if given, over an existing file.
 
-    Returns the exit code: 1 if a rig failed or crashed its worker, or none passed, else 0. Raises InputFileError for a
-    folder without results or with damaged ones, MissingExtra without pyarrow, OutputError if `page` cannot be written.
+    Returns the exit code: 1 if a rig failed (also by a trip) or crashed its worker, or no rig passed, else 0. Raises
+    InputFileError for a folder without results or with damaged ones, MissingExtra without pyarrow, OutputError if
+    `page` cannot be written.
     """
     from rtloop.campaigns.summary import summarise_campaign
 
@@ -206,7 +211,9 @@ def _report(folder: Path, worst_count: int, as_json: bool, page: Path | None) ->
 
 
 def _print_summary(summary: CampaignSummary, folder: Path) -> None:
-    """Print yield, figures, causes of failures and the worst rigs, and where their recordings are in `folder`."""
+    """Print yield, figures, causes of failures, variances, worst rigs with the folder of their recordings, and rigs
+    that crashed or cannot run.
+    """
     out, estimate = console(), summary.yield_of_rigs
     out.print(
         f"{escape(summary.name)}: {estimate.passed:,} of {count_text(estimate.rigs, 'rig')} pass, yield "
@@ -246,5 +253,5 @@ def _print_summary(summary: CampaignSummary, folder: Path) -> None:
 
 
 def value_text(value: object) -> str:
-    """Return the value of a configuration's key as text for rich: a float with four digits, brackets escaped."""
+    """Return a configuration's value as text for rich: a float with four significant digits, brackets escaped."""
     return f"{value:.4g}" if isinstance(value, float) else escape(value)

@@ -28,8 +28,8 @@ if TYPE_CHECKING:
 def compare(first: Path, second: Path, page: Path | None, as_json: bool) -> None:
     """Compare the results in two folders, rig by rig.
 
-    Both need the same rigs: `rtloop campaign run CAMPAIGN`, once with --config. Yields are compared by McNemar's test,
-    figures by the median of their differences, with an interval of 95 %.
+    FIRST and SECOND must have the same rigs: run `rtloop campaign run CAMPAIGN` once without and once with --config.
+    Yields are compared by McNemar's test, figures by the median of their differences, with an interval of 95 %.
     """
     for folder in (first, second):
         if folder.is_file():

@@ -46,10 +46,10 @@ def search(
     campaign: Path, config: Path | None, out: Path | None, jobs: int | None, scheduler: str | None, rigs: int,
     figure: str, target: float, record: bool, as_json: bool,
 ) -> None:  # fmt: skip
-    """Search the worst rig within the ranges of the uncertain keys.
+    """Search for the worst rig within the ranges of the uncertain keys.
 
-    Differential evolution begins with rigs all over the ranges and follows the figure. The worst of the range counts,
-    however unlikely it is: for a share of rigs, use `rtloop campaign run`.
+    Differential evolution begins with rigs all over the ranges and increases the figure. The search ignores how likely
+    a rig is: for the share of rigs that pass, use `rtloop campaign run`.
     """
     require_readable(campaign)
     from rtloop.campaigns.campaign_file import load_campaign
@@ -116,7 +116,7 @@ def boundary(
 def _print_worst(result: SearchResult, figure: str) -> None:
     """Print values, figures and missed limits of the worst rig.
 
-    `figure` is the figure that was maximised; "" is the largest figure in parts of its limit.
+    `figure` is the name of the figure that was maximised; "" is the largest ratio of a figure to its limit.
     """
     case, out = result.worst, console()
     rows = [(escape(name), value_text(value)) for name, value in {**case.values, **case.figures}.items()]

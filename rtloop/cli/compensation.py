@@ -39,9 +39,10 @@ RANDOM_COMMANDS = 20_000
 def compensation(as_json: bool, **options: Any) -> None:
     """Compute the hysteresis that the inverse of CONFIG leaves.
 
-    For the actuator: the gain ρ, the remaining hysteresis Ω and its bound ξ. ACTUATOR is the best known model of the
-    real actuator: identified from another recording than the inverse of CONFIG, or the model of a simulated rig. With
-    the model from which CONFIG's inverse is computed, only the dead band is left, and a warning says so.
+    Prints the gain ρ, the remaining hysteresis Ω = y − ρ v (command v, output y) and its bound ξ. The file of
+    --actuator holds the best known model of the real actuator: identified from another recording than the inverse of
+    CONFIG, or the model of a simulated rig. With the model from which CONFIG's inverse is computed, only the dead band
+    is left, and a warning says so.
     """
     print_result(compensation_report(**options), as_json, _print_compensation)
 
@@ -127,7 +128,7 @@ def _print_compensation(report: dict[str, Any]) -> None:
     out.print(rows)
     out.print(
         f"eq (3) of the paper gives {report['eq_3_um']:.4f} µm, which is no bound where the weights have both signs; "
-        f"Σ ζ|w| = {report['triangle_bound_um']:.4f} µm is a bound for all weights"
+        f"Σ ζ|w| (thresholds ζ, weights w) = {report['triangle_bound_um']:.4f} µm is a bound for all weights"
     )
     if report["same_model"]:
         print_warnings(
@@ -139,7 +140,7 @@ def _print_compensation(report: dict[str, Any]) -> None:
         )
     if report["dead_band"] == "exact":
         out.print(
-            f"these figures are computed without dead_band = 'exact', which {report['config']} sets; a run has it, and "
-            "less hysteresis remains"
+            f"these figures leave out dead_band = 'exact', which {report['config']} sets: in a run, less hysteresis "
+            "remains"
         )
     print_files(out, report)

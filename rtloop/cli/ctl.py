@@ -63,7 +63,7 @@ def make_client(context: click.Context) -> Client:
 
 
 def print_response(response: object, sentence: str) -> None:
-    """Print a response as JSON; on a terminal, an empty response {} as `sentence`, unless that is empty."""
+    """Print a response as JSON; on a terminal, print `sentence`, unless it is "", instead of an empty response {}."""
     if response == {} and sentence and sys.stdout.isatty():
         click.echo(sentence)
     else:
@@ -73,10 +73,10 @@ def print_response(response: object, sentence: str) -> None:
 def post(
     resource: str, sentence: str = ""
 ) -> Callable[[Callable[..., Mapping[str, object] | None]], Callable[..., None]]:
-    """Return a decorator: it turns a function that makes a request's body from a command's options into a command that
-    posts this body to `resource` and prints the response.
+    """Return a decorator that turns a function into a command: the function makes a request's body from the command's
+    options, the command posts this body to `resource` and prints the response.
 
-    `sentence` is printed for an empty response, as in `print_response`.
+    `sentence` is printed on a terminal for an empty response, as in `print_response`.
     """
 
     def decorate(make_body: Callable[..., Mapping[str, object] | None]) -> Callable[..., None]:
@@ -101,7 +101,7 @@ for _name, _help, _sentence in (
         "Allow the outputs to be driven.",
         "armed: the outputs may be driven; `rtloop ctl start` sets the configured mode",
     ),
-    ("start", "Set the configured mode.", ""),
+    ("start", "Set the mode that the configuration states, loop.mode.", ""),
     ("stop", "Ramp the outputs to their safe values.", ""),
     ("reset", "Clear latched trips; the outputs stay off.", ""),
     ("reload", "Read the configuration file again and apply it.", ""),
@@ -232,9 +232,9 @@ def tune(axis: str, section: str, values: str) -> dict[str, object]:
 @click.pass_context
 @report_errors
 def preview(context: click.Context, axis: str, section: str, values: str, as_json: bool) -> None:
-    """Show what `tune` would give AXIS, without changing it.
+    """Show the effect of `tune` on AXIS, without changing it.
 
-    Margins, step and tolerated shift: a table on a terminal, JSON elsewhere.
+    Prints margins, step and tolerated shift of the resonance: a table on a terminal, JSON elsewhere.
     """
     body = {"axis": axis, "section": section, "values": _parse_inline_table(values)}
     figures = make_client(context).post("/preview", body)
@@ -269,7 +269,8 @@ def controller(axis: str, config: Path) -> dict[str, object]:
 def read_numbers(file: IO[str]) -> list[list[float]]:
     """Return the rows of an open file: one number each, or two each (comma or spaces); empty lines are skipped.
 
-    Returns [] for a file without numbers. Raises click.UsageError for other text, and for rows of different lengths.
+    Returns [] for a file without numbers. Raises click.UsageError for other text, for a row of more than two numbers,
+    and for rows of different lengths.
     """
     rows: list[list[float]] = []
     for number, line in enumerate(file, start=1):
@@ -313,7 +314,7 @@ def print_preview(axis: str, answer: dict[str, Any]) -> None:
 
 
 def _format_shift(figures: dict[str, Any]) -> str:
-    """Return the shifts of the resonance that a loop tolerates, in %, as text: "-3.0 … +4.5"; "–" where it is unknown.
+    """Return the shifts of the resonance that a loop tolerates, in %, as text: "-3.0 … +4.5"; "–" if they are None.
 
     `figures` are the loop's figures in a response of `/preview`.
     """

@@ -50,8 +50,9 @@ def doctor(config: Path | None, seconds: float, change: bool, png: Path | None, 
     Exit 1 where the host is not suitable.
 
     Checks the conditions that make ticks late, and states the cost of each and the command that corrects it. Measures
-    the lateness of the loop's own clock, and compares it with the loop's period and margins. Touches no hardware;
-    changes settings only with --apply.
+    the lateness of the loop's own clock, and compares it with the loop's period and margins. With CONFIG, stores the
+    lateness, which `rtloop check` compares with the delay margin. Touches no hardware; changes settings only with
+    --apply.
     """
     from rtloop.configuration.file import load
     from rtloop.configuration.prepare import prepare
@@ -86,9 +87,9 @@ def doctor(config: Path | None, seconds: float, change: bool, png: Path | None, 
 
 
 def _examine(pacing: Pacing, seconds: float, line: NetworkLine | SerialLine | None) -> Examination:
-    """Examine the host, with `seconds` of the loop's clock, and the line to a node if there is one; return the result.
+    """Measure the loop's clock for `seconds`, check the host, and the `line` to a node unless it is None.
 
-    A status line is shown meanwhile.
+    Returns the Examination. A status line is shown meanwhile.
     """
     from rtloop.doctor.examine import examine
 
@@ -103,7 +104,7 @@ def _print_examination(
     objections: list[str],
     writes: list[SettingWrite],
 ) -> None:
-    """Print settings that were written, findings, lateness, its cost for each axis, and the verdict for loop `name`.
+    """Print settings that were written, findings, lateness, its phase for each axis, and the verdict for loop `name`.
 
     `objections` are the reasons why the host is not suitable; it is suitable if there are none.
     """

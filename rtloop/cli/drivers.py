@@ -57,9 +57,10 @@ def drivers(
 ) -> int:
     """List the backends, or test the channels of a configuration.
 
-    The test measures gain, offset, noise, delay and the highest rate, and the exchange with a node.
+    With --selftest, measures gain, offset, noise and delay of each channel, the highest rate, and the exchange with a
+    node.
 
-    The self-test moves outputs: disconnect fragile loads first. Exit 1 where it fails.
+    The self-test moves outputs: disconnect fragile loads first. Exit 1 where the self-test fails.
     """
     if config is None:
         entries = list_drivers()
@@ -80,8 +81,9 @@ def drivers(
 def list_drivers() -> Sequence[Mapping[str, object]]:
     """Return a dict for each registered kind of driver: kind, defined_in, real, max_rate_hz, problem.
 
-    `defined_in` is its module. With default options, `real` is whether it moves hardware, `max_rate_hz` its highest
-    rate (None: any). `problem` is the reason that prevents its use, else None; with a problem, those two are None.
+    `defined_in` is the driver's module. `real` is whether the driver with default options moves hardware, `max_rate_hz`
+    its highest rate (None: any). `problem` is the reason that prevents the driver's use, else None; with a problem,
+    `real` and `max_rate_hz` are None.
     """
     from rtloop.drivers.errors import DriverError
     from rtloop.drivers.registry import driver_class, kinds
@@ -128,7 +130,10 @@ def _print_report(report: dict[str, Any]) -> None:
             f"{exchange['max_us']:.1f} µs; {exchange['late']} of {exchange['count']} exchanges took longer "
             f"than a period, {exchange['lost']} got no answer"
         )
-        out.print(f"the margins of `rtloop check` include this delay beyond the model's: {exchange['added_us']:.1f} µs")
+        out.print(
+            f"this exchange adds {exchange['added_us']:.1f} µs to the model's delay; `rtloop check` compares the added "
+            "delay with the loop's delay margin"
+        )
     for rate in report["rates"]:
         out.print(f"{rate['rate_hz']:g} Hz: {rate['missed_share']:.2%} of the periods missed")
     highest = report["highest_rate_hz"]

@@ -53,8 +53,8 @@ def epics(
 ) -> int:
     """Serve a running loop as EPICS channels (Channel Access).
 
-    A separate process; no tick waits for it. Read only, unless --allow-control is used. The port is
-    EPICS_CA_SERVER_PORT, by default 5064.
+    The server is a separate process; no tick waits for it. Clients can only read, unless --allow-control is used. The
+    port is EPICS_CA_SERVER_PORT, by default 5064.
     """
     from rtloop.client.control_socket import find_control_socket
 

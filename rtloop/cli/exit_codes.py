@@ -17,12 +17,12 @@ if TYPE_CHECKING:
 
 
 def report_errors(command: Callable[..., int | None]) -> Callable[..., None]:
-    """Wrap a command so that it ends the process with an exit code, after an RtloopError or DriverError with a message
-    on stderr in place of a traceback.
+    """Return `command` wrapped: it ends the process with an exit code, and prints an RtloopError or DriverError as a
+    message on stderr, without a traceback.
 
-    `command` returns its exit code, or None for 0; with its option `as_json` the error is printed as JSON too, as
-    {error, exit_code}. The exit code after an error is its class's; a DriverError counts as an UnavailableError. Other
-    errors are raised.
+    `command` returns its exit code, or None for 0. If its option `as_json` is set, the error is printed as JSON too:
+    {error, exit_code}. The exit code after an error is set by the error's class; a DriverError counts as an
+    UnavailableError. Other errors are raised.
     """
 
     @wraps(command)

@@ -74,7 +74,7 @@ class RunOptions(TypedDict):
 
 
 def run_options(command: Callable[..., None]) -> Callable[..., None]:
-    """Add the parameters of `run_experiments`, except for the first, to a command. Returns the command."""
+    """Add RUN_OPTIONS to a command: the parameters of `run_experiments` except `names`. Returns the command."""
     for option in reversed(RUN_OPTIONS):
         command = option(command)
     return command
@@ -166,12 +166,12 @@ def run_experiments(
 ) -> int:
     """Run the experiments `names` on the driver of `config`, record them, and write and print their report.
 
-    Returns the exit code: 0, or 1 if a run failed, was interrupted, or the report is incomplete. `settings` are
-    EXPERIMENT.KEY=VALUE; `axis` None is the only axis; `out` is the folder for recordings and report, by default
-    NAME-experiments-TIME in `recording.folder`. `comparison` is a configuration that does the same experiments with the
-    same parameters; `paced` runs in real time even a driver that allows virtual time. Raises ConfigError for unknown
-    names, settings or an invalid configuration; LoopFault if no experiment can be done, no run was recorded, or Ctrl-C
-    ends the report; and the errors of the first run.
+    Returns the exit code: 1 if a run failed or was interrupted, or the report is incomplete, else 0. `settings` are
+    texts EXPERIMENT.KEY=VALUE; `axis` None is the only axis; `out` is the folder for recordings and report, by default
+    NAME-experiments-TIME in `recording.folder`. `comparison` is a second configuration, with which the same experiments
+    run with the same parameters; with `paced`, a driver that allows virtual time runs in real time, too. Raises
+    ConfigError for unknown names, unsuitable settings or an invalid configuration; LoopFault if no experiment can be
+    done, no run was recorded, or Ctrl-C ends the report; and the error of a first run that cannot start.
     """
     from rtloop.experiments.planning import plan_runs
     from rtloop.experiments.registry import parse_parameters, select_experiments
@@ -215,7 +215,7 @@ def run_experiments(
 
 
 def _load_stage(config: Path, axis: str | None) -> Stage:
-    """Load a configuration and print its warnings. Returns the stage of `axis`, None: the only one.
+    """Load a configuration and print its warnings. Returns the Stage of `axis` (None: the only axis).
 
     Raises ConfigError for an invalid configuration, an unknown axis, and several axes without a choice; InputFileError
     for a file that cannot be read, DriverError for a missing library.
@@ -232,8 +232,9 @@ def _record_all(
 ) -> tuple[list[Path], list[str]]:
     """Record run after run until one fails or the user interrupts. Returns recordings and problems, one sentence each.
 
-    A run that is planned from the recording of a finished one follows it at once. An error of a run, or of planning
-    such a run, is raised if no run is recorded yet, else it becomes a problem.
+    A run that is planned from the recording of a finished run follows it at once. A run that ends with an error is a
+    problem. The error of a run that cannot start or be planned is raised if no run is recorded yet, else it is a
+    problem, too.
     """
     from rtloop.drivers.errors import DriverError
 
@@ -263,7 +264,7 @@ def _record_all(
 def _record(
     planned: PlannedRun, folder: Path, paced: bool, interruption: Interruption, progress: RunsProgress
 ) -> RunResult:
-    """Recover recordings of killed runs in `folder`, record one run of the loop there, and return its result.
+    """Recover recordings of killed runs in `folder`, run the loop once, recorded in `folder`, and return the result.
 
     Shows the run's progress, and lets `interruption` stop it. Raises RtloopError or DriverError if it cannot start.
     """
@@ -291,8 +292,8 @@ def _report_recordings(
 ) -> bool:
     """Write the report of recordings to `folder`; print it, in JSON with `extra`. Returns whether it is complete.
 
-    `skipped` are the reasons of experiments that were left out, by name. Raises RecordingError for unreadable
-    recordings, OutputError for files that cannot be written.
+    `skipped` are the reasons why experiments were left out, by the experiment's name. Raises RecordingError for
+    unreadable recordings, OutputError for files that cannot be written.
     """
     from rtloop.experiments.report import load_runs, make_report
 
@@ -316,7 +317,7 @@ def _write_report(
     """Write report.html, report.json and a PNG of each picture in each theme to `folder`; return the paths, HTML first.
 
     Existing files are overwritten. `recordings` are the paths, by file name, to which the HTML page links; `skipped`
-    are reasons by experiment. Raises OutputError if a file cannot be written; those before it are written then.
+    are reasons by experiment. Raises OutputError if a file cannot be written; the files before it remain.
     """
     from rtloop.experiments.page import render_report
 
@@ -365,7 +366,11 @@ def _duration_text(seconds: float) -> str:
 
 
 def _print_report(content: Mapping[str, Any], skipped: Mapping[str, str]) -> None:
-    """Print the verdicts of every experiment in a report's `content`, and the reasons for skipped ones, by name."""
+    """Print the verdicts of every experiment in a report's `content`, then the reasons for skipped experiments.
+
+    The notes of an experiment are printed if a verdict misses or differs; the notes on middle and reduced defaults
+    always. `skipped` are the reasons by the experiment's name.
+    """
     from rtloop.experiments.page import HEADINGS, comparison_cell, comparison_keys, format_number, second_value_cell
 
     out = console()

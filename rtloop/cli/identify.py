@@ -22,7 +22,7 @@ PLOT = click.option("--plot", type=OUTPUT, help="Picture (PNG) to write.")
 
 @click.group()
 def identify() -> None:
-    """Make models of the actuator from recordings."""
+    """Identify actuator, dynamics and closed loop from recordings."""
 
 
 @identify.command()

@@ -135,9 +135,9 @@ def import_file(
 
     Returns the report of `import_data`, and under `mapping` the path of the mapping file or None. The options of
     `selection` override the mapping file. Where neither names a column, no recording is made and a `ColumnListing` is
-    returned, unless `file` is an export of a recording. `mapping` None: a mapping file beside the data, unless there is
-    a selection. `output` None: FILE with .mcap. `progress` receives the ticks so far. Raises UnreadableData,
-    OutputError, MissingExtra as `import_data`; InputFileError, ConfigError for the mapping file.
+    returned, unless `file` is an export of a recording. `mapping` None: a mapping file beside the data, unless
+    `selection` names a column. `output` None: FILE with .mcap. `progress` receives the number of imported ticks. Raises
+    UnreadableData, OutputError, MissingExtra as `import_data`; InputFileError, ConfigError for the mapping file.
     """
     from rtloop.interchange.columns import find_mapping, read_mapping
     from rtloop.interchange.importing import import_data, list_columns
@@ -191,7 +191,7 @@ def _print_import(report: Mapping[str, Any]) -> None:
     if report["mapping"]:
         out.print(f"mapping: {escape(report['mapping'])}")
     rows = [(s["name"], escape(s["unit"]), *_range_cells(s), escape(s["from"])) for s in report["signals"]]
-    out.print(table("signal", "unit", "least", "largest", "of", rows=rows, words=(4,)))
+    out.print(table("signal", "unit", "least", "largest", "made from", rows=rows, words=(4,)))
     _print_notes(out, report["notes"])
     length = f"{report['duration_s']:.6g} s at {report['rate_hz']:g} Hz, time: {escape(report['time'])}"
     out.print(f"{escape(report['output'])}: {count_text(report['ticks'], 'tick')}, {length}")
@@ -221,8 +221,8 @@ def _print_listing(report: Mapping[str, Any]) -> None:
 def _suggest_mapping(columns: Sequence[Column], time: str | None) -> list[tuple[str, str]]:
     """Return (signal, `COLUMN [UNIT]`) for each of EXAMPLE_SIGNALS, with another column each; fewer without columns.
 
-    The column is the first whose unit converts to the signal's, else the first of the others; the column `time` and
-    other clocks are left out. `columns` is the key of a `ColumnListing`.
+    The column is the first whose unit converts to the signal's unit, else the first that is left; the column `time` and
+    other clocks are left out. `columns` is the value of this key in a `ColumnListing`.
     """
     from rtloop.interchange.mapping import name_without_unit
 

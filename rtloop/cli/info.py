@@ -22,7 +22,7 @@ from rtloop.workbench.tables import console
 def info(files: tuple[Path, ...], as_json: bool) -> None:
     """Summarise a recording.
 
-    Completeness, timing, errors, drives. The parts of a rotated recording count as one.
+    Prints completeness, timing, errors and drives. The files of a rotated run count as one recording.
     """
     from rtloop.recording.views.summary import summarise
 

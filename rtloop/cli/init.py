@@ -101,7 +101,7 @@ def init(folder: Path, kind: str, name: str | None, config: Path | None, **figur
 def _require_in_folder(config: Path, folder: Path, kind: str) -> None:
     """Raise UsageError unless `kind` is "law" and the configuration lies directly in `folder`.
 
-    From another folder, its relative paths would point elsewhere.
+    The relative paths in a configuration from another folder would name other files.
     """
     if kind != "law":
         raise click.UsageError(f"--config: not allowed with --kind {kind}; allowed with --kind law")
@@ -114,9 +114,9 @@ def _require_in_folder(config: Path, folder: Path, kind: str) -> None:
 def _starter(kind: str, name: str | None, config: Path | None, figures: dict[str, float]) -> Starter:
     """Return the files of a kind, not yet written, and the commands that come next.
 
-    `name` names a law or driver, None: the default; `config` is the configuration for a law, None: the paper's;
-    `figures` are the given options of a stage. Raises UsageError for an option that belongs to another kind or is out
-    of range, RtloopError for a configuration that is unreadable or invalid.
+    `name` is the name of a law or driver (None: its entry in NAMES); `config` is the configuration for a law (None: the
+    paper's rig); `figures` are the given options of a stage by their names. Raises UsageError for an option that
+    belongs to another kind or is out of range, RtloopError for a configuration that is unreadable or invalid.
     """
     from rtloop.starters import folder
     from rtloop.starters.stage_figures import stage_figures

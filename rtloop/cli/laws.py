@@ -42,7 +42,7 @@ def new(name: str, out: Path) -> None:
     """Write NAME.py, its test and an example configuration.
 
     The law in NAME.py is a PI controller that runs; docs/laws.md explains how to change it. `rtloop init --kind law`
-    writes the same files, with the schema for editors, and takes a stage of your own.
+    writes the same files and the schema for editors, and can take a configuration of your stage (--config).
     """
     from rtloop.starters.law import law_files
     from rtloop.starters.new_files import write_new_files
@@ -56,8 +56,8 @@ def list_laws() -> list[dict[str, object]]:
     """Return for each registered kind {kind, slot, about (the docstring's first line), shipped, problem, defined_in}.
 
     `slot` is "controller" or "feedforward", `defined_in` the module; `about` is None without a docstring. `problem` is
-    the reason that prevents the law's use, else None; with a problem, slot and about are None. Laws of other packages
-    run first in the limited process, which is killed if a law does not return.
+    the reason that prevents the law's use, else None; with a problem, slot and about are None. A law of another package
+    is first tried in a limited process, which is killed if the law does not return.
     """
     from rtloop.laws.limited.trial import try_limited
     from rtloop.laws.registry import BUILT_IN, find_law, kinds, law_class

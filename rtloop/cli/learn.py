@@ -50,8 +50,8 @@ def learn(
     rows = read_numbers(file)
     if rows and len(rows[0]) != 1:
         raise click.UsageError(
-            f"{file.name}: two numbers in every line; allowed: one, the reference. A learned table holds the corrected "
-            "reference and a command: learn from the scan that it was made for"
+            f"{file.name}: two numbers in every line, as in a learned table; allowed: one number in every line, the "
+            "reference. Use the file from which the table was learned"
         )
     samples = [number for (number,) in rows]
     body = {"axis": axis, "samples": samples, "cycles": cycles, "resonance_percent": resonance_percent}

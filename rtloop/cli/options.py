@@ -34,12 +34,13 @@ class InputFile(click.File):
     """
 
     def __init__(self) -> None:
+        """Read files as UTF-8, with the character � for bytes that are no UTF-8."""
         super().__init__(encoding="utf-8", errors="replace")
 
     def convert(
         self, value: str | PathLike[str] | IO[str], param: click.Parameter | None, ctx: click.Context | None
     ) -> IO[str]:
-        """Return the file at the path `value`, for "-" stdin, open for reading text.
+        """Return the file at the path `value`, or stdin for "-", open for reading text.
 
         Raises UnreadableInput if it cannot be opened.
         """
@@ -78,7 +79,7 @@ class MatchingText(click.ParamType):
         self.name, self._pattern, self._rule = name, pattern, rule
 
     def convert(self, value: str, param: click.Parameter | None, ctx: click.Context | None) -> str:
-        """Return the text. Fails with a usage error where it does not match."""
+        """Return `value` unchanged. Fails with a usage error unless the pattern matches it as a whole."""
         if not re.fullmatch(self._pattern, value):
             self.fail(f"value is {value!r}; allowed: {self._rule}", param, ctx)
         return value
@@ -105,8 +106,8 @@ class PositiveFloat(click.FloatRange):
     """A number above 0; NaN is refused."""
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float:
-        """Return `value` as a float. Fails with a usage error for NaN, a number outside the range that the constructor
-        got, and a text that is no number.
+        """Return `value` as a float. Fails with a usage error for NaN, a number outside the range of this type, and a
+        text that is no number.
         """
         number = super().convert(value, param, ctx)
         return self.fail(f"value is {value}; allowed: a number above 0", param, ctx) if math.isnan(number) else number

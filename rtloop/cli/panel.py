@@ -39,9 +39,9 @@ def panel_options(command: Callable[..., object]) -> Callable[..., object]:
 def panel_process(config: Path, enabled: bool, port: int, name: str | None = None) -> AbstractContextManager[None]:
     """Return a context that runs the panel of a configuration's service in a second process, until the context ends.
 
-    Without `enabled`, the context has no effect. `name` replaces the name that the configuration gives the service.
-    The call, not the context, raises ConfigError for an invalid configuration, InputFileError for one that cannot be
-    read.
+    Without `enabled`, the context has no effect. `name` is the service's name, None: the configuration's name. The call
+    of this function, not the context, raises ConfigError for an invalid configuration and InputFileError for a
+    configuration that cannot be read.
     """
     if not enabled:
         return nullcontext()

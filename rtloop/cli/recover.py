@@ -80,7 +80,7 @@ def cut(
 ) -> None:
     """Cut a stretch out of a recording, as a recording that replays.
 
-    The new recording begins at the last recorded state of the law before the stretch, at most a second earlier.
+    The new recording begins at the last snapshot of the law's state before the stretch, at most a second earlier.
     FILE may still grow (NAME.mcap.part); FILE stays unchanged, and every tick is copied bit for bit.
     """
     from rtloop.recording.cutting.cut import cut as cut_recording
@@ -94,7 +94,7 @@ def cut(
 
 
 def _print_recovery(report: dict[str, Any]) -> None:
-    """Print the number of recovered ticks, the missing ticks and problems; or that the recording was complete."""
+    """Print the number of recovered ticks, gaps and problems, or that the recording was complete."""
     out, original, output = console(), escape(report["recording"]), escape(report["output"])
     if report["complete"] and not report["gaps"] and not report["problems"]:
         out.print(f"{original} is complete, nothing had to be recovered; {output} is a copy")
@@ -117,7 +117,7 @@ def _print_cut(report: dict[str, Any]) -> None:
 
 
 def _print_gaps(out: Console, report: dict[str, Any]) -> None:
-    """Print each gap of missing ticks and each problem of a report in a line to `out`; nothing if there are none."""
+    """Print each gap (missing ticks) and each problem of a report in a line to `out`."""
     for first, count in report["gaps"]:
         out.print(f"missing: {count_text(count, 'tick')} from tick {first} on")
     print_problems(out, report["problems"])

@@ -99,9 +99,9 @@ def service_response(
 @click.pass_context
 @report_errors
 def service_resonance(context: click.Context, as_json: bool, **request: object) -> None:
-    """Measure frequency and damping of the mode of AXIS.
+    """Measure frequency and damping of the resonance of AXIS.
 
-    The loop stays closed.
+    The loop stays closed: a multisine is added to the held reference, which is restored afterwards.
     """
     _report_resonance(_measure(context, {**request, "resonance_only": True}), as_json)
 
@@ -119,8 +119,8 @@ def recording_response(
 ) -> None:
     """Compute L, S, margins and mode from a recorded response.
 
-    The response is that of a closed loop to a multisine. RUN is a recording made during `rtloop ctl response`, or by
-    the experiment `response`.
+    RUN is a recording of a closed loop that a multisine excited: made during `rtloop ctl response`, or by the
+    experiment `response`.
     """
     from rtloop.design.identification.model_sections import require_new
     from rtloop.design.identification.recorded_response import recorded_measurement
@@ -138,8 +138,8 @@ def recording_response(
 def recording_resonance(run: Path, axis: str | None, near_hz: float | None, as_json: bool) -> None:
     """Compute the lightly damped mode from a recorded response.
 
-    With its uncertainty; the loop was closed. RUN is as for `rtloop identify response`; `rtloop ctl resonance` measures
-    the mode on a running loop.
+    Prints frequency and damping with their uncertainty. RUN is a recording of a closed loop as for `rtloop identify
+    response`; `rtloop ctl resonance` measures the mode in a running loop.
     """
     from rtloop.design.identification.recorded_response import recorded_measurement
 
@@ -157,10 +157,10 @@ def _measure(context: click.Context, request: Mapping[str, Any]) -> dict[str, ob
 
 
 def _report_response(content: Mapping[str, object], out: Path | None, plot: Path | None, as_json: bool) -> None:
-    """Print a measured closed loop, write it as JSON to the new file `out`, draw it to `plot`.
+    """Print a measured closed loop, write it as JSON to the new file `out` and draw it to `plot`, if given.
 
-    The files are written first. Raises OutputError for an existing `out`, or if the system refuses; MissingExtra for
-    `plot` without matplotlib, when `out` is written already.
+    The files are written before the text is printed. Raises OutputError for an existing `out`, or if the system
+    refuses; MissingExtra for `plot` without matplotlib, when `out` is written already.
     """
     from rtloop.design.identification.model_sections import write_new_file
     from rtloop.design.identification.plot_response import plot_response
@@ -178,7 +178,7 @@ def _report_response(content: Mapping[str, object], out: Path | None, plot: Path
 def _report_resonance(content: Mapping[str, object], as_json: bool) -> None:
     """Print the lightly damped mode of a measured closed loop, `content`, as text or as JSON {resonance}.
 
-    Raises UnsuitableData where it shows none.
+    Raises UnsuitableData if the measurement shows no such mode.
     """
     from rtloop.design.identification.axis_recording import UnsuitableData
 

@@ -79,11 +79,11 @@ def retune(
 
 
 def retune_axis(client: Client, request: RetuneRequest, yes: bool, as_json: bool) -> int:
-    """Measure, design, print and, with consent, swap better taps in. Returns 0 if the new taps are in force, else 1.
+    """Measure resonance and gain, design and print new taps, and swap better taps in after the user's consent.
 
-    `yes` swaps without asking; with `as_json` the user is not asked, and without `yes` the old taps stay. Raises
-    RtloopError as `propose_taps`, with the taps unchanged, and as `swap_in`: the stages before a refused one stay in
-    force.
+    Returns 0 if the new taps were swapped in, else 1. With `yes`, or with `as_json`, the user is not asked: `yes` swaps
+    better taps in; `as_json` without `yes` leaves the old ones. Raises RtloopError as `propose_taps`, with the taps
+    unchanged, and as `swap_in`: if the service refuses a stage, the stages before it remain swapped in.
     """
     from rtloop.client.retuning import propose_taps, swap_in
 
@@ -97,7 +97,7 @@ def retune_axis(client: Client, request: RetuneRequest, yes: bool, as_json: bool
     elif tick is not None:
         click.echo(f"swapped at tick {tick}")
     elif not proposal.is_better:
-        click.echo("the new taps are no better; the taps in force stay")
+        click.echo("the new taps are no better; the loop keeps the present taps")
     return LoopFault.exit_code if tick is None else 0
 
 
@@ -106,7 +106,7 @@ def swap_proposal(client: Client, axis: str, proposal: str, as_json: bool) -> in
 
     Prints the tick of the last stage, with `as_json` as {tick}. Returns 0. Raises ConfigError for another text or an
     unknown axis, LoopFault where the taps have changed since the proposal, RtloopError if the service refuses a stage:
-    the stages before it stay in force.
+    the stages before it remain swapped in.
     """
     from rtloop.client.retuning import swap_in
 
@@ -120,7 +120,7 @@ def swap_proposal(client: Client, axis: str, proposal: str, as_json: bool) -> in
 
 
 def _print_proposal(proposal: Proposal) -> None:
-    """Print measured resonance and gain, and figures of a step with the old taps and the new ones."""
+    """Print measured resonance and gain, and figures of a step with the present taps and with the new ones."""
     mode, percent, gain, gain_percent = proposal.stage
     click.echo(
         f"resonance {mode['hz']:.2f} ± {mode['hz_std']:.2f} Hz (standard deviation), {percent:+.2f} % from the model's"
@@ -137,7 +137,7 @@ def _print_proposal(proposal: Proposal) -> None:
         )
     step_table = table("step from the held reference", "settling / ms", "overshoot / %", "largest v per unit")
     rows = {
-        "with the taps in force": proposal.before,
+        "with the present taps": proposal.before,
         "with the new taps": proposal.after,
         "with the new taps, gain ± its uncertainty": proposal.at_gain_bounds,
     }

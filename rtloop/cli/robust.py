@@ -171,7 +171,7 @@ def _taps_as_dict(tap_design: TapDesign, files: list[Path]) -> dict[str, object]
 
 
 def _print_robust(robust: RobustDesign) -> None:
-    """Print the worst value of each certified figure on stderr, which leaves stdout to the section."""
+    """Print the worst value of each certified figure on stderr, because stdout may get the controller's section."""
     from rtloop.design.robust.section import certified_values
 
     click.echo(
@@ -188,7 +188,7 @@ def print_taps(tap_design: TapDesign, subject: Subject, *, to_stderr: bool = Tru
 
     The least overshoot for each settling time is printed too, if it was computed.
 
-    The lines go to stderr, which leaves stdout to another result, or to stdout if `to_stderr` is False.
+    The lines go to stderr, because stdout may get another result, or to stdout if `to_stderr` is False.
     """
     proof = tap_design.proof
     for line in (

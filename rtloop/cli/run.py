@@ -111,7 +111,7 @@ class TerminalObserver:
         print_warnings(warnings)
 
     def recover_leftovers(self, folder: Path) -> None:
-        """Complete the recordings that killed runs left in `folder`, as the function of the same name does."""
+        """Complete the recordings that killed runs left in `folder`, and print one line each on stderr."""
         recover_leftovers(folder)
 
     @contextmanager
@@ -131,7 +131,7 @@ class TerminalObserver:
 def recover_leftovers(folder: Path) -> None:
     """Complete the recordings that killed runs left in `folder`, *.mcap.part; print one line each on stderr.
 
-    The old files stay. A recording that cannot be recovered gives a warning there, and no error.
+    The old files stay. A recording that cannot be recovered gives a warning on stderr, and no error.
     """
     from rtloop.foundation.trusted import open_own
     from rtloop.recording.file.recover import find_leftovers, recover
@@ -159,7 +159,7 @@ class RunView(StatusLine):
         self._plan = prepared.plan
 
     def show(self, supervisor: Supervisor) -> None:
-        """Show the newest tick of a running loop; nothing without a terminal or before the first tick."""
+        """Show the newest tick of a running loop; no effect without a terminal or before the first tick."""
         row = supervisor.latest() if self._status else None
         if row is None:
             return

@@ -84,7 +84,8 @@ def hil() -> None:
 def hil_serve(config: Path, on_can: bool, on_udp: bool, on_serial: bool, tied: bool) -> None:
     """Simulate the board or the node of CONFIG.
 
-    The board (driver.kind = 'shm') is a simulated rig with its own clock. It goes on when a loop that drives it ends.
+    The board (driver.kind = 'shm') is a simulated rig with its own clock. The board keeps running when a loop that
+    drives it ends.
     """
     from rtloop.configuration.file import load
 
@@ -107,11 +108,11 @@ def hil_serve(config: Path, on_can: bool, on_udp: bool, on_serial: bool, tied: b
 
 
 def _serve_board(configuration: Configuration, axes: list[str], is_stopped: Callable[[], bool]) -> None:
-    """Be the simulated board of a configuration with driver 'shm' until `is_stopped()`; tell systemd when it is ready.
+    """Be the simulated board of a configuration with driver 'shm' until `is_stopped()` is True.
 
-    `axes` are the names of the axes in the order of outputs. Requests real-time priority, and goes on without it if
-    it is refused. Raises ConfigError for a driver other than 'shm' or invalid options, UnavailableError if the system
-    refuses the block's file or another board serves this file.
+    Tells systemd when the board is ready. `axes` are the names of the axes in the order of outputs. Requests real-time
+    priority, and runs without it if the kernel refuses. Raises ConfigError for a driver other than 'shm' or invalid
+    options, UnavailableError if the system refuses the block's file or another board serves this file.
     """
     from rtloop.drivers.shm import ShmOptions
     from rtloop.engine.plan import Pacing
@@ -127,7 +128,7 @@ def _serve_board(configuration: Configuration, axes: list[str], is_stopped: Call
     rate_hz = options.board_rate_hz or configuration.loop.rate_hz
     prepare_realtime(Pacing(rate_hz, priority=BOARD_PRIORITY))
     extent = f"{count_text(len(axes), 'channel')} at {rate_hz:g} Hz"
-    click.echo(f"the simulated board runs, {extent}, in shared memory {options.file}; Ctrl-C ends it", err=True)
+    click.echo(f"the simulated board runs, {extent}, in shared memory {options.file}; Ctrl-C ends the board", err=True)
     try:
         samples = serve(Path(options.file), options, axes, rate_hz, is_stopped, lambda: Notifier().send(READY=1))
     except ValueError as error:
@@ -138,11 +139,12 @@ def _serve_board(configuration: Configuration, axes: list[str], is_stopped: Call
 
 
 def _serve_node(configuration: Configuration, line: str, axes: list[str], is_stopped: Callable[[], bool]) -> None:
-    """Be the node of a configuration's [driver], with `axes` in the order of outputs, until `is_stopped()`.
+    """Be the simulated node of a configuration's [driver], with `axes` in the order of outputs, until `is_stopped()`.
 
-    `line` is the driver's kind: "can", "udp" or "serial". Takes real-time priority for this process, prints the start
-    and the node's counts at the end, and tells systemd when it is ready. Raises ConfigError for a driver of another
-    kind or invalid options, DriverError for a line that cannot be opened or fails, and for another node on a CAN bus.
+    `line` is the driver's kind: "can", "udp" or "serial". Requests real-time priority for this process, prints a line
+    at the start and the node's counts at the end, and tells systemd when the node is ready. Raises ConfigError for a
+    driver of another kind or invalid options, DriverError for a line that cannot be opened or fails, and for another
+    node on a CAN bus.
     """
     from rtloop.drivers.can.options import CanOptions
     from rtloop.drivers.node.options import NodeOptions
@@ -189,7 +191,7 @@ def _node_program(options: CanOptions | NodeOptions) -> Callable[..., str]:
 
 
 def _watch_stop_signals() -> Callable[[], bool]:
-    """Catch SIGINT and SIGTERM from here on. Returns a function that returns True once one has come."""
+    """Catch SIGINT and SIGTERM from now on. Returns a function that returns whether one of them has come."""
     has_stopped = False
 
     def stop(*_: object) -> None:

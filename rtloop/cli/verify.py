@@ -41,7 +41,7 @@ def verify(config: Path, spec: Path | None, out: Path | None, as_json: bool) -> 
 
     Shows every limit with the achieved value and the verdict, then margins and robustness.
 
-    Exit 1 where a loop, as it will run, is unstable or misses its specification; 0 where all are met.
+    Exit 1 where a loop, as it will run, is unstable or misses its specification; 0 where every loop meets it.
     """
     return verify_configuration(config, spec, out, as_json)
 
@@ -50,9 +50,9 @@ def verify_configuration(config: Path, spec: Path | None, out: Path | None, as_j
     """Judge and print every axis that has a controller; write a report to the folder `out`, if given.
 
     Returns the exit code: 1 where a loop is unstable or misses its specification, else 0. `spec` replaces the axes' own
-    specifications. Raises ConfigError for an invalid configuration or specification, without a controller, or where
-    python-control computes other figures; InputFileError for a file that cannot be read, OutputError for a report that
-    cannot be written, MissingExtra for a report without matplotlib.
+    specifications. Raises ConfigError for an invalid configuration or specification, if no axis has a controller, or
+    where python-control computes other figures; InputFileError for a file that cannot be read, OutputError for a report
+    that cannot be written, MissingExtra for a report without matplotlib.
     """
     from rtloop.configuration.checks import Findings, check_axes
     from rtloop.configuration.file import load

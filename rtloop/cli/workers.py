@@ -36,9 +36,9 @@ def choose_workers(
 ) -> Iterator[Workers]:
     """Yield the workers that run a command's functions, and close them at the end of the block.
 
-    They are `jobs` processes of this host (None: one for each processor), each of which has imported the module
-    `preload`, or the workers of the Dask scheduler at the address `scheduler`. Raises UsageError if both are given, and
-    the errors of `DaskWorkers`.
+    The workers are `jobs` processes of this host (None: one for each processor), each of which has imported the module
+    `preload`; or, if `scheduler` is given, the workers of the Dask scheduler at this address. Raises UsageError if both
+    are given, and the errors of `DaskWorkers`.
     """
     if jobs and scheduler:
         raise click.UsageError(

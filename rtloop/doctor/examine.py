@@ -48,7 +48,10 @@ class Latency:
 
     @property
     def late_share(self) -> float:
-        """Fraction of ticks later than a period: the median over windows of 1 s, so that one stall does not count."""
+        """Fraction 0 … 1 of ticks that are late by more than a period: the median over windows of 1 s.
+
+        One stall does not count. A measurement of less than 1 s is one window.
+        """
         late = self.lateness_us > self.period_us
         window = max(1, round(self.pacing.rate_hz))
         windows = late[: late.size // window * window].reshape(-1, window) if late.size >= window else late[None, :]
@@ -66,10 +69,10 @@ class Examination:
 def examine(
     pacing: Pacing, seconds: float, root: Path = Path("/"), line: NetworkLine | SerialLine | None = None
 ) -> Examination:
-    """Run the loop's clock for `seconds` in another process, then check every condition of the host below `root`, and
-    the `line` to a node unless it is None. Returns the measured lateness and all findings.
+    """Measure the lateness of the loop's clock for `seconds` in another process, then check every condition of the host
+    below `root`, and the `line` to a node unless it is None. Returns the measured lateness and all findings.
 
-    Raises RtloopError if that process fails or does not end.
+    Raises RtloopError if that process fails, or does not end within START_S + 3 `seconds`.
     """
     before_s = Host({}, root).stolen_s()
     timeout_s = START_S + 3 * seconds
@@ -97,8 +100,8 @@ def examine(
 def check_conditions(host: Host, pacing: Pacing, line: NetworkLine | SerialLine | None = None) -> tuple[Finding, ...]:
     """Return the finding on each condition of a host for a loop with this pacing.
 
-    The conditions are the CONDITIONS of `machine`, then of `permissions`, then of `software`, and those of the line to
-    a node if there is one.
+    The conditions are the CONDITIONS of `machine`, then of `permissions`, then of `software`, then the conditions of
+    the `line` to a node unless it is None.
     """
     checks = (*machine.CONDITIONS, *permissions.CONDITIONS, *software.CONDITIONS)
     return (*(check(host, pacing) for check in checks), *node_conditions.check_line(line, host, pacing))

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 
 @dataclass(frozen=True)
 class Finding:
-    """A condition with its present value, the required one, the cost of a bad value, and the command that mends it.
+    """A condition: present value, wanted value, consequence of a bad value, and the command that corrects it.
 
     `good` is None where the host does not show the condition. `late_us` is the order of magnitude by which a tick may
     wake late while the value is bad. `writes` maps files to texts that mend the condition on the running host.

@@ -38,8 +38,8 @@ class Host:
         return sorted(f"/{path.relative_to(self.root)}" for path in self.root.glob(pattern.lstrip("/")))
 
     def refusal_reason(self, name: str) -> str:
-        """Return the kernel's reason for refusing the right `name`, such as "mlock"; "not requested" if `grants` have
-        no refusal of it.
+        """Return the kernel's reason for refusing the right `name`, such as "mlock"; "not requested" if `grants` has no
+        refusal of this right.
         """
         reasons = (text.partition(": ")[2] for text in self.grants["refused"] if text.startswith(f"{name}: "))
         return next(reasons, "not requested")
@@ -59,8 +59,8 @@ class Host:
         return (int(major), int(minor)) if (major + minor).isdigit() else (0, 0)
 
     def stolen_s(self) -> float:
-        """Return the processor time in s that a hypervisor took from this host since its start, of all processors
-        together; 0 if not shown.
+        """Return the processor time in s that a hypervisor took from this host since the host's start, summed over all
+        processors; 0 if the host does not show it.
         """
         fields = (self.read("/proc/stat") or "").partition("\n")[0].split()
         return int(fields[8]) / os.sysconf("SC_CLK_TCK") if len(fields) > 8 else 0.0

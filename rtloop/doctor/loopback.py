@@ -2,8 +2,8 @@
 
     reading[k] = gain · drive[k − delay] + offset + noise
 
-Gain, offset and noise come from the settled part of each step, so that neither slew nor settling bends them; the delay
-is the whole number of ticks at which the residual of the line above is least.
+Gain, offset and noise come from the settled part of each step, so that neither slew nor settling bends them. The delay
+is the whole number of ticks at which drive and reading correlate most.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ MIN_CORRELATION = 0.5
 
 @dataclass(frozen=True)
 class ChannelPair:
-    """Figures of an output and an input: `noise_v` is rms, `delay_ticks` None where the reading does not follow."""
+    """Figures of an output and an input: gain in V/V, rms noise; `delay_ticks` is None if the input does not follow."""
 
     gain: float
     offset_v: float
@@ -29,11 +29,11 @@ class ChannelPair:
 
 
 def measure_pair(drive_v: Real, reading_v: Real, settling_ticks: int) -> ChannelPair:
-    """Return gain, offset, noise and delay of a wire, from samples at which the drive has stood still for
-    `settling_ticks`.
+    """Return gain, offset, noise and delay of a wire from its recorded drive and reading, each (ticks,) in V.
 
-    `drive_v` and `reading_v` are (ticks,). The delay is searched from 0 to `settling_ticks`, in all samples. Raises
-    ValueError if the drive never stood still at two different values.
+    Gain, offset and noise are of the ticks at which the drive has stood still for `settling_ticks`; the delay is found
+    from 0 to `settling_ticks`, in all ticks. Raises ValueError if the drive did not stand still so long at two
+    different values.
     """
     changes = np.flatnonzero(np.diff(drive_v)) + 1
     starts = np.concatenate([[0], changes])
@@ -53,8 +53,9 @@ def measure_pair(drive_v: Real, reading_v: Real, settling_ticks: int) -> Channel
 
 
 def _find_delay(drive_v: Real, reading_v: Real, max_lag: int) -> int | None:
-    """Return the lag, 0 … `max_lag` ticks, with the largest |correlation|; None if that is below MIN_CORRELATION, and
-    for a constant reading.
+    """Return the lag of the reading, 0 … `max_lag` ticks, with the largest |correlation| of drive and reading.
+
+    None if this correlation is below MIN_CORRELATION, and for a constant reading.
     """
     if not np.ptp(reading_v):
         return None

@@ -35,7 +35,7 @@ def virtualisation(host: Host, pacing: Pacing) -> Finding:
     flags = next((line for line in (host.read("/proc/cpuinfo") or "").splitlines() if line.startswith("flags")), "")
     is_virtual = "hypervisor" in flags.split()
     value = (
-        f"virtual machine, {host.stolen_s():.1f} s of processor time taken by the hypervisor since the start"
+        f"virtual machine, {host.stolen_s():.1f} s of processor time taken by the hypervisor since this machine started"
         if is_virtual
         else "none seen"
     )
@@ -51,8 +51,9 @@ def virtualisation(host: Host, pacing: Pacing) -> Finding:
 
 
 def processors(host: Host, pacing: Pacing) -> Finding:
-    """Return the finding on the number of processors that this process may use: good for two or more, so that loop and
-    other processes do not share one.
+    """Return the finding on the number of processors that this process may use: good for two or more.
+
+    With two, the loop need not share a processor with the recorder and the service.
     """
     count = len(host.allowed_cpus)
     return Finding(
@@ -62,7 +63,7 @@ def processors(host: Host, pacing: Pacing) -> Finding:
         count >= 2,
         10_000.0,
         "recorder, service and loop share one processor",
-        "sudo taskset -cp 0-N $$, where N is the last processor, or a larger machine",
+        "sudo taskset -cp 0-N $$, where N is the number of the last processor; or a machine with more processors",
     )
 
 
@@ -79,13 +80,15 @@ def isolation(host: Host, pacing: Pacing) -> Finding:
         pacing.cpu in isolated,
         1000.0,
         "kernel threads and other real-time processes run between the ticks",
-        f"on the kernel's command line: isolcpus=domain,managed_irq,{cpu} rcu_nocbs={cpu}; in [loop]: cpu = {cpu}",
+        f"on the kernel's command line: isolcpus=domain,managed_irq,{cpu} rcu_nocbs={cpu}; "
+        f"in [loop] of the configuration: cpu = {cpu}",
     )
 
 
 def interrupts(host: Host, pacing: Pacing) -> Finding:
-    """Return the finding on devices' interrupts: good if none may come to the loop's processors, unknown if the host
-    lists none.
+    """Return the finding on devices' interrupts: good if none may come to the loop's processors.
+
+    `good` is None if the host lists no interrupt.
     """
     loop_processors, allowed_processors = loop_cpus(host, pacing), set(host.allowed_cpus)
     affinities = {path: parse_cpus(host.read(path) or "") for path in host.paths("/proc/irq/[0-9]*/smp_affinity_list")}
@@ -108,8 +111,9 @@ def interrupts(host: Host, pacing: Pacing) -> Finding:
 
 
 def frequency(host: Host, pacing: Pacing) -> Finding:
-    """Return the finding on the frequency governors of the loop's processors: good if all are "performance", unknown if
-    none is shown.
+    """Return the finding on the frequency governors of the loop's processors: good if all are "performance".
+
+    `good` is None if the host shows no governor.
     """
     paths = {f"{CPUS}/cpu{cpu}/cpufreq/scaling_governor" for cpu in loop_cpus(host, pacing)}
     governors = {path: text for path in paths if (text := host.read(path))}
@@ -130,10 +134,10 @@ def frequency(host: Host, pacing: Pacing) -> Finding:
 
 
 def idle_states(host: Host, pacing: Pacing) -> Finding:
-    """Return the finding on idle states: good if the measuring process may prevent deep ones, or if waking takes at
-    most SHORT_IDLE_US from each.
+    """Return the finding on idle states: good if the measuring process may prevent deep ones, or if a processor wakes
+    from each idle state within SHORT_IDLE_US.
 
-    The times to wake are read for processor 0; also good if the host shows none.
+    The times to wake are read for processor 0; also good if the host shows no idle state.
     """
     is_held_off = bool(host.grants["pm_qos"])
     latencies = [float(host.read(path) or 0) for path in host.paths(f"{CPUS}/cpu0/cpuidle/state*/latency")]
@@ -156,7 +160,7 @@ def idle_states(host: Host, pacing: Pacing) -> Finding:
 
 
 def clock_source(host: Host, pacing: Pacing) -> Finding:
-    """Return the finding on the kernel's clock: good if it is one of EXACT_CLOCKS, unknown if it is not shown."""
+    """Return the finding on the kernel's clock: good if it is in EXACT_CLOCKS; `good` is None if it is not shown."""
     folder = "/sys/devices/system/clocksource/clocksource0"
     path = f"{folder}/current_clocksource"
     source = host.read(path)
@@ -176,7 +180,7 @@ def clock_source(host: Host, pacing: Pacing) -> Finding:
 
 
 def siblings(host: Host, pacing: Pacing) -> Finding:
-    """Return the finding on hyper-threading: good if no core of the loop has a second thread, which would share it.
+    """Return the finding on hyper-threading: good if no core on which the loop may run has a second thread.
 
     Also good if the host does not show the threads of a core.
     """
@@ -199,7 +203,7 @@ def siblings(host: Host, pacing: Pacing) -> Finding:
 
 
 def swap(host: Host, pacing: Pacing) -> Finding:
-    """Return the finding on swap: good if there is none or memory may be locked, so that no page is swapped out."""
+    """Return the finding on swap: good if the host has no swap, or if the measuring process may lock its memory."""
     swap_files = [line.split()[0] for line in (host.read("/proc/swaps") or "").splitlines()[1:]]
     is_harmless = not swap_files or bool(host.grants["mlock"])
     value = (
@@ -211,7 +215,7 @@ def swap(host: Host, pacing: Pacing) -> Finding:
         "none, or locked memory",
         is_harmless,
         10_000.0,
-        "a page of the loop that was swapped out takes milliseconds",
+        "reading back a page of the loop that was swapped out takes milliseconds",
         "sudo swapoff -a",
     )
 

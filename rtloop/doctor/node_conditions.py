@@ -17,9 +17,9 @@ US_PER_MS = 1e3
 
 
 def check_line(line: NetworkLine | SerialLine | None, host: Host, pacing: Pacing) -> tuple[Finding, ...]:
-    """Return the findings on the line to a node; () for None, a driver without a node.
+    """Return the findings on the line to a node; () for None.
 
-    Only the finding of `route` for the loopback interface, and if that finding is bad.
+    A network line has only the finding of `route` if the node is on this computer, or if this finding is bad.
     """
     if isinstance(line, SerialLine):
         return (latency_timer(line, host), low_latency(line, host))
@@ -32,8 +32,9 @@ def check_line(line: NetworkLine | SerialLine | None, host: Host, pacing: Pacing
 
 
 def route(line: NetworkLine, host: Host) -> Finding:
-    """Return the finding on the route to the node: good if an interface leads there that is neither wireless nor down,
-    also the loopback interface.
+    """Return the finding on the route to the node: good if an interface that is neither wireless nor down leads to it.
+
+    The loopback interface is good, too.
     """
     name, required, net = line.interface, "a cable to the node", f"/sys/class/net/{line.interface}"
     if not name:
@@ -59,7 +60,7 @@ def route(line: NetworkLine, host: Host) -> Finding:
 
 
 def cable(line: NetworkLine, host: Host) -> Finding:
-    """Return the finding on the cable: good at MIN_SPEED_MBIT or more and full duplex, unknown if not shown."""
+    """Return the finding on the cable: good at MIN_SPEED_MBIT or more and full duplex; `good` is None if not shown."""
     net = f"/sys/class/net/{line.interface}"
     speed, duplex = host.read(f"{net}/speed"), host.read(f"{net}/duplex")
     required = f"{MIN_SPEED_MBIT} Mbit/s or more, full duplex"
@@ -74,8 +75,9 @@ def cable(line: NetworkLine, host: Host) -> Finding:
 
 
 def coalescing(line: NetworkLine) -> Finding:
-    """Return the finding on interrupt coalescing: good if the card interrupts at each packet at once, unknown if its
-    driver does not tell.
+    """Return the finding on interrupt coalescing: good if the card interrupts at once at each packet.
+
+    `good` is None if the card's driver does not tell.
     """
     required = "0 µs, not adaptive"
     if line.rx_usecs is None:
@@ -89,8 +91,9 @@ def coalescing(line: NetworkLine) -> Finding:
 
 
 def packet_merging(line: NetworkLine) -> Finding:
-    """Return the finding on large receive offload (LRO), with which the card waits to join packets: good if it is off,
-    unknown if its driver does not tell.
+    """Return the finding on large receive offload (LRO), with which the card waits to join packets: good if it is off.
+
+    `good` is None if the card's driver does not tell.
     """
     if line.collects is None:
         return Finding("large receive offload", "not shown", "off", None)
@@ -101,8 +104,9 @@ def packet_merging(line: NetworkLine) -> Finding:
 
 
 def card_interrupts(line: NetworkLine, host: Host, pacing: Pacing) -> Finding:
-    """Return the finding on the card's interrupts: good if none may come to the loop's processors, unknown if the host
-    lists no interrupt of the card.
+    """Return the finding on the card's interrupts: good if none may come to the loop's processors.
+
+    `good` is None if the host lists no interrupt of the card.
     """
     loop_processors, allowed = loop_cpus(host, pacing), set(host.allowed_cpus)
     numbers = _interrupt_numbers(host.read("/proc/interrupts") or "", line.interface)
@@ -123,7 +127,10 @@ def card_interrupts(line: NetworkLine, host: Host, pacing: Pacing) -> Finding:
 
 
 def _interrupt_numbers(table: str, interface: str) -> set[str]:
-    """Return the numbers of an interface's interrupts in the text of /proc/interrupts: `eth1`, `eth1-rx-0`, …"""
+    """Return the numbers of an interface's interrupts in `table`, the text of /proc/interrupts.
+
+    For eth1, these are the interrupts of the names eth1, eth1-rx-0, …
+    """
     numbers = set[str]()
     for line in table.splitlines():
         number, _, rest = line.strip().partition(":")
@@ -134,8 +141,9 @@ def _interrupt_numbers(table: str, interface: str) -> set[str]:
 
 
 def latency_timer(line: SerialLine, host: Host) -> Finding:
-    """Return the finding on the latency timer of an FTDI adapter: good if it hands on received bytes after 1 ms,
-    unknown for a line without such a timer.
+    """Return the finding on the latency timer of an FTDI adapter: good if it hands on received bytes after 1 ms.
+
+    `good` is None for a line without such a timer.
     """
     path = f"/sys/bus/usb-serial/devices/{_terminal(line)}/latency_timer"
     milliseconds = host.read(path)
@@ -149,8 +157,9 @@ def latency_timer(line: SerialLine, host: Host) -> Finding:
 
 
 def low_latency(line: SerialLine, host: Host) -> Finding:
-    """Return the finding on a serial port's flag low_latency, with which received bytes are handed on at once: good if
-    it is set, unknown if the flags cannot be read.
+    """Return the finding on a serial port's flag low_latency, with which the kernel hands on received bytes at once.
+
+    `good` is whether the flag is set, None if the flags cannot be read.
     """
     try:
         flags = int(host.read(f"/sys/class/tty/{_terminal(line)}/flags") or "", 0)

@@ -42,7 +42,7 @@ class SerialLine:
 
 
 def find_line(configuration: Configuration) -> NetworkLine | SerialLine | None:
-    """Return the line to the node of a configuration; None for a driver without a node behind a line."""
+    """Return the network or serial line to the node of a configuration; None for drivers other than "udp", "serial"."""
     options = configuration.driver_options
     if configuration.driver_kind == "udp":
         return find_network_line(str(vars(options)["host"]), int(vars(options)["port"]), vars(options)["bind"])
@@ -52,10 +52,10 @@ def find_line(configuration: Configuration) -> NetworkLine | SerialLine | None:
 
 
 def find_network_line(host: str, port: int, bind: str | None) -> NetworkLine:
-    """Return the interface by which the system would send to a node from the address `bind`, with its card's settings.
+    """Return the NetworkLine by which the system would send to a node at `host` and `port`: interface and settings.
 
-    `bind` None: from any address. No datagram is sent to the node. `interface` is "" without a route, also for a `host`
-    or `bind` that is unknown.
+    `bind` is the address of this computer from which it would send, None: any. No datagram is sent to the node.
+    `interface` is "" without a route, also for an unknown `host` or `bind`.
     """
     try:
         family, _, _, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)[0]
@@ -96,15 +96,15 @@ def _coalescing(interface: str) -> tuple[int | None, bool | None]:
 
 
 def _joins_packets(interface: str) -> bool | None:
-    """Return whether the card joins packets (LRO); None where its driver does not tell."""
+    """Return whether an interface's card joins packets (LRO); None where its driver does not tell."""
     words = _ask_card(interface, ETHTOOL_GFLAGS, 2)
     return None if words is None else bool(words[1] & FLAG_LRO)
 
 
 def _ask_card(interface: str, command: int, words: int) -> tuple[int, ...] | None:
-    """Return the answer of the interface's driver to a command of ethtool; None if it refuses.
+    """Return the answer of the interface's driver to the ethtool `command`; None if the driver refuses.
 
-    The answer has `words` numbers of 32 bits, as the struct of this command; the first is the command.
+    The answer is the struct of this command: `words` numbers of 32 bits, the first of them `command`.
     """
     answer = ctypes.create_string_buffer(struct.pack(f"{words}I", command, *[0] * (words - 1)), 4 * words)
     try:
@@ -117,7 +117,7 @@ def _ask_card(interface: str, command: int, words: int) -> tuple[int, ...] | Non
 def _interface_request(interface: str, number: int, content: bytes) -> bytes:
     """Return the kernel's answer to ioctl `number` about a network interface: a struct ifreq (40 bytes).
 
-    `content` (24 bytes) stands behind the name in the request. Raises OSError if the kernel refuses.
+    The request is the name of `interface`, 16 bytes, and `content`, 24 bytes. Raises OSError if the kernel refuses.
     """
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as any_socket:
         return fcntl.ioctl(any_socket, number, struct.pack("16s", interface.encode()) + content)

@@ -23,7 +23,7 @@ def _grant_command(limit: str) -> str:
 
 
 def fifo(host: Host, pacing: Pacing) -> Finding:
-    """Return the finding on SCHED_FIFO: good if it was granted to the measuring process, at the loop's priority."""
+    """Return the finding on SCHED_FIFO: good if the kernel granted it to the measuring process."""
     is_granted = host.grants["scheduler"] == "SCHED_FIFO"
     value = (
         f"granted, priority {host.grants['priority']}" if is_granted else f"refused: {host.refusal_reason('priority')}"
@@ -34,14 +34,14 @@ def fifo(host: Host, pacing: Pacing) -> Finding:
         "granted",
         is_granted,
         100_000.0,
-        "any busy process takes the processor from the loop for its time slices",
+        "any busy process may take the processor from the loop for a time slice",
         _grant_command("rtprio 99"),
     )
 
 
 def throttling(host: Host, pacing: Pacing) -> Finding:
     """Return the finding on real-time throttling, which stops threads that never sleep: good if it is off, or if the
-    loop sleeps; unknown if the host does not show the setting.
+    loop sleeps; `good` is None if the host does not show the setting.
 
     The loop sleeps if `spinning_share` is below SPINNING_SHARE.
     """
@@ -66,7 +66,7 @@ def throttling(host: Host, pacing: Pacing) -> Finding:
 
 def fair_server(host: Host, pacing: Pacing) -> Finding:
     """Return the finding on the kernel's fair server, which takes time from a spinning loop: good if it is off, for a
-    kernel before 6.12, and if the loop sleeps; else unknown if debugfs does not show the setting.
+    kernel before 6.12, and if the loop sleeps; else `good` is None if debugfs does not show the setting.
 
     The loop sleeps if `spinning_share` is below SPINNING_SHARE.
     """
@@ -96,8 +96,8 @@ def real_time_groups(host: Host, pacing: Pacing) -> Finding:
     """Return the finding on control groups, whose real-time scheduling may refuse SCHED_FIFO: good if SCHED_FIFO was
     granted, or if the kernel has no such scheduling.
 
-    Unknown if it was refused and the kernel's configuration is not shown. A control group has no real-time runtime by
-    default.
+    `good` is None if SCHED_FIFO was refused and the host does not show the kernel's configuration. A control group has
+    no real-time runtime by default.
     """
     options, is_granted = host.kernel_options, host.grants["scheduler"] == "SCHED_FIFO"
     name, requirement = "control groups", "allow SCHED_FIFO"
@@ -132,8 +132,9 @@ def locked_memory(host: Host, pacing: Pacing) -> Finding:
 
 
 def timer_slack(host: Host, pacing: Pacing) -> Finding:
-    """Return the finding on the timer slack, by which wake-ups may be late: good if it is 1 ns, and under SCHED_FIFO,
-    where it has no effect.
+    """Return the finding on the timer slack, by which wake-ups may be late: good if it is 1 ns, or under SCHED_FIFO.
+
+    The slack has no effect under SCHED_FIFO.
     """
     slack_ns, is_fifo = host.grants["timer_slack_ns"], host.grants["scheduler"] == "SCHED_FIFO"
     value = f"{slack_ns} ns" if slack_ns else host.refusal_reason("timer_slack_ns")

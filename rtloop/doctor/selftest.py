@@ -1,8 +1,9 @@
 """Self-test of the configured channels: gain, offset, noise, delay and the highest rate, with each output wired back.
 
-The loop runs in raw mode, as a run would: a small staircase within the axis's limits, ramped at its slew, parked in the
-end. Then it runs with outputs off, at one rate after another until periods are missed. Only the user knows whether a
-wire connects output and input: without tolerances the report has figures, and a verdict only on a wrong sign.
+The loop runs in raw mode, as a run would: each output follows a small staircase within the axis's limits, ramped at the
+axis's slew rate, and is parked at the end. Then the loop runs with outputs off, at one rate after another until too
+many periods are missed. Only the user knows whether a wire connects output and input: without tolerances the report has
+figures, and a verdict only on a wrong sign.
 """
 
 from __future__ import annotations
@@ -88,7 +89,7 @@ class SelfTest:
             channel = configuration.channels[axis.name]
             yield (
                 f"  {axis.name}: {channel.output} from {min(levels):g} V to {max(levels):g} V, at most "
-                f"{axis.limits.slew_v_per_s:g} V/s, for {staircase.duration_s:.1f} s; reads {channel.input}"
+                f"{axis.limits.slew_v_per_s:g} V/s, for {staircase.duration_s:.1f} s; measures {channel.input}"
             )
 
     def run(self, tolerances: Tolerances | None, progress: Callable[[str], None]) -> dict[str, object]:
@@ -96,10 +97,10 @@ class SelfTest:
         grants), `real` (whether the hardware is no simulation), and `exchange` as `_measure_exchanges` returns it.
 
         `passed` with tolerances: whether all wires are within them. Without: False if a position falls as its drive
-        rises, else None. Where it is True, the measured delay of each wire is stored for this host; whatever `passed`
-        is, so is the delay that exchanges with a node add. `progress` receives a text before the exchanges and for each
-        rate. Raises LoopFault for a run that trips, ends early or whose drive did not stand still, and if a node
-        answers no exchange; RtloopError and DriverError if a run cannot start, or a delay cannot be stored.
+        rises, else None. If `passed` is True, the measured delay of each wire is stored for this host. The delay that
+        exchanges with a node add is stored whatever `passed` is. `progress` receives a text before the exchanges and
+        for each rate. Raises LoopFault for a run that trips, ends early or whose drive did not stand still, and if a
+        node answers no exchange; RtloopError and DriverError if a run cannot start, or a delay cannot be stored.
         """
         configuration = self._configuration
         exchange = self._measure_exchanges(progress)
@@ -120,8 +121,8 @@ class SelfTest:
         """Measure EXCHANGES exchanges with a node; return {count, p50_us, p99_us, max_us, lost, late, added_us}.
 
         None for a driver without such exchanges. `lost` were not answered, `late` took longer than a period. `added_us`
-        is the delay that p99 adds to the model's: all of it where a tick waits for its own sample, else the whole
-        periods in it. `progress` receives a text first. Raises DriverError, LoopFault if no exchange was answered.
+        is the delay that is added to the model's delay: p99 if a tick waits for its own sample, else the whole periods
+        within p99. `progress` receives a text first. Raises DriverError, LoopFault if no exchange was answered.
         """
         configuration = self._configuration
         driver = build_driver(configuration)
@@ -130,7 +131,7 @@ class SelfTest:
         if exchanges is None:
             return None
         if not exchanges.durations_us:
-            raise LoopFault(f"none of {exchanges.lost} exchanges was answered; check the line to the node")
+            raise LoopFault(f"the node answered none of {exchanges.lost} exchanges; check the line to the node")
         p50_us, p99_us = np.percentile(exchanges.durations_us, [50, 99]).tolist()
         period_us = 1e6 / self._rate_hz
         added_us = p99_us if self._facts.delay_ticks == 0 else math.floor(p99_us / period_us) * period_us
@@ -152,8 +153,9 @@ class SelfTest:
     def _try_rates(self, progress: Callable[[str], None]) -> Iterator[tuple[float, float]]:
         """Run the loop at one rate after another, outputs off. Yields (Hz, fraction of periods missed) of each.
 
-        The rate is doubled while at most MISSED_SHARE is missed; if the first misses more, it is halved until one does
-        not. It ends after MAX_RATE_TRIALS rates, and at the driver's highest rate or MAX_RATE_HZ.
+        The first rate is the configured one. The rate is doubled while at most MISSED_SHARE of the periods is missed;
+        if the first rate misses more, the rate is halved until one does not. At most MAX_RATE_TRIALS rates are tried,
+        none above the driver's highest rate or MAX_RATE_HZ.
         """
         rate_hz, factor = self._rate_hz, 2.0
         for index in range(MAX_RATE_TRIALS):
@@ -211,8 +213,9 @@ class SelfTest:
 
 
 def _sign_verdict(slope_um_per_v: float | None) -> bool | None:
-    """Return False if the position falls as the drive rises, which makes a loop unstable; else None, never True: the
-    slope alone says no more.
+    """Return False if the position falls as the drive rises, which makes a loop unstable; else None, never True.
+
+    A slope above 0 alone does not show that gain and offset are right.
     """
     return False if slope_um_per_v is not None and slope_um_per_v < 0.0 else None
 
@@ -222,8 +225,8 @@ def _staircase(
 ) -> Staircase:
     """Return the staircase of an axis: safe value, `amplitude_v` above it, safe value, `amplitude_v` below it.
 
-    The levels are within the axis's limits and the range of its output, one of `outputs`; each is held for longer than
-    the ramp to it takes.
+    The axis's limits and the range of its output, one of `outputs`, reduce the steps. Each level is held for longer
+    than the ramp to it takes.
     """
     output = outputs[channel_index(outputs, configuration.channels[axis.name].output)]
     lowest = max(output.safe_v - amplitude_v, output.minimum_v, axis.limits.lowest_v)
@@ -236,7 +239,7 @@ def _staircase(
 
 
 def _open_loop(configuration: Configuration, mode: ModeName, rate_hz: float) -> Configuration:
-    """Return the configuration at another mode and rate, without controllers, models, prefilters and schedule."""
+    """Return the configuration with `mode` and `rate_hz`, without controllers, models, pre-filters and schedule."""
     loop = configuration.loop.model_copy(update={"mode": mode, "rate_hz": rate_hz})
     update = {"controller": None, "model": None, "prefilter": PrefilterOptions()}
     axes = tuple(axis.model_copy(update=update) for axis in configuration.axes)
@@ -244,7 +247,7 @@ def _open_loop(configuration: Configuration, mode: ModeName, rate_hz: float) -> 
 
 
 def _run_and_load(prepared: Prepared) -> tuple[Recording, dict[str, object]]:
-    """Run once. Returns (the recording, all in memory; the host's real-time grants). Its file is deleted.
+    """Run the loop once, and delete the file of its recording. Returns (recording in memory, host's real-time grants).
 
     Raises LoopFault for a run that trips or ends early, as by Ctrl-C or SIGTERM; RtloopError or DriverError for a run
     that cannot start.

@@ -19,7 +19,8 @@ def compiled_code(host: Host, pacing: Pacing) -> Finding:
     """Return the finding on the cache of compiled code: good if it outlives a restart of the machine and has no damaged
     file.
 
-    A bad value makes a start slower, and no tick late. Raises OSError for a file of the cache that cannot be read.
+    A bad value makes the start of a run slower; it makes no tick late. Raises OSError for a file of the cache that
+    cannot be read.
     """
     cache_text = f"{CACHE_FOLDER}" if CACHE_IS_PERSISTENT else f"{CACHE_FOLDER}, gone after a restart"
     if damaged_count := len(damaged_files(CACHE_FOLDER)) + len(quarantined_files(CACHE_FOLDER)):
@@ -66,7 +67,7 @@ def libraries(host: Host, pacing: Pacing) -> Finding:
         not missing,
         0.0,
         f"{', '.join(missing)}: needed by rtloop, but not installed",
-        "pip install .",
+        "in the folder of rtloop's source: pip install .",
     )
 
 

@@ -29,10 +29,11 @@ class AxisDelay:
 
 
 def axis_delays(prepared: Prepared, latency: Latency) -> list[AxisDelay]:
-    """Return the phase 360° · f · lateness of each axis, at the crossover f with the least delay margin, for the median
-    and for the 99 % quantile of the lateness.
+    """Return for each axis the phase 360° · f · lateness at the crossover f with the least delay margin, for the median
+    and for the 99 % quantile of the lateness, and the delay margin.
 
-    Axes without a controller and a model, and unstable loops, are left out.
+    Axes whose loop is unstable are left out, and axes without a loop: without a controller that can be linearised, or
+    without a model.
     """
     delays, (p50_us, p99_us) = [], (latency.quantile_us(0.5), latency.quantile_us(0.99))
     for check in prepared.checks:
@@ -47,8 +48,8 @@ def axis_delays(prepared: Prepared, latency: Latency) -> list[AxisDelay]:
 def reasons_unsuitable(examination: Examination, delays: Sequence[AxisDelay] = ()) -> list[str]:
     """Return the reasons that make the host unsuitable for the loop, a sentence each; [] where it is suitable.
 
-    Reasons are: a bad condition that can make a tick later than a period, a measured tick that was, and an axis in
-    `delays` for which one tick in a hundred is later than its loop tolerates.
+    Reasons are: a bad condition that can make a tick late by more than a period, measured ticks that were late by more
+    than a period, and an axis in `delays` for which one tick in a hundred is later than the axis's loop tolerates.
     """
     latency = examination.latency
     objections = [

@@ -29,12 +29,14 @@ def derive_configuration(
     base: Configuration, axis: str, experiment: str, parameters: Mapping[str, object], run: Run, run_count: int,
     specification: Mapping[str, object], is_comparison: bool = False, reductions: Sequence[str] = (),
 ) -> Configuration:  # fmt: skip
-    """Return a copy of `base` that executes `run`: its timeline for `axis`, and its changes of the axis's plant.
+    """Return a configuration made from `base` that executes `run`: modes, references of `axis`, changes of its plant.
 
-    All other axes hold the reference 0. The first line of the text describes the run, as `read_metadata` returns it:
-    with the name of the `experiment`, its `parameters`, the number of its runs `run_count` and the axis's
-    `specification`. `is_comparison` marks a run of the second configuration (`--beside`), `reductions` are sentences on
-    reduced defaults. Raises ConfigError if the text is no valid configuration, for example with an unsuitable plant.
+    The run's schedule replaces the schedule of `base`; all other axes hold the reference 0. The first line of the
+    returned configuration's text is the description that `read_metadata` returns: among others the name of the
+    `experiment`, its `parameters`, the number of its runs (`run_count`) and the axis's `specification`.
+    `is_comparison`: the run belongs to the second configuration (`--beside`). `reductions` has a text for each default
+    that a limit reduced. Raises ConfigError if the result is no valid configuration, for example because of an
+    unsuitable plant.
     """
     raw = tomllib.loads(base.text)
     first_segment, timeline = run.timeline.segments[0], run.timeline
@@ -68,8 +70,8 @@ def derive_configuration(
 def store_tables(run: Run, folder: Path) -> None:
     """Write the tables of samples that a run plays to `folder` as npy files, named as in `run.tables`.
 
-    The run's references are changed in place: they then name these files by absolute path. A missing folder is made,
-    existing files are overwritten. Raises OutputError if a file cannot be written.
+    The run's references to these tables are changed in place: they name the files by absolute path. A missing folder is
+    made, existing files are overwritten. Raises OutputError if a file cannot be written.
     """
     for name, samples in run.tables.items():
         with output_errors(folder / name):
@@ -86,12 +88,13 @@ def store_tables(run: Run, folder: Path) -> None:
 
 
 def read_metadata(configuration: str) -> dict[str, Any] | None:
-    """Return the description of the run in the first line of a configuration's text; None for any other first line.
+    """Return the description of an experiment's run from the first line of a configuration's text; None without one.
 
-    Keys, as `derive_configuration` writes them and unchecked: name (of the experiment), run (its label), runs (their
-    number), axis, may_trip, ticks, middle_um (the middle of its motion; an absent key means 0), parameters, asked (the
-    axis's specification), beside (whether the run is one of the second configuration), reduced (sentences on reduced
-    defaults), segments (each a list of the fields of Segment).
+    Unchecked keys, as `derive_configuration` writes them: name (of the experiment), run (the run's label), runs (number
+    of the experiment's runs), axis, may_trip, ticks, middle_um (middle of the run's motion; an absent key means 0),
+    parameters, asked (the axis's specification without its defaults), beside (whether the run belongs to the second
+    configuration), reduced (a text for each default that a limit reduced), segments (each a list of the fields of
+    Segment).
     """
     first_line = configuration.partition("\n")[0].removeprefix("# ")
     if not first_line.startswith(METADATA_PREFIX):

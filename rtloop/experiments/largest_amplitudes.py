@@ -21,14 +21,17 @@ FEEDFORWARD_PEAK = 1.02
 
 
 def largest_command(setting: Setting) -> Bound:
-    """Return the largest slow command without feedback, µm to both sides, with the limit that sets it."""
+    """Return the largest amplitude of a slow sine in mode feedforward, µm, with the limit that sets it.
+
+    It is `Setting.reach` divided by FEEDFORWARD_PEAK, because the inverse may add the dead band to the command.
+    """
     return setting.reach.divided(FEEDFORWARD_PEAK, "with the dead band, the command is up to", "the reference")
 
 
 def largest_step_up(setting: Setting) -> Bound:
-    """Return the largest height of a step of the reference up from 0 and back, µm, with the limit that sets it.
+    """Return the largest height ≥ 0 of a step of the reference up from 0 and back, µm, with the limit that sets it.
 
-    With a drive of one sign, the step is about the middle.
+    With a drive of one sign, the step starts at the middle of the reachable range instead of 0.
     """
     return _largest_step_towards(setting, 1.0)
 
@@ -36,7 +39,7 @@ def largest_step_up(setting: Setting) -> Bound:
 def largest_step_down(setting: Setting) -> Bound:
     """Return the largest height ≥ 0 of a step of the reference down from 0 and back, µm, with the limit that sets it.
 
-    With a drive of one sign, the step is about the middle.
+    With a drive of one sign, the step starts at the middle of the reachable range instead of 0.
     """
     return _largest_step_towards(setting, -1.0)
 
@@ -44,9 +47,9 @@ def largest_step_down(setting: Setting) -> Bound:
 def _largest_step_towards(setting: Setting, direction: float) -> Bound:
     """Return the largest height ≥ 0, µm, of a step of the reference from 0 and back, with the limit that sets it.
 
-    The step goes up for `direction` 1, down for −1. One towards the shorter side of the drive is taken to follow the
-    largest one to the longer side, because the hysteresis remembers that. With a drive of one sign, steps are about the
-    middle of the reachable range, and have equal room to both sides.
+    The step goes up for `direction` 1, down for −1. A step towards the shorter side of the drive's range, or down if
+    both sides are equal, is computed after the largest step to the other side, which the hysteresis remembers. With a
+    drive of one sign, steps start at the middle of the reachable range, and have equal room to both sides.
     """
     axis, model, drive_range_v = setting.axis, setting.model, setting.drive_range_v
     peak = max((model and model.step_peak) or UNKNOWN_PEAK, MIN_PEAK)
@@ -88,9 +91,10 @@ def largest_sine(setting: Setting) -> Bound:
 
 
 def largest_swept_sine(setting: Setting) -> Bound:
-    """Return the largest amplitude of a sine at any frequency, µm, with and without control, and what limits it.
+    """Return the largest amplitude of a sine at any frequency, µm, with the limit that sets it.
 
-    It neither trips nor is clipped at the resonance.
+    The amplitude holds for the command without a controller and for the reference in closed loop: even at the
+    resonance, the sine trips no interlock and no limit clips it.
     """
     interlocks, model = setting.axis.interlocks, setting.model
     closed_peak = max((model and model.tracking_peak) or 1.0, 1.0)
@@ -105,9 +109,10 @@ def largest_swept_sine(setting: Setting) -> Bound:
 
 
 def largest_part_of_drive(setting: Setting) -> Bound:
-    """Return the largest step of the drive without control, as a fraction 0 … 1 of the drive's limit.
+    """Return the largest step of the drive without control as a fraction 0 … 1 of `limits.drive_v`, with its limit.
 
-    Its overshoot trips neither the position interlock nor the sensor's. With the limit that sets it.
+    The step's overshoot trips neither the position interlock nor the sensor's. Without a model, the overshoot is taken
+    to be 100 %.
     """
     drive_v = setting.axis.limits.drive_v
     overshoot_um = abs(setting.um_per_v) * drive_v * (setting.model.open_overshoot if setting.model else 2.0)
@@ -115,7 +120,7 @@ def largest_part_of_drive(setting: Setting) -> Bound:
         Bound(1.0, f"limits.drive_v = {drive_v:g}"),
         Bound(
             setting.trip_um / overshoot_um,
-            f"{setting.trip.reason} (a step of the whole drive moves the stage by {overshoot_um:.4g} µm)",
+            f"{setting.trip.reason} (a step of the whole drive moves the stage by up to {overshoot_um:.4g} µm)",
         ),
     )
 
@@ -123,8 +128,8 @@ def largest_part_of_drive(setting: Setting) -> Bound:
 def largest_true(condition: Callable[[float], bool], upper: float) -> float:
     """Return a number from 0 to `upper` for which `condition` holds, at most 10⁻⁹ `upper` below the largest one.
 
-    By bisection: `condition` must be true up to one number, and false above it. `upper` if it is true there, 0 if it is
-    true nowhere.
+    The search is a bisection: `condition` must be true up to one number, and false above it. Returns `upper` if
+    `condition` is true for `upper`, 0 if it is true for no number above 0.
     """
     if condition(upper):
         return upper

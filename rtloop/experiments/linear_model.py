@@ -2,9 +2,9 @@
 
     P(z)   plant, held and delayed        L = C P,   S = 1/(1 + L),   T = L S,   F_x, F_v the pre-filter:
 
-    x = (T F_x + P S F_v) x_d
+    x = (T F_x + P S F_v) x_d               x: position, x_d: reference
 
-Linear throughout: the remaining hysteresis is not in it, and an experiment measures it too.
+The model is linear: it leaves out the remaining hysteresis, which an experiment measures too.
 """
 
 from __future__ import annotations
@@ -46,9 +46,9 @@ class LinearModel:
     def __init__(self, axis: AxisOptions, model: ModelOptions, rate_hz: float, rig_delay_ticks: int = 0) -> None:
         """Compute the plant of `model` at `rate_hz`, and its loop with the axis's controller and pre-filter.
 
-        Without a linear controller of this axis alone, or a stable loop, `loop` is None. `rig_delay_ticks` are the
-        simulated rig's samples of delay, which count where the model states none. Raises ValueError for a controller on
-        a model with as many zeros as poles.
+        `loop` is None if it is unstable, and without a controller of this axis alone that can be linearised.
+        `rig_delay_ticks` is the simulated rig's delay in samples, used if the model states no delay. Raises ValueError
+        for a model with as many zeros as poles, unless there is no such controller.
         """
         self.rate_hz = rate_hz
         self.dynamics = model.transfer()
@@ -72,12 +72,12 @@ class LinearModel:
 
     @cached_property
     def resonance_hz(self) -> float | None:
-        """Natural frequency ω_n/2π in Hz of the plant's least damped pair of poles; None without a pair."""
+        """Natural frequency ω_n/2π in Hz of the plant's least damped pair of poles; None if all poles are real."""
         return abs(least_damped_pole(self.dynamics)) / (2 * np.pi) if np.any(self.dynamics.poles.imag > 0) else None
 
     @cached_property
     def decay_per_s(self) -> float:
-        """Decay −Re s in 1/s of the plant's least damped pair of poles; 0 without a pair."""
+        """Decay −Re s in 1/s of the plant's least damped pair of poles; 0 if all poles are real."""
         return -least_damped_pole(self.dynamics).real if self.resonance_hz else 0.0
 
     def plant(self, hz: npt.ArrayLike) -> Complex:
@@ -90,25 +90,25 @@ class LinearModel:
     def tracking(self, hz: npt.ArrayLike) -> Complex | None:
         """Return the complex response (k,) from reference to position, pre-filter included, at frequencies (k,) in Hz.
 
-        None without a loop.
+        None without a stable loop.
         """
         return None if self.loop is None else self.loop.response_from_reference(hz)[0]
 
     def rejection(self, hz: npt.ArrayLike) -> Complex | None:
-        """Return the complex response S·P (k,) from a disturbance before the dynamics to the position.
+        """Return the complex response S·P (k,) from a disturbance to the position, at frequencies (k,) in Hz.
 
-        It is at frequencies (k,) in Hz; None without a loop.
+        The disturbance is added to the input of the dynamics. None without a stable loop.
         """
         return None if self.loop is None else self.plant(hz) / (1 + self.loop.open(hz))
 
     def open_response(self, command: Real) -> Real:
-        """Return the position (n,) at each tick for a command (n,), from rest and without a controller."""
+        """Return the position (n,) in µm at each tick for a command (n,) in µm, from rest and without a controller."""
         return simulate(*self._plant, command)[0]
 
     def closed_response(self, reference: Real) -> tuple[Real, Real] | None:
-        """Return position and command, (n,) each, for a reference (n,) before the pre-filter, from rest.
+        """Return position and command, (n,) each, for a reference (n,) at the input of the pre-filter, from rest.
 
-        None without a loop.
+        All are in µm. None without a stable loop.
         """
         if self.loop is None:
             return None
@@ -120,26 +120,25 @@ class LinearModel:
         return signals[0], signals[1]
 
     def disturbance_response(self, disturbance: Real) -> Real | None:
-        """Return the position (n,) under a disturbance Ω (n,) before the dynamics, the reference at 0.
+        """Return the position (n,) for a disturbance Ω (n,) added to the input of the dynamics, at the reference 0.
 
-        It is d − T d: d is the motion that Ω causes through the dynamics without a loop, T = L/(1 + L). None without a
-        loop.
+        Both are in µm. The position is d − T d, with T = L/(1 + L) and the motion d that Ω causes without a controller.
+        None without a stable loop.
         """
         displacement = simulate(*sampled_plant(self.dynamics, 1 / self.rate_hz), disturbance)[0]
         return None if self.loop is None else displacement - simulate(*self.loop.matrices, displacement)[0]
 
     @cached_property
     def step_peak(self) -> float | None:
-        """Largest |command| per height of a step of the reference; None without a loop."""
+        """Largest |command| in a step of the reference, divided by the step's height; None without a stable loop."""
         return None if self.loop is None else step_metrics(self.loop, ()).peak_command
 
     @cached_property
     def step_reversal(self) -> float | None:
-        """Largest command beyond 0, per height, of a step of the reference from 0 or back to it; ≥ 0.
+        """Largest command below 0 in a step of the reference up from 0 and in the step back to 0, per height; ≥ 0.
 
-        None without a loop.
-
-        The command of a step up may begin below 0. The command of a step back passes 0 by the overshoot of the step up.
+        The command of a step up may begin below 0. The command of the step back to 0 passes 0 by as much as the command
+        of the step up passes its final value. None without a stable loop.
         """
         if self.loop is None:
             return None
@@ -150,7 +149,7 @@ class LinearModel:
     def sine_peak(self) -> float | None:
         """Largest amplitude of the command per amplitude of a sine of the reference, over all frequencies.
 
-        None without a loop.
+        None without a stable loop.
         """
         if self.loop is None:
             return None
@@ -160,36 +159,38 @@ class LinearModel:
     def tracking_peak(self) -> float | None:
         """Largest amplitude of the position per amplitude of a sine of the reference, over all frequencies.
 
-        It contains the pre-filter. None without a loop.
+        The response contains the pre-filter. None without a stable loop.
         """
         tracking = None if self.loop is None else self.tracking(self.loop.frequencies)
         return None if tracking is None else float(np.abs(tracking).max())
 
     @cached_property
     def open_peak(self) -> float:
-        """Largest magnitude of the plant's response over its static gain, from 0.1 Hz to half the rate."""
+        """Largest magnitude of the plant's response from 0.1 Hz to half the rate, divided by its |static gain|."""
         resonances_hz = np.abs(self.dynamics.poles[self.dynamics.poles.imag > 0]) / (2 * np.pi)
         hz = np.concatenate([np.geomspace(0.1, self.rate_hz / 2, 3000), resonances_hz])
         return float(np.abs(self.plant(hz[hz < self.rate_hz / 2])).max() / abs(self.static_gain))
 
     @cached_property
     def open_overshoot(self) -> float:
-        """Largest position after a step of the command, over the final position: 1 without overshoot."""
+        """Largest position after a step of the command, divided by the final position: 1 without overshoot."""
         ticks = round(min(20 / max(self.decay_per_s, 20.0), 1.0) * self.rate_hz)
         return float(np.max(self.open_response(np.ones(ticks)) / self.static_gain))
 
     def is_stable_with_shift(self, shift_percent: float) -> bool:
         """Whether the loop is stable with the frequency of the plant's resonance shifted by `shift_percent`.
 
-        False without a linear controller of this axis alone. Raises ValueError for a plant without complex poles.
+        False without a controller of this axis alone that can be linearised. Raises ValueError for a plant without
+        complex poles.
         """
         loop = self.build_loop(shift_resonance(self.dynamics, shift_percent))
         return loop is not None and loop.is_stable
 
     def build_loop(self, plant: Transfer) -> Loop | None:
-        """Return the loop with another plant, stable or not; None without a linear controller of this axis alone.
+        """Return the loop of the axis's controller with `plant` in place of [axis.model], stable or not.
 
-        Raises ValueError for a plant with as many zeros as poles.
+        None without a controller of this axis alone that can be linearised. Raises ValueError for a plant with as many
+        zeros as poles.
         """
         if self._controller is None:
             return None
@@ -200,7 +201,7 @@ class LinearModel:
         """Shifts of the resonance in %, `down` and `up`, both ≥ 0, within which the loop is stable.
 
         (0, 0) for an unstable loop. An end is None if the loop is stable for all shifts that the search tries. None
-        without a resonance, or without a linear controller of this axis alone.
+        without a resonance, or without a controller of this axis alone that can be linearised.
         """
         if self._controller is None or not self.resonance_hz:
             return None
@@ -209,10 +210,10 @@ class LinearModel:
 
 
 def linear_model(axis: AxisOptions, rate_hz: float, rig_delay_ticks: int = 0) -> LinearModel | None:
-    """Return the model that predicts an axis; None for an axis without [axis.model].
+    """Return the LinearModel of an axis, its plant and loop; None for an axis without [axis.model].
 
-    `rig_delay_ticks` are the simulated rig's samples of delay, which count where the model states none. Raises
-    ValueError for a controller on a model with as many zeros as poles.
+    `rig_delay_ticks` is the simulated rig's delay in samples, used if the model states no delay. Raises ValueError for
+    a model with as many zeros as poles, unless there is no controller of this axis alone that can be linearised.
     """
     return None if axis.model is None else LinearModel(axis, axis.model, rate_hz, rig_delay_ticks)
 

@@ -37,9 +37,10 @@ class Response(NamedTuple):
 
 
 def tone(signal: Real, hz: float, rate_hz: float) -> Tone:
-    """Return complex amplitude and power ratio of `signal` (samples,) at `hz`; the phase refers to its first sample.
+    """Return the complex amplitude of the part of `signal` (samples,) at `hz`, and its fraction of the signal's power.
 
-    Raises ValueError for a frequency outside 0 … half the rate, and for less than MIN_CYCLES or three samples.
+    The phase refers to the first sample; the power is about the mean. Raises ValueError for a frequency that is
+    not between 0 and half the rate, and for fewer than MIN_CYCLES cycles or three samples.
     """
     if not 0 < hz < rate_hz / 2:
         raise ValueError(f"frequency: {hz:g} Hz; allowed: between 0 and {rate_hz / 2:g} Hz, half the rate")

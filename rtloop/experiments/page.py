@@ -8,16 +8,16 @@ from typing import Any
 
 from rtloop.values import render_page
 
-HEADINGS = {"asked": "asked", "claimed": "claimed", "model": "the model gives"}
+HEADINGS = {"asked": "required", "claimed": "claimed", "model": "the model gives"}
 
 
 def render_report(content: Mapping[str, Any], pictures: Mapping[str, Mapping[str, bytes]], links: Mapping[str, str],
          skipped: Mapping[str, str]) -> str:  # fmt: skip
     """Return the `content` of a Report as one HTML page.
 
-    `pictures` are PNG bytes by experiment and theme: dark on dark screens; paper is always light. `links` are the
-    recordings' paths relative to the page, by file name; `skipped` are the reasons why experiments were not done, by
-    name.
+    `pictures` are PNG bytes by experiment and theme, "light" or "dark": dark screens show the dark one, other screens
+    and paper the light one. `links` are the recordings' paths relative to the page, by file name; `skipped` are the
+    reasons why experiments were not done, by the experiment's name.
     """
     return render_page(
         __package__,
@@ -29,18 +29,18 @@ def render_report(content: Mapping[str, Any], pictures: Mapping[str, Mapping[str
 
 
 def comparison_keys(rows: Sequence[Mapping[str, object]]) -> list[str]:
-    """Return the keys of HEADINGS, in its order, for which any row has a value."""
+    """Return the keys of HEADINGS, in the order of HEADINGS, for which any row has a value other than None."""
     return [key for key in HEADINGS if any(row[key] is not None for row in rows)]
 
 
 def comparison_cell(row: Mapping[str, Any], key: str) -> str:
-    """Return the text of a row's cell in column `key` of HEADINGS, the model with its tolerance; "–" for None."""
+    """Return the text of a row's cell in column `key` of HEADINGS, for "model" with the tolerance; "–" for None."""
     value = row[key]
     return "–" if value is None else f"{format_number(value)} ± {row['tolerance']:.2g}" if key == "model" else value
 
 
 def second_value_cell(row: Mapping[str, Any]) -> str:
-    """Return as text the value that the second configuration, of `--beside`, gave, with its unit; "–" without one."""
+    """Return as text, with its unit, the row's value for the second configuration (`--beside`); "–" without a value."""
     value, unit = row["beside"], "" if row["unit"] == "1" else f" {row['unit']}"
     return "–" if value is None else format_number(value) + unit
 

@@ -50,10 +50,11 @@ class PlannedRun(NamedTuple):
 
 
 def load_stage(config: Path, axis: str | None) -> Stage:
-    """Load a configuration for experiments on `axis` (None: its only one), with the axis's specification.
+    """Return the Stage of a configuration for experiments on `axis` (None: the only axis), with its specification.
 
-    Raises ConfigError for an invalid configuration or specification, an unknown axis, and several axes without a
-    choice; InputFileError for a file that cannot be read, DriverError for a missing library.
+    The specification is empty if the axis names no specification file. Raises ConfigError for an invalid configuration
+    or specification, an unknown axis, and several axes without a choice; InputFileError for a file that cannot be read,
+    DriverError for a missing library.
     """
     base = load(config)
     prepared = prepare(base)
@@ -77,12 +78,13 @@ def plan_runs(
     compared: Stage | None = None,
     is_comparison: bool = False,
 ) -> tuple[list[PlannedRun], dict[str, str]]:
-    """Plan the runs of every suitable experiment; tables that they play are stored below `folder`.
+    """Plan the runs of every suitable experiment, and store the tables that these runs play below `folder`.
 
-    `options` by experiment. Defaults are fitted to the limits of `stage` and, where `compared` suits the experiment, to
-    its limits as well. `is_comparison`: `stage` is the one compared, and the options, fitted before, stay as they are.
-    Returns the runs and, by name, the reasons why other experiments are skipped. Raises ConfigError for options beyond
-    the axis's limits and for an invalid configuration of a run, OutputError if a table cannot be written.
+    `options` are by the experiment's name. Defaults are fitted to the limits of `stage` and, where the experiment can
+    be done on `compared`, to the limits of `compared` as well. `is_comparison`: `stage` is of the second configuration
+    (`--beside`), and the options are used unchanged. Returns the planned runs and, by the experiment's name, the
+    reasons why other experiments are skipped. Raises ConfigError for options that the axis's limits or the experiment
+    do not allow and for an invalid configuration of a run, OutputError if a table cannot be written.
     """
     planned_runs: list[PlannedRun] = []
     skipped: dict[str, str] = {}
@@ -103,7 +105,7 @@ def plan_runs(
 
 
 def _select_axis(base: Configuration, name: str | None) -> AxisOptions:
-    """Find the axis `name`, or the only one for None.
+    """Return the options of the axis `name`, or of the only axis for None.
 
     Raises ConfigError for an unknown name, and for None with several axes.
     """
@@ -128,12 +130,12 @@ def _unsuitable_reason(experiment: Experiment, stage: Stage) -> str | None:
 def _plan_experiment(
     experiment: Experiment, options: Options, stage: Stage, folder: Path, reductions: list[str], is_comparison: bool
 ) -> list[PlannedRun]:
-    """Plan the runs of one experiment, and store their tables; only the last one has `plan_next`.
+    """Return the planned runs of one experiment, and store their tables.
 
-    `reductions` are sentences on reduced defaults, for the report.
-
-    Raises UnsuitableLoop if the loop does not allow it, ConfigError for an invalid configuration of a run, OutputError
-    if a table cannot be written.
+    Only the last run has `plan_next`, and only if the experiment has `next_run`. `reductions` has a text for each
+    default that a limit reduced, for the report. Raises UnsuitableLoop if the loop does not allow the experiment,
+    ConfigError for options that the experiment refuses and for an invalid configuration of a run, OutputError if a
+    table cannot be written.
     """
     base, setting = stage.base, stage.setting
     runs = experiment.runs(options, setting)

@@ -77,10 +77,11 @@ class Experiment(Generic[Chosen, Curves]):
         return None
 
     def fit_options(self, options: Options, setting: Setting, compared: Setting | None = None) -> Options:
-        """Return the options with defaults for the axis, scaled down to its limits unless a user set them.
+        """Return a copy of the options: absent defaults filled in for the axis, all defaults scaled down to its limits.
 
-        They keep the limits of a `compared` setting, too. Raises ConfigError for values that a user set beyond the
-        limits, UnsuitableLoop where the limits leave no room.
+        Options that a user set stay unchanged. The limits of a `compared` setting, unless it is None, hold too. Raises
+        ConfigError for values that a user set beyond the limits, UnsuitableLoop if less than LEAST_SHARE of a default
+        would remain.
         """
         return self._fit(options, setting, compared)[0]
 
@@ -126,24 +127,25 @@ class Experiment(Generic[Chosen, Curves]):
         return options.model_copy(update=changes), reductions
 
     def _bound(self, key: str, sign: float, setting: Setting, compared: Setting | None) -> tuple[float, str]:
-        """Return the largest allowed magnitude of an option's positive or negative numbers, and the key that limits it.
+        """Return the largest allowed magnitude of an option's positive (`sign` 1) or negative (−1) numbers.
 
-        `sign` is 1 or −1; `key` is the option's. The smaller limit of `setting` and, unless it is None, of
-        `compared` counts.
+        A text follows it: the configuration key, with its value, that sets this limit. `key` is the option's key. The
+        smaller limit of `setting` and, unless it is None, of `compared` counts.
         """
         bound_of_setting = self.limits[key] if sign > 0 else self.lower_limits.get(key, self.limits[key])
         limit, reason = bound_of_setting(setting)
         place = f"axis.{setting.axis.name}.{reason}"
         if compared is not None and (bound := bound_of_setting(compared))[0] < limit:
-            return bound[0], f"axis.{compared.axis.name}.{bound[1]} of the configuration after --beside"
+            return bound[0], f"axis.{compared.axis.name}.{bound[1]} of the second configuration (--beside)"
         return limit, place
 
 
 def _scale_down(value: object, limits: Sequence[float]) -> float | tuple[float, ...]:
-    """Return a number, or a tuple of numbers, scaled down to `limits`, the largest positive and negative magnitudes.
+    """Return a number, or a tuple of numbers, scaled down to `limits`.
 
-    The limits are first rounded down to two significant digits. Equal limits scale all numbers by one factor, unequal
-    ones each sign by its own; no factor is above 1.
+    `limits` are the largest magnitudes allowed for positive and for negative numbers, in this order. They are first
+    rounded down to two significant digits. Equal limits scale all numbers by one factor, unequal limits each sign by a
+    separate one; no factor is above 1.
     """
     numbers = np.atleast_1d(np.asarray(value, dtype=float))
     rounded = [_round_down(limit) for limit in limits]

@@ -35,7 +35,10 @@ class RecordedRun:
     """
 
     def __init__(self, recording: Recording) -> None:
-        """Read the run's description from the recorded configuration. Raises RecordingError if there is none."""
+        """Read the run's description from the recorded configuration.
+
+        Raises RecordingError if there is no description, or a damaged one.
+        """
         metadata = read_metadata(recording.configuration)
         if metadata is None:
             raise RecordingError(
@@ -53,7 +56,8 @@ class RecordedRun:
     def _read(self, metadata: dict[str, Any]) -> None:
         """Set this run's attributes from its description, the table that `read_metadata` returns.
 
-        Raises LookupError for a missing key, TypeError or ValueError for a value of another type.
+        Raises LookupError for a missing key, TypeError or ValueError for unsuitable segments or an invalid
+        specification; values of other keys are not checked.
         """
         self.experiment: str = metadata["name"]
         self.label: str = metadata["run"]
@@ -70,7 +74,7 @@ class RecordedRun:
 
     @property
     def paths(self) -> tuple[Path, ...]:
-        """The files of the recording, in the order of the run."""
+        """The files of the recording, in the order in which the run wrote them."""
         return self.recording.paths
 
     @property
@@ -95,7 +99,7 @@ class RecordedRun:
 
     @property
     def actuator_model(self) -> PlayModel:
-        """The forward hysteresis model as identified, dead band included."""
+        """Hysteresis model from drive (V) to displacement (µm) of [axis.feedforward], dead band included."""
         return self.axis_options.feedforward.actuator()
 
     @cached_property
@@ -105,7 +109,7 @@ class RecordedRun:
 
     @property
     def static_gain(self) -> float:
-        """D(0) of the axis's model; 1 without a model."""
+        """Static gain D(0) of the axis's model, µm of position per µm of command; 1 without a model."""
         return self.model.static_gain if self.model else 1.0
 
     def row(
@@ -113,8 +117,8 @@ class RecordedRun:
     ) -> Row:
         """Return the row of a quantity: its value `run` in this run and the `model`'s, both in `unit`.
 
-        The run may miss the model by `tolerance`. The axis's specification has limit and claim under `name`; they are
-        None for an unknown name.
+        The run may miss the model by `tolerance`. The axis's specification gives the row's limit and claim under
+        `name`; each is None where the specification does not have it.
         """
         return Row(
             quantity,
@@ -137,7 +141,8 @@ class RecordedRun:
     def require_complete(self) -> None:
         """Raise UnsuitableData for a run that was cut short, lost ticks, tripped or was clipped.
 
-        Trips and clipping are allowed where the experiment expects a trip.
+        Trips and clipping are no fault of a run that may trip. Clipping before the end of the approach to the middle of
+        the motion is no fault either.
         """
         if self.first_trip and not self._may_trip:
             causes = ", ".join(self.first_trip["causes"])
@@ -161,9 +166,9 @@ class RecordedRun:
             )
 
     def _flags(self) -> Real:
-        """Return a copy of the recorded flags (ticks,), with 0 until the approach to the middle has ended.
+        """Return a copy of the recorded flags (ticks,), with 0 up to the end of the approach to the motion's middle.
 
-        Before, at 0 V, noise alone clips a drive of one sign.
+        Near 0 V, before that end, noise alone clips a drive of one sign.
         """
         flags = self.recording["flags"].copy()
         if approaches := self.segments_labelled(APPROACH):
@@ -171,14 +176,14 @@ class RecordedRun:
         return flags
 
     def signal(self, name: str) -> Real:
-        """Return a signal (ticks,) of the axis; `name` is without the axis.
+        """Return a signal (ticks,) of the axis; `name` is without the axis, such as "position_um".
 
         Reference, position and command are relative to the middle of the run's motion.
         """
         return self.read(name)[0]
 
     def read(self, *names: str) -> list[Real]:
-        """Return several signals (ticks,) of the axis, read in one pass; `names` are without the axis.
+        """Return signals (ticks,) of the axis, read in one pass; `names` are without the axis, such as "position_um".
 
         Reference, position and command are relative to the middle of the run's motion.
         """
@@ -191,7 +196,7 @@ class RecordedRun:
         return signals
 
     def segments_labelled(self, *labels: str) -> list[Segment]:
-        """Return the segments with these labels, in order."""
+        """Return the segments that have one of these labels, in the order of time."""
         return [segment for segment in self.segments if segment.label in labels]
 
     def shortest_duration_s(self, label: str) -> float:
@@ -200,7 +205,7 @@ class RecordedRun:
 
     @property
     def simulated_hysteresis(self) -> str | None:
-        """Model that simulated the actuator's hysteresis, the option `truth` of the plant: "residual" by default.
+        """Model that simulated the actuator's hysteresis: option hysteresis.truth of the plant, "residual" by default.
 
         None for drivers other than "sim" and "shm".
         """

@@ -40,8 +40,8 @@ def select_experiments(names: Sequence[str]) -> list[Experiment]:
 def parse_parameters(experiments: Sequence[Experiment], settings: Sequence[str]) -> dict[str, Options]:
     """Return the options of each experiment by name, with the `settings` EXPERIMENT.KEY=VALUE applied.
 
-    VALUE is as in TOML. Raises ConfigError, with all faults, for another form, an experiment that is not among these,
-    an unknown key and a wrong value.
+    VALUE is written as in TOML. Raises ConfigError, with all faults, for a setting of another form, an EXPERIMENT that
+    is not among `experiments`, an unknown KEY and a wrong VALUE.
     """
     raw_options: dict[str, dict[str, object]] = {experiment.name: {} for experiment in experiments}
     faults = []

@@ -34,14 +34,14 @@ class Report(NamedTuple):
 
     @property
     def is_complete(self) -> bool:
-        """Whether every experiment could be analysed."""
+        """Whether every experiment was analysed and drawn: no section has a `problem`."""
         return all(section["problem"] is None for section in self.content["experiments"])
 
 
 def load_runs(paths: Sequence[Path]) -> list[RecordedRun]:
     """Load the runs that these files hold, in the order of their start; rotated files are one run.
 
-    Raises RecordingError for an unreadable file, and for a recording of no experiment.
+    Raises RecordingError for an unreadable file, and for a recording without a valid description of an experiment.
     """
     run_paths: dict[tuple[int, str | None], list[Path]] = {}
     for path in paths:
@@ -51,12 +51,12 @@ def load_runs(paths: Sequence[Path]) -> list[RecordedRun]:
 
 
 def make_report(runs: Sequence[RecordedRun], on_progress: ProgressCallback = lambda _: None) -> Report:
-    """Analyse all experiments found in one or more runs; `on_progress` receives a line for each.
+    """Return the report of all experiments found in `runs`, one or more; `on_progress` receives a line for each.
 
-    Runs of a second configuration add a column and curves; an experiment of that configuration alone is left out.
-    Without runs of the first configuration, the second takes its place. An experiment that cannot be analysed has a
-    `problem` and no pictures. Raises RecordingError where two recordings are of the same run, MissingExtra without
-    matplotlib.
+    Runs of a second configuration (`--beside`) add a column and curves; an experiment that only the second
+    configuration did is left out. If all runs are of the second configuration, it takes the place of the first. An
+    experiment that cannot be analysed or drawn has a `problem` and no pictures. Raises RecordingError if two recordings
+    are of the same run, MissingExtra without matplotlib.
     """
     sections, pictures_by_name = [], {}
     _require_distinct(runs)
@@ -93,10 +93,10 @@ def _experiment_section(
 ) -> tuple[dict[str, object], dict[str, bytes]]:
     """Return the section of one experiment for JSON, and its pictures by theme.
 
-    Keys: name, title, about, parameters, middle_um (the middle of the motion), reduced (a sentence for each default
-    that limits reduced), recordings (file names), periods_missed, problem, rows, tables, notes (which begin with the
-    middle, unless it is 0, and those sentences). The problem is None, or says why pictures, and possibly rows, are
-    missing. Raises MissingExtra without matplotlib.
+    Keys: name, title, about, parameters, middle_um (the middle of the motion), reduced (a text for each default that a
+    limit reduced), recordings (file names), periods_missed, problem, rows, tables, notes. The notes begin with one on
+    the middle, unless it is 0, and one for each reduced default. The problem is None, or the reason why pictures, and
+    possibly rows, are missing. Raises MissingExtra without matplotlib.
     """
     comparison: Analysis | None = None
     analysis: Analysis | None = None
@@ -136,7 +136,7 @@ def _experiment_section(
 
 
 def _middle_notes(run: RecordedRun) -> list[str]:
-    """Return a sentence on the middle of a run's motion; [] for a motion about 0."""
+    """Return a list of one note, on the middle of a run's motion; [] for a motion about 0."""
     if not run.middle_um:
         return []
     return [
@@ -162,12 +162,12 @@ def _analyse(experiment: Experiment, runs: Sequence[RecordedRun]) -> Analysis:
 
 
 def _configuration_name(run: RecordedRun) -> str:
-    """Name of the configuration that the run was derived from."""
+    """Name of the configuration from which the run was derived, by the name in the recording's header."""
     return run.recording.header["name"].rsplit(f"-{run.experiment}", 1)[0]
 
 
 def _require_distinct(runs: Sequence[RecordedRun]) -> None:
-    """Raise RecordingError where two recordings are of the same run: one experiment, label and configuration."""
+    """Raise RecordingError if two recordings are of the same run: same experiment, run label and configuration."""
     run_by_key: dict[tuple[str, str, bool], RecordedRun] = {}
     for run in runs:
         key = run.experiment, run.label, run.is_comparison

@@ -1,4 +1,4 @@
-"""Parts of the base configuration that an experiment may use, and the range of slow drives and commands there."""
+"""Parts of the base configuration that an experiment may use, and the slow drives and commands that it allows."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class Bound(NamedTuple):
     reason: str
 
     def divided(self, factor: float, effect: str, signal: str) -> Bound:
-        """Return the bound of a signal if the limited signal is `factor` times as large: the magnitude over `factor`.
+        """Return the bound of `signal` where the limited signal is `factor` times as large: the magnitude / `factor`.
 
         The reason gets an explanation that begins with `effect`: "(`effect` 1.4 times as large as `signal`)".
         """
@@ -55,9 +55,9 @@ class Setting:
     ) -> Timeline:
         """Return a new timeline that begins with depolarising, unless `is_virgin`, and a rest at `middle`.
 
-        The rest lasts `rest_s` in `rest_mode`; None: no rest. The actuator is depolarised about 0 V, with a drive of
-        one sign, or with `uses_whole_drive`, about the middle of the allowed drive. With `uses_whole_drive`, rests and
-        motions are about 0 instead of `middle`.
+        The rest lasts `rest_s` in `rest_mode`; None: no rest. The actuator is depolarised about 0 V; if the drive has
+        one sign or `uses_whole_drive` is True, about the middle of the drive's range. With `uses_whole_drive`, rests
+        and motions are about 0 instead of `middle`.
         """
         timeline = Timeline(self.rate_hz, ABOUT_ZERO if uses_whole_drive else self.middle)
         low_v, high_v = self.drive_range_v
@@ -76,26 +76,30 @@ class Setting:
 
     @property
     def trip(self) -> Bound:
-        """Largest displacement before the dynamics, µm, that trips neither the position interlock nor the sensor's."""
-        return self._trip_bound(self.sensor_um, "about 0")
+        """Largest |input| of the dynamics, µm, that trips neither the position interlock nor the sensor's, and its key.
+
+        The motion is about 0; the input of the dynamics is the displacement of the actuator.
+        """
+        return self._trip_bound(self.sensor_um, "for a motion about 0")
 
     @property
     def trip_um(self) -> float:
-        """Largest displacement before the dynamics, µm, that trips neither the position interlock nor the sensor's."""
+        """Largest |input| of the dynamics, µm, about 0, that trips neither the position interlock nor the sensor's."""
         return self.trip.magnitude
 
     def trip_towards(self, direction: float) -> Bound:
-        """Return the largest input of the dynamics in µm that trips no interlock, up (`direction` 1) or down (−1).
+        """Return the largest |input| of the dynamics in µm, for positions above 0 (`direction` 1) or below 0 (−1).
 
-        It is the smaller one of two bounds, the position interlock's and the sensor range's, each divided by the
-        static gain of the dynamics.
+        It trips neither the position interlock nor the sensor's: it is the smaller of the two ranges of the position,
+        divided by the |static gain| of the dynamics. The bound names the key that sets it.
         """
         return self._trip_bound(self.sensor_ends_um[1] if direction > 0 else -self.sensor_ends_um[0], "on this side")
 
     def _trip_bound(self, sensor_end_um: float, place: str) -> Bound:
-        """Return the largest input of the dynamics in µm by position interlock and sensor: the smaller bound.
+        """Return the largest |input| of the dynamics in µm: the smaller bound of position interlock and sensor.
 
-        The sensor's range ends at the position `sensor_end_um`; `place` says in the reason where, such as "about 0".
+        The sensor's range ends at the position `sensor_end_um`; `place` is the beginning of the reason's explanation,
+        such as "on this side".
         """
         interlocks, gain = self.axis.interlocks, abs(self.model.static_gain) if self.model else 1.0
         ends = f"sensor_min_v = {interlocks.sensor_min_v:g} and sensor_max_v = {interlocks.sensor_max_v:g}"
@@ -108,8 +112,8 @@ class Setting:
     def largest_drive(self, direction: float) -> tuple[float, str]:
         """Return the largest magnitude ≥ 0, in V, of a slow drive from 0 V, and the key that limits it.
 
-        `direction` is 1 for drives above 0 V, −1 for those below. The key is the drive's limit, or the interlock that
-        trips earlier, by the initial loading curve; it comes with its value, such as "limits.drive_v = 10".
+        `direction` is 1 for drives above 0 V, −1 for drives below 0 V. The key, with its value, is the drive's limit,
+        such as "limits.drive_v = 10", or the interlock that trips at a smaller drive on the initial loading curve.
         """
         limits = self.axis.limits
         largest_v, reason = (limits.drive_v, f"limits.drive_v = {limits.drive_v:g}")
@@ -136,9 +140,9 @@ class Setting:
 
     @cached_property
     def _one_sided_range(self) -> PositionRange:
-        """Lowest and highest slow command in µm that can follow in any order with a drive of one sign.
+        """Lowest and highest of the slow commands in µm that can follow each other in any order.
 
-        They are within the limits, the interlocks and the sensor's range.
+        The drive has one sign. Both ends are within the limits, the interlocks and the sensor's range.
         """
         actuator, gain = self.axis.feedforward.actuator(), abs(self.model.static_gain) if self.model else 1.0
         low_um, high_um = reachable_range(actuator, *self.drive_range_v, self.axis.limits.command_um)
@@ -147,7 +151,7 @@ class Setting:
 
     @cached_property
     def middle(self) -> Middle:
-        """Middle about which experiments move: 0, with a drive of one sign the middle of the reachable range."""
+        """Middle about which experiments move: 0 or, for a drive of one sign, the middle of the reachable range."""
         if not self.is_one_sided:
             return ABOUT_ZERO
         middle_um = float(f"{sum(self._one_sided_range) / 2:.3g}")
@@ -155,15 +159,19 @@ class Setting:
 
     @property
     def reach_v(self) -> float:
-        """Largest slow drive in V to both sides: within its limits, and below the interlocks of position and sensor."""
+        """Largest slow drive in V to both sides of 0 V.
+
+        It is within the drive's limits, and trips neither the position interlock nor the sensor's.
+        """
         low_v, high_v = self.drive_range_v
         return min(-low_v, high_v)
 
     @property
     def reach(self) -> Bound:
-        """Largest slow command in µm to both sides of the middle, such as a sine has, from rest.
+        """Largest slow command in µm to both sides of the middle, such as the amplitude of a sine, with its limit.
 
-        It is within the limits of command and drive, and trips neither the position interlock nor the sensor's.
+        The motion begins at rest. The command is within the limits of command and drive, and trips neither the position
+        interlock nor the sensor's.
         """
         limits = self.axis.limits
         if self.is_one_sided:
@@ -181,11 +189,11 @@ class Setting:
 
     @property
     def reach_um(self) -> float:
-        """Largest slow command in µm to both sides of the middle, as `reach`."""
+        """Largest slow command in µm to both sides of the middle: the magnitude of `reach`."""
         return self.reach.magnitude
 
     @property
     def um_per_v(self) -> float:
-        """Static gain in µm/V of the axis's hysteresis model, from 0 V to the largest drive."""
+        """Mean gain of the axis's hysteresis model, µm/V, on the initial loading curve from 0 V to `limits.drive_v`."""
         largest_v = self.axis.limits.drive_v
         return float(loading_curve(self.axis.feedforward.actuator(), largest_v) / largest_v)

@@ -100,9 +100,10 @@ class Timeline:
         self.references.append(reference)
 
     def depolarise(self, amplitude_v: float, middle_v: float = 0.0) -> None:
-        """Append DEPOLARISING_CYCLES cycles of a sine about `middle_v`, in V in mode raw, which erase the memory.
+        """Append DEPOLARISING_CYCLES cycles of a sine of the drive about `middle_v`, which erase the actuator's memory.
 
-        Each is a little smaller than the one before. To a middle other than 0 leads half a cycle, and another one back.
+        Each cycle is a little smaller than the one before. Half a cycle leads from 0 V to a `middle_v` other than 0,
+        and another one back to 0 V at the end.
         """
         half_s, half_v = 0.5 / DEPOLARISING_HZ, middle_v / 2
         if middle_v:
@@ -114,10 +115,10 @@ class Timeline:
             self._append("depolarise", "raw", sine(half_v, DEPOLARISING_HZ, half_v, 90.0), half_s)
 
     def schedule(self, axis: str) -> list[dict[str, object]]:
-        """Return entries of [[schedule]] for all segments but the first: {at_tick, axis, reference} for each, and
-        {at_tick, mode} where the mode changes.
+        """Return the entries of [[schedule]] for all segments but the first, in the order of time.
 
-        A mode holds for the whole loop, not for `axis` alone.
+        Each segment has {at_tick, axis, reference}, followed by {at_tick, mode} where the mode changes. A mode holds
+        for the whole loop, not for `axis` alone.
         """
         entries: list[dict[str, object]] = []
         for previous, segment, reference in zip(self.segments, self.segments[1:], self.references[1:], strict=False):
@@ -136,7 +137,7 @@ def hold(value: float) -> Reference:
 def sine(amplitude: float, frequency_hz: float, offset: float = 0.0, phase_deg: float = 0.0) -> Reference:
     """Return the reference {kind: "sine", amplitude, frequency_hz, offset, phase_deg}, in V in mode raw, else in µm.
 
-    The sine is about `offset`; for phase 0 it begins there and rises.
+    The sine is about `offset`; with a phase of 0, it begins at `offset` and rises.
     """
     return {
         "kind": "sine",

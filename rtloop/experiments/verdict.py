@@ -74,14 +74,17 @@ class Row:
 
     @property
     def mark(self) -> str:
-        """Return "good" if every answer is yes, "bad" if the limit is missed, else "mixed"; "" without an answer."""
+        """Return "good" if limit, claim and model agree with the run, "bad" if the limit is missed, else "mixed".
+
+        A limit, claim or model counts only where the row can judge it; "" without any.
+        """
         answers = [answer for answer in (self.is_met, self.is_as_claimed, self.is_as_modelled) if answer is not None]
         if not answers:
             return ""
         return "bad" if self.is_met is False else "good" if all(answers) else "mixed"
 
     def as_dict(self) -> dict[str, object]:
-        """Return the row and its answers by key; `run` and `model` may be NaN or infinite.
+        """Return the row and its judgements by key; `run` and `model` may be NaN or infinite.
 
         Keys: quantity, unit, asked (the limit as text), claimed (the claim's words), model, tolerance, run, met,
         as_claimed, as_the_model, verdict, mark. A value that does not exist is None.

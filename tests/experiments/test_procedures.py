@@ -246,7 +246,7 @@ def test_compared_configurations_share_the_smaller_defaults(smaller: str, tmp_pa
         plan_runs(experiments, too_large, stages[0], folder, compared=stages[1])
     message = str(refused.value)
     assert "steps.levels_um: 20 µm; allowed: up to 18.18 µm, limited by axis.x.limits.command_um" in message
-    assert ("of the configuration after --beside" in message) is (smaller == "compared")
+    assert ("of the second configuration (--beside)" in message) is (smaller == "compared")
 
 
 def test_a_configuration_that_is_not_compared_changes_no_default(tmp_path: Path) -> None:
@@ -294,7 +294,8 @@ def test_a_scan_stays_within_the_range_of_the_sensor() -> None:
     stage = Setting(RATE_HZ, axis, True, sensor_um=sensor_reach_um(base, axis))
     scan = EXPERIMENTS["scan"]
     with pytest.raises(
-        ConfigError, match=r"sensor_min_v = -1\.9 and sensor_max_v = 1\.9 \(about 0 the sensor's range ends at 18 µm"
+        ConfigError,
+        match=r"sensor_min_v = -1\.9 and sensor_max_v = 1\.9 \(for a motion about 0 the sensor's range ends at 18 µm",
     ):
         scan.fit_options(scan.options(amplitude_um=19.0), stage)
     assert scan.fit_options(scan.options(), stage).model_dump()["amplitude_um"] <= 18.0

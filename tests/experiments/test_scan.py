@@ -104,4 +104,7 @@ def test_a_cycle_in_which_the_loop_trips_is_the_last(learned_scan, tmp_path: Pat
 def test_a_frequency_that_the_ticks_do_not_divide(tmp_path):
     result = run(PAPER, tmp_path, "frequencies_hz=[30.0]")
     assert result.exit_code == 78
-    assert "scan.frequencies_hz: 30 Hz; allowed: periods of 4 or more whole ticks of 0.0001 s" in result.stderr
+    message = (
+        "scan.frequencies_hz: 30 Hz; allowed: frequencies with a period of 4 or more whole ticks, each of 0.0001 s"
+    )
+    assert message in result.stderr

@@ -141,7 +141,7 @@ def test_taps_that_are_no_better_are_not_sent_whatever_the_consent(
     text = capsys.readouterr().out
     assert "static gain of the plant 0.9500 ± 0.0010 (standard deviation) between 0 and 2.5" in text
     assert "-5.00 % from the model's" in text
-    assert "the new taps are no better; the taps in force stay" in text
+    assert "the new taps are no better; the loop keeps the present taps" in text
     assert not service.tuned
 
 

@@ -37,10 +37,10 @@ class CharacteriseOptions(Options):
 
 
 def runs(options: CharacteriseOptions, setting: Setting) -> list[Run]:
-    """Plan one run without control: slow sines of half the drive, then of all of it, then of a minor loop.
+    """Plan one run without control: slow sines of half the drive, then of the whole drive, then of a minor loop.
 
-    The smaller one is first, so that both begin on the initial loading curve. The minor loop is from 0 V to half the
-    larger end of the drive.
+    The sine of half the drive comes first, so that both sines begin on the initial loading curve. The minor loop is
+    between 0 V and half of the end of the drive that is farther from 0 V.
 
     All sines begin at 0 V. The whole drive reaches from its lowest to its highest value, which need not be opposite.
     """
@@ -135,19 +135,19 @@ def _range_notes(run: RecordedRun) -> list[str]:
         return []
     return [
         f"The limits allow a drive of {limits.lowest_v:g} … {limits.drive_v:g} V. The largest hysteresis loop was "
-        "driven over a smaller range, because the interlocks of position or sensor would have tripped in the rest."
+        "driven over a smaller range, because a larger drive would trip the interlock of position or sensor."
     ]
 
 
 def _table(shapes: Mapping[str, tuple[LoopShape, LoopShape]]) -> Table:
-    """Return a table of height h, width H and h/H of every loop, measured and modelled."""
+    """Return a table of height h in µm, range H in µm and h/H in % of every loop, measured and modelled."""
     rows = [[label, *(f"{value:.3f}" for shape in pair for value in (shape.height, shape.width, shape.percent))]
             for label, pair in shapes.items()]  # fmt: skip
     return Table("Loops", ("loop", "h / µm", "H / µm", "h/H / %", "model: h", "H", "h/H"), rows)
 
 
 def draw(figure: Figure, curves: Mapping[str, Any], ink: Palette) -> None:
-    """Draw the loops, the model with the major loop, and their difference over time.
+    """Draw the measured loops, the modelled major loop, and measured minus modelled position over time.
 
     `curves` come from `analyse`.
     """

@@ -61,7 +61,8 @@ def analyse(recordings: Sequence[RecordedRun], options: CompensationOptions) -> 
     """Evaluate the output y = x/D(0) of the compensation over the command v, both in µm, from one recording.
 
     x is the position relative to rest, D(0) the static gain of the dynamics. Rows: height h of the remaining loop, µm,
-    and h over its range H, %; largest |v − y|; slope ρ of y over v after half a cycle; largest |Ω| = |y − ρ v|.
+    and h over its range H, %; largest |v − y|; slope ρ of y over v, fitted without the first half cycle; largest
+    |Ω| = |y − ρ v|.
     """
     (run,) = recordings
     reference, position, drive = run.read("reference_um", "position_um", "drive_v")
@@ -94,10 +95,11 @@ def analyse(recordings: Sequence[RecordedRun], options: CompensationOptions) -> 
 
 
 def _modelled_output(run: RecordedRun, drive: Real, rest: Segment, segment: Segment) -> Real:
-    """Return the position (n,) of [axis.feedforward]'s actuator, relative to `rest`, in µm.
+    """Return the displacement (n,) of the actuator in µm, by [axis.feedforward], relative to its mean in `rest`.
 
-    It begins with the segment and ends with the recording; `drive` (ticks,), V, is of the whole recording. The model's
-    memory begins at the rest at 0, or, for a run about another middle, with the recording, before the way there.
+    The result begins with `segment` and ends with the recording; `drive` (ticks,), V, is of the whole recording. The
+    model starts without memory: at `rest` for a run about 0, else at the start of the recording, because the way to
+    another middle leaves a memory.
     """
     start = 0 if run.middle_um else rest.start_tick
     output_um = model_output(run.actuator_model, drive[start:])

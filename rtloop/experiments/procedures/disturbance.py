@@ -47,7 +47,7 @@ class DisturbanceOptions(Options):
 def runs(options: DisturbanceOptions, setting: Setting) -> list[Run]:
     """Plan a run in closed loop for the disturbance's step, and one for each of its sines.
 
-    They are apart because the rig's disturbance is fixed when the rig is built.
+    Each disturbance has a run to itself, because a rig's disturbance is fixed when the rig is built.
     """
     amplitude_um = options.amplitude_um or disturbance_um(setting)
     planned_runs = [_plan_run("step", {"step_um": amplitude_um}, STEP_S, setting, settle_s=0.0)]
@@ -73,7 +73,7 @@ def _plan_run(
 
 
 def disturbance_um(setting: Setting) -> float:
-    """Return the largest Ω of the axis's specification in µm; without one, PART_OF_REACH of the largest command."""
+    """Return the specification's largest Ω in µm; if it states none, PART_OF_REACH of the largest slow command."""
     limits = setting.specification.disturbance
     return limits.largest_um if limits else PART_OF_REACH * setting.reach_um
 
@@ -81,7 +81,8 @@ def disturbance_um(setting: Setting) -> float:
 def analyse(recordings: Sequence[RecordedRun], options: DisturbanceOptions) -> Analysis:
     """Evaluate the remaining error of the step over time, and of each sine, with the specification's limits.
 
-    `recordings` has one run for each; the curves are the error over time and over frequency, and the model's.
+    `recordings` has one run for the step and one for each sine, in any order. The curves are the error over time and
+    over frequency, measured and modelled.
     """
     rows: list[Row] = []
     table: list[list[str]] = []
@@ -148,8 +149,8 @@ def _row(
 def _step_rows(run: RecordedRun, error: Real, model: Real | None, amplitude_um: float) -> list[Row]:
     """Return rows of largest error, settling time (only with a limit), and static error after a step, in nm and ms.
 
-    `error` (n,) and the `model`'s, None without one, are in µm, from the step on. A step contains every frequency: a
-    limit up to some frequency applies to its end alone.
+    `error` (n,) and the `model`'s error (None without a model) are in µm and begin with the step. A step contains all
+    frequencies: a limit that holds up to some frequency judges the static error alone.
     """
     static_limit_um, peak_limit_um = (
         error_limit_um(run, 0.0, amplitude_um),

@@ -1,8 +1,8 @@
 """Stepped sines from high frequencies down to 0.01 Hz, for the drive alone, with feedforward, in closed loop.
 
-From high to low, whole cycles each: a frequency starts on the branch of the loop where the one before has ended, so
-that the slow ones need no cycle to settle. The amplitude is part of the answer, since a small one does not leave the
-dead band of the hysteresis.
+The frequencies fall, with whole cycles of each: a sine starts on the branch of the hysteresis loop on which the sine
+before it has ended, so that slow sines need no cycle to settle. The amplitude is part of the answer, since a small one
+does not leave the dead band of the hysteresis.
 """
 
 from __future__ import annotations
@@ -108,7 +108,8 @@ class HarmonicCurves(TypedDict):
 def analyse(recordings: Sequence[RecordedRun], options: HarmonicOptions) -> Analysis[HarmonicCurves]:
     """Evaluate magnitude, phase and coherence of each mode over frequency, beside the model's, from one recording.
 
-    Rows: peak without control, gain at low frequencies, and bandwidth and largest response of the closed loop.
+    Rows: peak without control, gain at low frequencies, bandwidth of the closed loop, and its largest response from
+    half the resonance's frequency on.
     """
     (run,) = recordings
     sweeps = {mode: _sweep(run, mode) for mode in MODES}
@@ -161,7 +162,8 @@ def analyse(recordings: Sequence[RecordedRun], options: HarmonicOptions) -> Anal
 def _model_hysteresis_db(run: RecordedRun, amplitude_um: float) -> tuple[float | None, float | None]:
     """Return the model's gain in dB at this amplitude, of the drive alone and with feedforward.
 
-    Both are None without a dynamic model, without Prandtl-Ishlinskii feedforward, or if this handles the dead band.
+    Both contain the static gain of the dynamics. Both are None without [axis.model], without Prandtl-Ishlinskii
+    feedforward, and unless the feedforward's `dead_band` is "none".
     """
     feedforward = run.axis_options.feedforward
     if not isinstance(feedforward, PrandtlIshlinskiiOptions) or run.model is None or feedforward.dead_band != "none":
@@ -172,7 +174,7 @@ def _model_hysteresis_db(run: RecordedRun, amplitude_um: float) -> tuple[float |
 
 
 def hysteresis_db(actuator: PlayModel, inverse: PlayModel, um_per_v: float, amplitude_um: float) -> tuple[float, float]:
-    """Return fundamental of the position over `amplitude_um`, in dB: for a sine of the drive, and of the command.
+    """Return the fundamental of the position divided by `amplitude_um`, in dB, for two sines: of drive and command.
 
     The drive, of `amplitude_um` / `um_per_v` volts, acts on `actuator` alone; the command, of `amplitude_um`, on
     `inverse` and then on `actuator`.
@@ -267,7 +269,7 @@ def draw(figure: Figure, curves: HarmonicCurves, ink: Palette) -> None:
 def _draw_column(panels: npt.NDArray[np.object_], curves: HarmonicCurves, ink: Palette) -> None:
     """Draw magnitude, phase and coherence of all modes in the three `panels` of a column, in this order.
 
-    Points of less coherence than MIN_COHERENCE are left out of the first two. `curves` come from `analyse`.
+    Points of less coherence than MIN_COHERENCE are left out of magnitude and phase. `curves` come from `analyse`.
     """
     magnitude, phase, coherence = panels
     for mode, color in zip(MODES, (ink.error, ink.drive, ink.measured), strict=True):

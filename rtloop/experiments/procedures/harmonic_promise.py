@@ -1,4 +1,4 @@
-"""Promise of the axis's own models for a harmonic response: figures for the verdicts, curves for the picture."""
+"""Promise of the axis's model for a harmonic response: figures for the verdicts, curves for the picture."""
 
 from __future__ import annotations
 
@@ -23,7 +23,10 @@ class HarmonicPromise:
     """
 
     def __init__(self, model: LinearModel | None, measured_hz: Real, rate_hz: float) -> None:
-        """Compute the responses of `model`, None without one, over the range of `measured_hz` (n,), which rise."""
+        """Compute the responses of `model` on a grid that covers the resonance and `measured_hz` (n,), which rise.
+
+        No response is computed for a `model` of None.
+        """
         self._model = model
         self.resonance_hz = (model and model.resonance_hz) or REFERENCE_HZ
         self.near_hz = RESONANCE_BAND[0] * self.resonance_hz, RESONANCE_BAND[1] * self.resonance_hz
@@ -39,7 +42,7 @@ class HarmonicPromise:
 
     @property
     def peak_hz(self) -> float | None:
-        """Frequency in Hz of the plant's largest response; None without a model, and for one without resonance."""
+        """Frequency in Hz of the plant's largest response; None without a model or for a model without resonance."""
         if self._open_db is None or self._model is None or not self._model.resonance_hz:
             return None
         return float(self._hz[self._open_db.argmax()])
@@ -48,7 +51,7 @@ class HarmonicPromise:
     def peak_db(self) -> float | None:
         """Largest response of the plant at the measured frequencies, in dB relative to its static gain.
 
-        None without a model, and for one without resonance.
+        None without a model or for a model without resonance.
         """
         if self._model is None or not self._model.resonance_hz:
             return None
@@ -58,7 +61,7 @@ class HarmonicPromise:
     def closed_low_db(self) -> float | None:
         """Response of the model's closed loop at the lowest measured frequency, in dB.
 
-        None without a model, and for one without a stable loop.
+        None without a model or for a model without a stable loop.
         """
         tracking = self._model.tracking(self._measured_hz[0]) if self._model else None
         return None if tracking is None else float(20 * np.log10(abs(tracking[0])))
@@ -67,7 +70,7 @@ class HarmonicPromise:
     def bandwidth_hz(self) -> float | None:
         """Frequency in Hz at which the model's closed loop is first 3 dB below its response at the lowest frequency.
 
-        None if it never is, without a model, and for one without a stable loop.
+        None if the response does not fall so far, without a model, and for a model without a stable loop.
         """
         if self._closed_db is None:
             return None
@@ -77,7 +80,7 @@ class HarmonicPromise:
     def closed_db_beyond(self, hz: float) -> float | None:
         """Largest response in dB of the model's closed loop at the measured frequencies from `hz` on.
 
-        None without such a frequency, without a model, and for one without a stable loop.
+        None without such a frequency, without a model, and for a model without a stable loop.
         """
         high = self._measured_hz[self._measured_hz >= hz]
         tracking = self._model.tracking(high) if self._model and high.size else None
@@ -86,7 +89,7 @@ class HarmonicPromise:
     def curves(self, shifts_db: tuple[float | None, ...]) -> list[Curve]:
         """Return curves (label, dashed, Hz, dB): the plant's response shifted by each of `shifts_db`, then the loop's.
 
-        A shift of None is left out, and so are the curves that need a model or a stable loop without one.
+        A shift of None has no curve. Without a model there is no curve, without a stable loop no curve of the loop.
         """
         curves: list[Curve] = []
         for shift_db in shifts_db:

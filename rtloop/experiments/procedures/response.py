@@ -1,6 +1,6 @@
-"""The loop and its margins, from a small multisine in closed loop; as `rtloop ctl response` on a loop that runs.
+"""Loop and margins, from a small multisine in closed loop; `rtloop ctl response` measures them in a running loop.
 
-The excitation is of the model's making where there is one: it moves the position equally at all frequencies.
+With a stable loop of the model, the excitation is shaped so that the model's position moves equally at all frequencies.
 """
 
 from __future__ import annotations
@@ -71,7 +71,7 @@ def runs(options: ResponseOptions, setting: Setting) -> list[Run]:
 
 
 def _reference_period(options: ResponseOptions, setting: Setting) -> Real:
-    """Return one period of the reference in µm, (samples,), beginning where it is nearest to 0.
+    """Return one period of the reference in µm, (samples,), which begins at the sample nearest to 0.
 
     Raises ConfigError for a band or period that `make_grid` refuses.
     """
@@ -86,7 +86,7 @@ def _reference_period(options: ResponseOptions, setting: Setting) -> Real:
 
 
 def _line_grid(options: ResponseOptions, setting: Setting) -> LineGrid:
-    """Return the lines of the multisine, dense about the model's resonance.
+    """Return the frequencies of the multisine as a LineGrid, dense about the model's resonance.
 
     Raises ConfigError for a band or period that `make_grid` refuses.
     """
@@ -161,7 +161,7 @@ def analyse(recordings: Sequence[RecordedRun], options: ResponseOptions) -> Anal
 
 
 def _motion_at_rest_um(run: RecordedRun, position_um: Real) -> float:
-    """Return how far the position at rest moves from its mean at most, in µm, in the last half of the last rest.
+    """Return the largest deviation of the position at rest from its mean, in µm, in the second half of the last rest.
 
     This rest follows the multisine. `position_um` (ticks,) has the whole run.
     """
@@ -179,7 +179,7 @@ def _row(
     model: float | None,
     tolerance_ratio: float = MARGIN_TOLERANCE,
 ) -> Row:
-    """Return the row of a measured value, with the `model`'s value, or None, and the limits under `name`.
+    """Return the row of a measured value, with the `model`'s value (or None), and the specification's limit of `name`.
 
     The tolerance is SIGMA_FACTOR standard deviations, or `tolerance_ratio` of the model's value if that is larger.
     """

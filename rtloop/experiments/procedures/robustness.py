@@ -119,17 +119,17 @@ def analyse(recordings: Sequence[RecordedRun], options: RobustnessOptions) -> An
 
 
 def settling_range(outcomes: Sequence[Outcome]) -> tuple[float, float]:
-    """Return the lowest and the highest tested shift of the resonance, %, that settles, as do all between it and 0.
+    """Return the ends, %, of the range of tested shifts about 0 in which each settles; (NaN, NaN) without any.
 
-    (NaN, NaN) without one, as where shift 0 does not settle.
+    The range is empty if shift 0 was tested and does not settle.
     """
     return range_about_zero({outcome.shift_percent: outcome.is_settled for outcome in outcomes})
 
 
 def range_about_zero(is_good: Mapping[float, bool]) -> tuple[float, float]:
-    """Return the least and the greatest good shift with no bad one from 0 to it; (NaN, NaN) without any.
+    """Return the least and the greatest good shift without a bad shift between 0 and it; (NaN, NaN) without any.
 
-    A bad shift 0 leaves none.
+    `is_good` is by shift. If 0 is bad, there is none.
     """
     good_shifts, bad_shifts = ([s for s, value in is_good.items() if value is expected] for expected in (True, False))
     lowest_bad, highest_bad = (

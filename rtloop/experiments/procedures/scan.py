@@ -54,7 +54,7 @@ def runs(options: ScanOptions, setting: Setting) -> list[Run]:
     """Plan the first run, in closed loop: unlearned triangles at each frequency in turn.
 
     Raises UnsuitableLoop without a model that has a stable loop of this axis alone, and if learning would not converge;
-    ConfigError for a frequency whose period is no whole number of ticks.
+    ConfigError for a frequency whose period is not 4 or more whole ticks.
     """
     lengths = [_period_ticks(hz, setting.rate_hz) for hz in options.frequencies_hz]
     for ticks in lengths:
@@ -67,8 +67,8 @@ def runs(options: ScanOptions, setting: Setting) -> list[Run]:
 def plan_next_run(run_records: Sequence[RecordedRun], options: ScanOptions, setting: Setting) -> Run | None:
     """Plan the next run, with the tables learned from the recordings so far; None after the last.
 
-    `run_records` are in order, cycle 0 first. At a frequency where the error grew beyond MAX_ERROR_GROWTH of the least
-    one, the table of the least error is played again. Raises UnsuitableLoop as `runs`.
+    `run_records` begin with cycle 0, in the order of the cycles. At a frequency where the last rms error is above
+    MAX_ERROR_GROWTH times the least, the table of the least error is played again. Raises UnsuitableLoop as `runs`.
     """
     if len(run_records) > options.cycles:
         return None
@@ -104,10 +104,13 @@ def _plan_run(cycle: int, options: ScanOptions, setting: Setting, tables: Sequen
 
 
 def _period_ticks(hz: float, rate_hz: float) -> int:
-    """Return a period in ticks. Raises ConfigError if it is no whole number of ticks, or less than 4."""
+    """Return the period of `hz` in ticks. Raises ConfigError unless it is a whole number of ticks, 4 or more."""
     ticks = round(rate_hz / hz)
     if ticks < 4 or abs(rate_hz / ticks / hz - 1) > 1e-9:
-        faults = [f"scan.frequencies_hz: {hz:g} Hz; allowed: periods of 4 or more whole ticks of {1 / rate_hz:g} s"]
+        faults = [
+            f"scan.frequencies_hz: {hz:g} Hz; allowed: frequencies with a period of 4 or more whole ticks, each of "
+            f"{1 / rate_hz:g} s"
+        ]
         raise ConfigError("parameters of the experiments", faults)
     return ticks
 
@@ -167,7 +170,7 @@ class ScanCurves(TypedDict):
 def analyse(recordings: Sequence[RecordedRun], options: ScanOptions) -> Analysis[ScanCurves]:
     """Evaluate the rms error of every frequency before and after learning, in % of peak to peak.
 
-    `recordings` are in the order of the cycles; a table has the error of each cycle, and the curves too.
+    `recordings` are in the order of the cycles. A table and the curves have the error of each cycle.
     """
     rows: list[Row] = []
     table, traces = [], []
@@ -189,7 +192,7 @@ def analyse(recordings: Sequence[RecordedRun], options: ScanOptions) -> Analysis
 
 
 def draw(figure: Figure, curves: ScanCurves, ink: Palette) -> None:
-    """Draw the error over a period before and after learning, and its size over the cycles.
+    """Draw the error over a period before and after learning, and the rms error over the cycles.
 
     `curves` come from `analyse`.
     """

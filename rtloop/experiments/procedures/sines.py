@@ -42,7 +42,7 @@ class SinesOptions(Options):
 def runs(options: SinesOptions, setting: Setting) -> list[Run]:
     """Plan one run in closed loop: a sine at each frequency in turn, in whole cycles.
 
-    The first cycle of each is to settle.
+    The first cycle of each sine is for settling and is not evaluated.
     """
     timeline = setting.timeline("closed_loop")
     for hz in options.frequencies_hz:
@@ -61,7 +61,8 @@ class SinesCurves(TypedDict):
 def analyse(recordings: Sequence[RecordedRun], options: SinesOptions) -> Analysis[SinesCurves]:
     """Evaluate rms error and phase at each frequency beside the model's, from one recording.
 
-    A table has the largest error, the gain and the coherence too; the curves are two cycles of each frequency.
+    A table also has the largest error, the gain and the coherence; the curves are the first two evaluated cycles of
+    each frequency.
     """
     (run,) = recordings
     reference, position = run.read("reference_um", "position_um")

@@ -65,7 +65,7 @@ class ModelResponse(NamedTuple):
 
 
 def runs(options: StepResponseOptions, setting: Setting) -> list[Run]:
-    """Plan one run in mode raw: rest, then a step of the drive without control."""
+    """Plan one run in mode raw: rest, then a step of the drive to `part_of_drive` times `limits.drive_v`."""
     timeline = setting.timeline("raw", uses_whole_drive=True)
     timeline.add("step", "raw", hold(options.part_of_drive * setting.axis.limits.drive_v), options.duration_s)
     return [Run("", timeline)]
@@ -82,10 +82,9 @@ class StepResponseCurves(TypedDict):
 
 
 def analyse(recordings: Sequence[RecordedRun], options: StepResponseOptions) -> Analysis[StepResponseCurves]:
-    """Evaluate overshoot, frequency and damping of the ringing, and final position, beside the model's.
+    """Evaluate overshoot, ringing (frequency and damping) and final position from one recording, beside the model's.
 
-    From one recording. The curves are the positions, measured and modelled, after the step. Raises UnsuitableData for
-    too little ringing.
+    The curves are the positions, measured and modelled, after the step. Raises UnsuitableData for too little ringing.
     """
     (run,) = recordings
     position = run.signal("position_um")
@@ -120,7 +119,7 @@ def analyse(recordings: Sequence[RecordedRun], options: StepResponseOptions) -> 
     if modelled.difference_percent is not None:
         difference = modelled.difference_percent
         rows.append(run.row("open_fit", "largest difference to the model", "%", difference, 0.0, 0.5))
-    notes = ["The axis has no model."]
+    notes = ["[axis.model] is missing: no model is compared with the measurement."]
     if run.model:
         notes = [
             "The model's response is scaled to the measured final position, because the hysteresis determines the "
@@ -150,7 +149,7 @@ def fit_ringing(height: Real, rate_hz: float, window_s: tuple[float, float] = RI
     """Return the ringing of the position `height` (n,) since a step, in µm, within the window.
 
     Its frequency (Hz), damping ratio and level c come from the fit of c + Re(a e^{(−σ + jω)t}). Raises UnsuitableData
-    for fewer than 50 ticks in the window, or no motion faster than MIN_PERIODS in it.
+    for fewer than 50 ticks in the window, and for no ringing of MIN_PERIODS or more periods in it.
     """
     from scipy.optimize import least_squares  # a quarter of a second of import, for one experiment of many
 

@@ -65,13 +65,16 @@ class Step(NamedTuple):
 def analyse(recordings: Sequence[RecordedRun], _: StepsOptions) -> Analysis:
     """Evaluate overshoot, settling and static error of every step, from one recording; the rows have their medians.
 
-    Raises UnsuitableData if no level differs from the one before for long enough.
+    Raises UnsuitableData if no level differs from the level before it and lasts long enough.
     """
     (run,) = recordings
     reference, position, command, drive = run.read("reference_um", "position_um", "command_um", "drive_v")
     measured_steps = _evaluate_steps(run, reference, position, command)
     if not measured_steps:
-        raise UnsuitableData("no step to evaluate: every level equals the level before it, or is too short")
+        raise UnsuitableData(
+            "no step to evaluate: every level equals the level before it, or is too short. Use other steps.levels_um, "
+            "or a longer steps.dwell_s"
+        )
     median_figures = np.median([step.figures for step in measured_steps], axis=0)
     start = run.segments_labelled("rest")[0].start_tick
     model_signals = run.model.closed_response(reference[start:]) if run.model else None
@@ -95,7 +98,9 @@ def analyse(recordings: Sequence[RecordedRun], _: StepsOptions) -> Analysis:
         run.row(
             "static_error_percent", "static error, median", "%", median_figures[2], model_figures[2], STATIC_TOLERANCE
         ),
-        run.row("peak_command", "peak of v per step, median", "1", median_figures[3], model_figures[3], PEAK_TOLERANCE),
+        run.row(
+            "peak_command", "peak of v per unit step, median", "1", median_figures[3], model_figures[3], PEAK_TOLERANCE
+        ),
     ]
     shown_ticks = round(
         min(SHOWN_SETTLINGS * max(median_figures[1], 1.0) / 1e3, run.shortest_duration_s("level")) * run.rate_hz
@@ -119,7 +124,7 @@ def analyse(recordings: Sequence[RecordedRun], _: StepsOptions) -> Analysis:
 
 
 def _evaluate_steps(run: RecordedRun, reference: Real, position: Real, command: Real) -> list[Step]:
-    """Return the figures of every level that differs from the one before, and lasts long enough for them.
+    """Return a Step for every level that differs from the level before it and lasts long enough to be evaluated.
 
     `reference`, `position` and `command` (ticks,) cover the whole run, measured or by the model.
     """
@@ -134,7 +139,7 @@ def _evaluate_steps(run: RecordedRun, reference: Real, position: Real, command: 
 
 
 def _scaled_steps(run: RecordedRun, position: Real, ticks: int) -> list[Real]:
-    """Return (position − level before)/height, without unit, in the first `ticks` of every step, (ticks,) each.
+    """Return (position − level before it)/height in the first `ticks` of every step, without unit, (ticks,) each.
 
     `ticks` must not exceed the shortest level, as the next level would follow in its place.
     """
@@ -145,7 +150,7 @@ def _scaled_steps(run: RecordedRun, position: Real, ticks: int) -> list[Real]:
 
 
 def _level_changes(run: RecordedRun) -> Iterator[tuple[Segment, float, float]]:
-    """Yield segment, level before and level, both in µm, of every level that differs from the one before."""
+    """Yield (segment, level before it in µm, level in µm) for every level that differs from the level before it."""
     previous_um = 0.0
     for segment in run.segments_labelled("level"):
         level = segment.values["level_um"]
@@ -162,7 +167,7 @@ def _steps_table(steps: Sequence[Step]) -> Table:
     """
     rows = [[f"{step.before_um:g} → {step.level_um:g} µm", *(f"{value:.{digits}f}" for value, digits in
              zip(step.figures, (2, 1, 3, 2), strict=True))] for step in steps]  # fmt: skip
-    headings = ("step", "overshoot / %", "settling / ms", "static error / %", "peak of v per step")
+    headings = ("step", "overshoot / %", "settling / ms", "static error / %", "peak of v per unit step")
     return Table("Every step", headings, rows)
 
 
