@@ -102,17 +102,17 @@ class Store:
         except BlockingIOError:
             close_descriptor(self._lock)
             raise UnavailableError(f"{folder}: another process runs this campaign; wait for it or stop it") from None
+        self._paths: dict[int, Path] = {}
         try:
             self._check_manifest(_manifest(campaign))
+            for path in _result_paths(folder):  # a longer file of the same unit, which is later, replaces a shorter one
+                first = _first_rig(path)
+                if first in self._paths:
+                    _remove(self._paths[first])
+                self._paths[first] = path
         except BaseException:
             self.close()
             raise
-        self._paths: dict[int, Path] = {}
-        for path in _result_paths(folder):  # a longer file of the same unit, which is later, replaces a shorter one
-            first = _first_rig(path)
-            if first in self._paths:
-                self._paths[first].unlink(missing_ok=True)
-            self._paths[first] = path
 
     def _check_manifest(self, manifest: Manifest) -> None:
         """Write the manifest to a folder without one.
@@ -158,7 +158,7 @@ class Store:
         self._write(path, self._bytes(table))
         self._paths[unit.first] = path
         if replaced is not None and replaced != path:
-            replaced.unlink(missing_ok=True)
+            _remove(replaced)
 
     def equals(self, case: CaseResult) -> bool | None:
         """Whether the stored row of the rig equals the row of its result `case` byte for byte; None without a row.
@@ -353,6 +353,12 @@ def _file_name(unit: Unit, last: int) -> str:
 def _result_paths(folder: Path) -> list[Path]:
     """Return the files of results in a folder, by their rigs; files of other names are ignored."""
     return sorted(path for path in (folder / RESULTS).glob("*.parquet") if FILE_NAME.fullmatch(path.name))
+
+
+def _remove(path: Path) -> None:
+    """Remove a file, if it exists. Raises OutputError if the system refuses."""
+    with output_errors(path):
+        path.unlink(missing_ok=True)
 
 
 def _first_rig(path: Path) -> int:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import errno
 import math
 import os
+from pathlib import Path
 
 import pyarrow.parquet
 import pytest
@@ -168,6 +170,25 @@ def test_a_kill_between_writing_and_removing_a_file_stores_no_rig_twice(runner, 
         summarise_campaign(folder)
     assert missing_rigs(runner, folder) == []
     assert summarise_campaign(folder).yield_of_rigs.rigs == 4
+
+
+def test_a_shorter_file_that_cannot_be_removed_is_named_and_the_folder_is_free_again(runner, folder, monkeypatch):
+    """The system may refuse to delete a file, as in a folder of another user."""
+    store_rigs(runner, folder, Unit(1, 2), [1, 2])
+    (short,) = (folder / "results").iterdir()
+    content = short.read_bytes()
+
+    def refuse(path, missing_ok=False) -> None:
+        raise PermissionError(errno.EACCES, "Permission denied", str(path))
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "unlink", refuse)
+        with pytest.raises(OutputError, match=f"{short.name}: Permission denied"):
+            store_rigs(runner, folder, UNIT, [3, 4])
+        with pytest.raises(OutputError, match=f"{short.name}: Permission denied"):
+            missing_rigs(runner, folder)
+    assert short.read_bytes() == content
+    assert missing_rigs(runner, folder) == []
 
 
 def test_fewer_rigs_than_before_delete_no_row(runner, folder):

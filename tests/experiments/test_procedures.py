@@ -168,6 +168,20 @@ def test_the_ringing_of_a_known_system_is_found() -> None:
     assert ringing.level == pytest.approx(40.0, abs=0.01)
 
 
+@pytest.mark.parametrize(
+    ("height", "rate_hz", "ticks"),
+    [
+        (np.ones(100), 200.0, "in 17 ticks"),
+        (np.ones(100), 5.0, "in 0 ticks"),
+        (np.zeros(2000), RATE_HZ, "ticks that contain"),
+    ],
+)
+def test_a_window_without_ringing_is_named(height: np.ndarray, rate_hz: float, ticks: str) -> None:
+    """A slow loop has too few ticks in the window, or none; a stage at rest has no ringing."""
+    with pytest.raises(UnsuitableData, match=f"no ringing found .*{ticks}"):
+        fit_ringing(height, rate_hz)
+
+
 def test_bandwidth_of_a_first_order_lag() -> None:
     hz = np.geomspace(0.01, 1000, 200)
     magnitude = -10 * np.log10(1 + (hz / 50) ** 2)

@@ -154,15 +154,18 @@ def fit_ringing(height: Real, rate_hz: float, window_s: tuple[float, float] = RI
     from scipy.optimize import least_squares  # a quarter of a second of import, for one experiment of many
 
     ringing = height[round(window_s[0] * rate_hz) : round(window_s[1] * rate_hz)]
+    fault = UnsuitableData(
+        f"no ringing found in {ringing.size} ticks, {1e3 * window_s[0]:.3g} to {1e3 * window_s[1]:.3g} ms after "
+        f"the step; allowed: at least 50 ticks that contain {MIN_PERIODS} or more periods of ringing"
+    )
+    if ringing.size < 50:
+        raise fault
     time_s = np.arange(ringing.size) / rate_hz
     spectrum = np.abs(np.fft.rfft((ringing - ringing.mean()) * np.hanning(ringing.size)))
     hz = np.fft.rfftfreq(ringing.size, 1 / rate_hz)
     spectrum[hz < MIN_PERIODS / (window_s[1] - window_s[0])] = 0.0
-    if ringing.size < 50 or not spectrum.any():
-        raise UnsuitableData(
-            f"no ringing found in {ringing.size} ticks, {1e3 * window_s[0]:.3g} to {1e3 * window_s[1]:.3g} ms after "
-            f"the step; allowed: at least 50 ticks that contain {MIN_PERIODS} or more periods of ringing"
-        )
+    if not spectrum.any():
+        raise fault
     start = [20.0, 2 * np.pi * hz[spectrum.argmax()]]
 
     def residual(unknowns: Real) -> Real:

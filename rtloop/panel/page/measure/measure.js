@@ -135,7 +135,7 @@ export class Measure {
     if (activity === "retune") {
       showRetuned(found);
       const { replaces, prefilter } = found;
-      return this.#propose("retuned", "Swap the new taps in", "Keep the taps in force", {
+      return this.#propose("retuned", "Swap the new taps in", "Keep the present taps", {
         name: "swap", body: { axis, replaces, prefilter }, done: ({ tick }) => `Swapped in at tick ${tick}.`,
       });
     }

@@ -48,7 +48,7 @@ const STEP = [
   ["highest_command", "largest command per unit", (value) => significant(value, 4)],
 ];
 
-/** A step on the stage as it was measured, with the taps in force and with new ones. */
+/** A step on the stage as it was measured, with the present taps and with new ones. */
 export function showRetuned({ resonance, percent_from_model, before, after }) {
   const sign = percent_from_model < 0 ? "" : "+";
   showFigures($("retuned-figures"), { resonance: `${significant(resonance.hz, 6)} ± ${significant(resonance.hz_std, 2)} Hz`, "difference from the model's": `${sign}${fixed(percent_from_model, 2)} %` });
