@@ -90,8 +90,8 @@ def estimate_response(
 
 
 def recording_response(run: Excitation) -> FrequencyResponse:
-    """Return the response of a recording from input to position; in closed loop, the external excitation is the
-    instrument.
+    """Return the response of a recording from input to position; in closed loop, the part of the input that follows
+    from the external excitation is the instrument.
 
     A recording shorter than two segments of SEGMENT_S gets two segments of half its length. Raises UnsuitableData where
     these have fewer than LEAST_SEGMENT samples, and for external signals that all stand still.
@@ -107,7 +107,7 @@ def _require_two_segments(samples: int, period_s: float, segment_s: float = SEGM
     if samples < 2 * round(segment_s / period_s):
         raise UnsuitableData(
             f"the recording has {samples * period_s:g} s of excitation; a frequency response needs at least "
-            f"{2 * segment_s:g} s"
+            f"{2 * segment_s:g} s. Record longer"
         )
 
 
