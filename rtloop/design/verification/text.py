@@ -93,8 +93,8 @@ def robustness(verification: Verification) -> list[tuple[str, ...]]:
 
 
 def scenarios(verification: Verification) -> list[tuple[str, ...]]:
-    """Return headings, then for each quantity label, limit, worst value, verdict and its plant; [] without
-    scenarios.
+    """Return headings, then a row for each quantity: label, limit, worst value, verdict, and the plant with the worst
+    value; [] without scenarios.
     """
     if verification.scenarios is None:
         return []
@@ -182,7 +182,8 @@ def simulation_notes(verification: Verification) -> list[str]:
 
 
 def _static_error_notes(verification: Verification) -> list[str]:
-    """Return a sentence on the static error of the linear loop where a simulated step misses its limit because of it.
+    """Return one note on the static error of the linear loop if a simulated step misses its limit because of this
+    error; otherwise [].
 
     The error is a part of the position: away from 0 it is a larger part of a small step.
     """
@@ -203,8 +204,8 @@ def _static_error_notes(verification: Verification) -> list[str]:
 
 
 def simultaneous_rows(margins: SimultaneousMargins) -> list[tuple[str, str]]:
-    """Return rows (label, text) of the margins of all axes of a controller together; one row "stable", "NO" if
-    unstable.
+    """Return rows (label, text) of the margins of all axes of a controller together; the single row ("stable", "NO") if
+    their loop is unstable.
     """
     if math.isnan(margins.max_sensitivity):
         return [("stable", "NO")]

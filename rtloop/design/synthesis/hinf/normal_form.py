@@ -49,7 +49,7 @@ class NormalForm(NamedTuple):
 def normalise(plant: GeneralisedPlant) -> NormalForm:
     """Return the normal form of a plant, with D12 = [0; I] and D21 = [0 I].
 
-    Its own D12 must have full column rank, and its D21 full row rank.
+    D12 of `plant` must have full column rank, and D21 full row rank.
     """
     scale = _state_scale(plant)
     a = plant.a * scale / scale[:, None]
