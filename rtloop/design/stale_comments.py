@@ -13,7 +13,7 @@ _COMMENT = re.compile(r"^\s*#")
 
 
 def split_schema_line(text: str) -> tuple[str, str]:
-    """Return the first line of a text with its end if it is `#:schema`, else "", and the rest."""
+    """Return the first line of a text with its line end if it begins with "#:schema ", otherwise "", and the rest."""
     match = _SCHEMA.match(text)
     return (match.group(), text[match.end() :]) if match else ("", text)
 

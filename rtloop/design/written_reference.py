@@ -38,13 +38,13 @@ def steps_reference(limits: LimitsOptions, actuator: PlayModel, slowest_hz: floa
 
 
 def describe_reference(values: StepsReference) -> str:
-    """Return `values`, as of `steps_reference`, as words: both levels in µm, and the duration of each."""
+    """Return the table that `steps_reference` makes as words: both levels in µm, and the duration of each in s."""
     levels = " and ".join(f"{level:g}" for level in values["levels"])
     return f"steps between {levels} µm, {values['dwell_s']:g} s each"
 
 
 def _levels_um(limits: LimitsOptions, actuator: PlayModel) -> list[float]:
-    """Return both levels of the square wave in µm, the farther first."""
+    """Return both levels of the square wave in µm, the one farther from rest first."""
     low_um, high_um = reachable_range(actuator, limits.lowest_v, limits.drive_v)
     if low_um <= 0 <= high_um:
         return [float(f"{STEP_PART * limits.command_um:.1g}"), 0.0]

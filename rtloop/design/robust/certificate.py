@@ -58,7 +58,7 @@ class Certificate(NamedTuple):
         checks = [
             ("max |S|", self.sensitivity, walls.sensitivity),
             (f"|S| at {walls.disturbance_hz:g} Hz", self.disturbance, walls.disturbance),
-            ("noise gain into v", self.noise_gain, walls.noise_gain),
+            ("noise gain from sensor to v", self.noise_gain, walls.noise_gain),
             ("time constant in ms of the slowest mode around a resonance", self.decay_ms, decay_ms or math.inf),
         ]
         return [

@@ -92,8 +92,7 @@ class Objective:
         return cost + np.sum((points - clipped) ** 2, axis=1)
 
     def measure(self, points: Real) -> Measures:
-        """Return the worst value of every quantity over the scenarios for points (k, n), which must be within bounds.
-        """
+        """Return the worst value of each quantity over the scenarios for points (k, n), which must be within bounds."""
         controllers = build_candidates(points)
         z_poles = self._closed_loop_poles(*controllers.matrices())
         rates = np.log(np.maximum(np.abs(z_poles), 1e-300)) / self.period_s

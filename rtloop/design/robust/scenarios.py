@@ -45,7 +45,7 @@ class Family:
     """
 
     def __init__(self, model: Transfer, delay_ticks: int, options: ScenarioOptions, period_s: float):
-        """Find the lightly damped modes of `model` below half the rate, and which of them lead.
+        """Find the lightly damped modes of `model` below half the rate, and the leading ones: the highest peaks.
 
         `delay_ticks` is the delay in samples unless `options` list delays.
         """

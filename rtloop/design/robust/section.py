@@ -100,7 +100,7 @@ def certified_values(proof: Certificate) -> list[tuple[str, float, str]]:
         ),
         ("max |S|", proof.sensitivity.value, str(proof.sensitivity.scenario)),
         ("|S| at the disturbance's frequency", proof.disturbance.value, str(proof.disturbance.scenario)),
-        ("noise gain into v", proof.noise_gain.value, str(proof.noise_gain.scenario)),
+        ("noise gain from sensor to v", proof.noise_gain.value, str(proof.noise_gain.scenario)),
     ]
 
 

@@ -116,7 +116,7 @@ QUANTITIES = {
     "settling_ms": ("settling (5 %)", "ms"),
     "overshoot_percent": ("overshoot", "%"),
     "peak_command": ("peak of v per unit step", ""),
-    "resonance_decay_ms": ("longest decay near the resonance", "ms"),
+    "resonance_decay_ms": ("longest decay time near the resonance", "ms"),
     "resonance_shift_percent": ("resonance may move by ±", "%"),
     "bandwidth_hz": ("bandwidth, |S| < 0.71", "Hz"),
     "disturbance_hz": ("disturbance held up to", "Hz"),
@@ -128,8 +128,8 @@ QUANTITIES = {
     "modulus_margin": ("modulus margin", ""),
     "max_sensitivity": ("max |S|", ""),
     "sensitivity_1hz": ("|S| at 1 Hz", ""),
-    "noise_x_nm": ("sensor noise in x, rms, linear", "nm"),
-    "noise_v_nm": ("sensor noise in v, rms, linear", "nm"),
+    "noise_x_nm": ("x due to sensor noise, rms, linear loop", "nm"),
+    "noise_v_nm": ("v due to sensor noise, rms, linear loop", "nm"),
     "gamma": ("‖F_l(P, C)‖∞ without delay", ""),
 }
 """Label and unit of each quantity computed for a loop."""

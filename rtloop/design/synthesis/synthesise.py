@@ -1,7 +1,7 @@
 """Synthesis of a runnable controller from a plant and weights: augmented plant, H∞ controller, reduction.
 
-The controller is written in s, and the loop's own rate makes C(z) of it. What `synthesise_design` returns is stable as
-it runs at that rate; `synthesise` alone knows of no rate.
+The controller is written in s, and the loop discretises it at its own rate to C(z). The controller of
+`synthesise_design` gives a stable loop at that rate; `synthesise` alone knows no rate.
 """
 
 from __future__ import annotations

@@ -89,7 +89,7 @@ class Bench:
         return dict(zip(plan.columns, run_in_process(plan, plan.driver(), ticks).T, strict=True))
 
     def true_positions(self, run: Mapping[str, Real], axis: str) -> Real:
-        """Return the true positions of a run at the POINTS of each period, in µm, (ticks, POINTS), the tick first."""
+        """Return the true positions of a run in µm at POINTS times in each period, the tick first, (ticks, POINTS)."""
         driver = cast("SimDriver", self._plan.driver())
         return true_positions(driver, driver.rig, axis, run, POINTS)
 

@@ -233,8 +233,7 @@ def verify(
 
 
 def _weights(design: DesignOptions) -> Weights | None:
-    """Return the weights of the design (`build_weights`); None if it lacks a value for them or a rule cannot make them.
-    """
+    """Return the weights of `design`; None if `build_weights` raises ValueError."""
     try:
         return build_weights(design)
     except ValueError:

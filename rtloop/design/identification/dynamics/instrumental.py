@@ -140,8 +140,7 @@ def past_mask(samples: int) -> npt.NDArray[np.bool_]:
 
 
 def _free_decays(model: Innovations, samples: int) -> Real:
-    """Return a row of ones, then the free decay of each mode, real and imaginary part for a pair, (1 + order, samples).
-    """
+    """Return a row of ones, then each mode's free decay, real and imaginary part for a pair, (1 + order, samples)."""
     rows = [np.ones(samples)]
     for rate in model.rates:
         decay = np.exp(rate * model.period_s * np.arange(samples))

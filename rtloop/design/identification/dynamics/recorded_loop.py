@@ -1,4 +1,4 @@
-"""Whether a recording is of a loop that was closed, and what moved it from outside."""
+"""Longest part of a recording in closed loop, and the external signals that excited the loop."""
 
 from __future__ import annotations
 

@@ -1,5 +1,4 @@
-"""Judgement of recordings under a sum of plays that was fitted to other data: held-out errors, offset, drift, memory.
-"""
+"""Judgement of recordings under a sum of plays fitted to other data: held-out errors, offset, drift, memory."""
 
 from __future__ import annotations
 
