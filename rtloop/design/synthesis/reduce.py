@@ -139,8 +139,8 @@ def _balance(part: ModalSystem | System) -> _BalancedSystem:
 def _reduce_states(balanced: _BalancedSystem, count: int, method: ReductionMethod) -> System:
     """Return the system of the first `count` balanced states, the others truncated or residualised.
 
-    Only the kept states are computed: residualising G(s) is truncating G(1/s), which has the same balanced coordinates.
-    So rounding in negligible states does not enter, and C(0) is preserved.
+    Only these states are computed: residualising G(s) is truncating G(1/s), which has the same balanced coordinates. So
+    rounding in negligible states does not enter, and C(0) is preserved.
     """
     (a, b, c, direct), forward, back = balanced.system, balanced.forward[:, :count], balanced.back[:count]
     if method == "truncate":

@@ -23,8 +23,8 @@ NOTE = "The row of the gain stands for D(0), the sensor's scale and all hysteres
 def table(verification: Verification) -> list[tuple[str, ...]]:
     """Return headings, then a row for the loop's stability and one for each quantity.
 
-    Its cells: label, required; the value of C(s), if it exists; value and verdict of C(z); the claim. The column of
-    claims is left out if the specification has none. C(s) does not run, and has no verdict.
+    Cells of a row: label, required; the value of C(s), if it exists; value and verdict of C(z); the claim. The column
+    of claims is left out if the specification has none. C(s) does not run, and has no verdict.
     """
     continuous, running = verification.continuous, verification.running
     rows: list[tuple[str, ...]] = [

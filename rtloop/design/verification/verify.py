@@ -122,8 +122,8 @@ class Verification:
 
     `weights`, and `gamma`, the H∞ norm of the loop with these weights, are None without C(s) and where the
     specification defines no weights. `contradictions` has a line for each key that makes the loop differ from the
-    verified one. `on_rig` judges the loop on the simulated rig. It is None for drivers other than a simulated rig,
-    without a linear loop, and without a contradiction if the loop is stable on the rig.
+    verified one. `on_rig` judges the loop on the simulated rig. It is None for drivers other than a simulated rig, for
+    an axis without a linear loop on a model of its own, and without a contradiction if the loop is stable on the rig.
     """
 
     rows: tuple[Row, ...]

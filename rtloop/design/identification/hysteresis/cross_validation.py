@@ -54,8 +54,8 @@ def unseen_errors(recording: Equations, common: SharedGains) -> Real:
     """Return errors (blocks, 2) in µm, measured minus modelled, of a recording that was not used for `common`.
 
     Column 0: the whole model; column 1: the plays alone, less the mean of these errors over each stretch of known
-    memory. NaN where memory is not known. The recording's own offsets and drift are fitted to every second piece and
-    judged on the pieces between, then the reverse.
+    memory. NaN where memory is not known. The recording's own offsets and drift are fitted to every second of the
+    PIECES pieces of each stretch and judged on the pieces between, then the reverse.
     """
     errors_um, is_odd = np.full((recording.is_known.size, 2), np.nan), piece_numbers(recording) % 2 == 1
     for fitted_blocks in (recording.is_known & is_odd, recording.is_known & ~is_odd):
@@ -69,8 +69,8 @@ def unseen_errors(recording: Equations, common: SharedGains) -> Real:
 
 
 def piece_numbers(recording: Equations) -> npt.NDArray[np.intp]:
-    """Return the number of each block's piece (blocks,), 0 … PIECES − 1 within its stretch of known memory; −1 where
-    memory is not known.
+    """Return the number of each block's piece (blocks,): a stretch of known memory is divided into PIECES pieces of
+    equal length, numbered from 0 in each stretch; −1 where memory is not known.
     """
     numbers = np.full(recording.is_known.size, -1)
     for column in (recording.offsets.T > 0) & recording.is_known:
@@ -80,7 +80,7 @@ def piece_numbers(recording: Equations) -> npt.NDArray[np.intp]:
 
 def _errors_by_piece(recordings: Sequence[Equations], limits: Limits) -> list[Real]:
     """Return errors in µm (blocks, 2), measured minus modelled, of every recording; each fit leaves out one fold, every
-    FOLDS-th piece of each recording, and judges it.
+    FOLDS-th piece (`piece_numbers`) of each recording, and judges it.
 
     Column 0: the whole model; column 1: the plays alone, less the mean of these errors over each stretch of known
     memory. NaN where memory is unknown.

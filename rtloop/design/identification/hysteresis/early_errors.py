@@ -28,7 +28,8 @@ def early_errors(
     """Return errors in µm, measured minus modelled, (blocks,) where memory, the state of the plays, is unknown, with
     the best-fitting memory; each is held out of the fit of this memory.
 
-    NaN elsewhere, and everywhere if memory is known in all blocks or in none. `own_gains` belong to this recording.
+    NaN elsewhere, and everywhere if memory is known in all blocks or in none. `own_gains` are the offsets and drift of
+    this recording.
     """
     early_um = np.full(recording_equations.is_known.size, np.nan)
     if recording_equations.is_known.all() or not recording_equations.is_known.any():

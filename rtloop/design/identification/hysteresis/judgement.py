@@ -164,7 +164,9 @@ def fit_and_judge(
 def _judge_recording(
     run: AveragedRecording, recording: Equations, own_gains: Real, error: Real, common: SharedGains, trial: Trial
 ) -> Judgement:
-    """Return the judgement of one recording, with its own gains and its held-out errors (blocks, 2)."""
+    """Return the judgement of one recording from its offsets and drift, `own_gains`, and its held-out errors, `error`
+    (blocks, 2), of the whole model and of the plays alone.
+    """
     residual_um, offsets = model_errors(recording, common, own_gains), own_gains[: recording.offsets.shape[1]]
     offset_changes = (recording.offsets @ offsets)[recording.is_known] - offsets[-1:]
     departures = np.concatenate([residual_um[~recording.is_known], offset_changes, np.zeros(1)])

@@ -35,7 +35,7 @@ class Equations(NamedTuple):
     offsets (blocks, stretches) and drift (blocks, 1), or (blocks, 0) without; position in µm (blocks,).
 
     A stretch is a part of the recording in which the state of all plays that move is known, and has an offset of its
-    own. `is_known` (blocks,) marks the blocks in one; in others the last stretch's offset applies.
+    own. `is_known` (blocks,) marks the blocks within a stretch; all other blocks have the offset of the last stretch.
     """
 
     slopes: Real
