@@ -77,8 +77,8 @@ def taps_values(taps: Taps) -> dict[str, list[float]]:
 
 
 def taps_provenance(tap_design: TapDesign, subject: Subject, source: str) -> list[str]:
-    """Return comment lines, without #, on the origin of taps; `source` is the name of the file with their controller
-    or specification.
+    """Return comment lines, without #, on the origin of taps and their proved figures; `source` is the name of the
+    configuration with their controller, or of the specification for both.
     """
     options, proof = subject.options.scenarios, tap_design.proof
     return [

@@ -161,7 +161,9 @@ def _format_step_value(step: SimulatedStep, name: str) -> str:
 
 
 def simulation_notes(verification: Verification) -> list[str]:
-    """Return notes on the simulated system, omitted steps and the noise at rest; [] without simulation."""
+    """Return notes on the simulated system and its noise at rest, on omitted steps, on a static error because of which
+    steps miss their limit, and on verdicts that do not count; [] without simulation.
+    """
     if verification.simulated is None:
         return []
     result = verification.simulated

@@ -35,8 +35,9 @@ class Mode:
 
 @dataclass(frozen=True)
 class Candidate:
-    """Candidate order: rms one-step-ahead error (on the held-out samples, if there are some), Akaike's criterion ln(V)
-    + 2 d/N, and rms output error on other runs (NaN: none).
+    """Candidate order: rms one-step-ahead error in µm (on the held-out samples, if there are some), Akaike's criterion
+    ln(V) + 2 d/N (V: mean square of this error, d: unknowns, N: samples), and rms output error in µm on other runs
+    (NaN: none).
     """
 
     order: int

@@ -52,8 +52,8 @@ class AveragedRecording(NamedTuple):
 def average_recording(
     run: AxisRecording, runs: int, before_v: npt.ArrayLike | None = None, blocks: int = BLOCKS
 ) -> AveragedRecording:
-    """Return the recording `run` averaged over blocks, at most `blocks`/max(3, `runs`) of them or, if that is less,
-    LEAST_BLOCKS; `runs` is the number of recordings of the fit.
+    """Return the recording `run` averaged over blocks: at most `blocks` // max(3, `runs`) of them, but LEAST_BLOCKS if
+    this number is smaller. `runs` is the number of recordings of the fit.
 
     Each drive is paired with the position of the following tick. `before_v` (k,) is the drive in V from rest to the
     first tick, [0] for a start at rest, None if unknown. Unless it is None, the whole recording is one stretch.

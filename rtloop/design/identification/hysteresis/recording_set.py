@@ -40,7 +40,7 @@ class HysteresisFit:
 
     `offsets_um` are the sensor offsets of the recordings; errors and noise refer to averaged samples. `range_um` is the
     largest range of position, `drive_v` the largest |drive|; both loops are of the recording with the widest drive.
-    `least_slope_um_per_v` is the least partial sum of "invertible" weights, also where the `weights` are "free".
+    `least_slope_um_per_v` is the least partial sum that "invertible" weights may have, also where they are "free".
     """
 
     model: PlayModel
@@ -137,9 +137,8 @@ def prepare_recordings(
     before_v: Sequence[npt.ArrayLike | None] | None,
     blocks: int = BLOCKS,
 ) -> RecordingSet:
-    """Return the recordings, each averaged over blocks: at most `blocks`/3, `blocks` divided by their number if there
-    are more than three, or LEAST_BLOCKS if that is less (`average_recording`). The length of a block differs between
-    them.
+    """Return the n recordings `runs`, each averaged over blocks: at most `blocks` // max(3, n) of them, but LEAST_BLOCKS
+    if this number is smaller (`average_recording`). The length of a block differs between recordings.
 
     `before_v` has for each recording the drive in V from rest to its first tick, [0] for a start at rest, None if
     unknown; None instead of a list: unknown for all.
