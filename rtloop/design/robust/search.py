@@ -113,7 +113,7 @@ def minimise(
 ) -> Minimum:
     """Minimise `cost`, which takes points (k, n) and returns (k,), from `start` (n,) with standard deviation `spread`.
 
-    All random numbers come from `random`. Returns `start` where no generation is better.
+    All random numbers come from `random`. Returns `start` if no point of any generation is better.
     """
     import cma  # takes a second: only a search needs it
 

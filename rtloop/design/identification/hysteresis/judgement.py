@@ -125,7 +125,8 @@ def combine_errors(rms_um: Sequence[float]) -> CombinedError:
 def evaluate_from_rest(
     runs: Sequence[AxisRecording], shape: HysteresisFit, other_runs: Sequence[AxisRecording] = ()
 ) -> tuple[tuple[Judgement, ...], tuple[Judgement, ...]]:
-    """Judge `runs`, each from rest and held out of the fit in turn, and `other_runs`, whose memory is unknown.
+    """Judge `runs`, each from rest, by held-out errors (`cross_validate`), and `other_runs`, whose memory is unknown,
+    by the fit to `runs`.
 
     Only thresholds and kind of weights come from `shape`; the weights are fitted anew. `runs` are not checked: they
     must have passed `identify_hysteresis`. Returns the judgements of `runs` and the judgements of `other_runs`.
