@@ -234,7 +234,7 @@ def require_rising(run: AxisRecording) -> None:
 def wrong_sign(name: str, observation: str) -> UnsuitableData:
     """Return the error for the recording `name`, in which the position falls where it should rise.
 
-    `observation` is a clause that tells how this was seen.
+    `observation` is a clause that says how the recording shows this.
     """
     return UnsuitableData(
         f"{name}: the sign of drive or position is wrong: {observation}. A loop with this sign is unstable. Change "

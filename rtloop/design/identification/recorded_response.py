@@ -24,8 +24,8 @@ def recorded_measurement(path: Path, axis: str | None = None, near_hz: float | N
 
     The model comes from the recorded configuration; a user's law has no model. The lightly damped mode is searched near
     `near_hz`; None means near the model's resonance, or without one where the plant's response is largest. Raises
-    RecordingError for a bad file, an unknown axis, and None with several axes; UnsuitableData for an imported recording
-    and for signals that `measure_loop` refuses.
+    RecordingError for a bad file and as `select_axis`; UnsuitableData for an imported recording and for signals that
+    `measure_loop` refuses.
     """
     recording = load(path)
     if "imported" in recording.header:

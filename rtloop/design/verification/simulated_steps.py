@@ -89,8 +89,8 @@ class SimulationResult:
 
     def as_dict(self) -> dict[str, object]:
         """Return the result for JSON: `truth`; `steps`, each with the fields of SimulatedStep and `met` {figure:
-        whether it meets its limit}, without figures that have none; `left_out_um`; `range_um` [low, high];
-        `noise_x_nm`; `noise_v_nm`; `judged`. Infinite figures are still infinite, not null.
+        whether it meets its limit}, without figures that have no limit; `left_out_um`, the omitted heights; `range_um`
+        [low, high]; `noise_x_nm`; `noise_v_nm`; `judged`. Infinite figures are still infinite, not null.
         """
         steps = [
             {

@@ -110,7 +110,8 @@ def _residual_columns(recording: Equations, common: SharedGains, own_gains: Real
 
 
 def _remove_play_offsets(recording: Equations, errors_um: Real) -> Real:
-    """Subtract from the errors of the plays alone their mean over each stretch of known memory: plays have no offset.
+    """Subtract from the errors of the plays alone the mean of these errors over each stretch of known memory, because
+    plays have no offset.
 
     `errors_um` (blocks, 2) has the errors of the whole model and of its plays alone. Column 1 is changed in place where
     memory is known; the array is returned.

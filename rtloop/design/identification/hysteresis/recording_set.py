@@ -137,7 +137,7 @@ def prepare_recordings(
     before_v: Sequence[npt.ArrayLike | None] | None,
     blocks: int = BLOCKS,
 ) -> RecordingSet:
-    """Return the n recordings `runs`, each averaged over blocks: at most `blocks` // max(3, n) of them, but LEAST_BLOCKS
+    """Return the n recordings `runs`, each averaged over blocks, at most `blocks` // max(3, n) of them, or LEAST_BLOCKS
     if this number is smaller (`average_recording`). The length of a block differs between recordings.
 
     `before_v` has for each recording the drive in V from rest to its first tick, [0] for a start at rest, None if
