@@ -164,7 +164,7 @@ OTHER_SIZES_TEXT = ". The recording does not show how steps of other sizes behav
 def _require_play_model(stage: Stage, design: DesignOptions) -> None:
     """Raise NoDesign if no sum of plays describes the actuator (`unexplained_um`), so that steps cannot be predicted.
 
-    With `simulation.residual_percent` in the specification, nothing is raised: that much hysteresis is simulated.
+    With `simulation.residual_percent` in the specification, it does not raise: that much hysteresis is simulated.
     """
     left_um = unexplained_um([stage.slow], stage.hysteresis)
     if left_um and "residual_percent" not in design.simulation.model_fields_set:

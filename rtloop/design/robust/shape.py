@@ -301,7 +301,7 @@ def _proof_failure(subject: Subject, settling_ms: float, proof: StepMeasures, pl
 
 
 def _describe_relaxations(subject: Subject) -> str:
-    """Return as text the fastest settling in ms with one constraint relaxed, for each, and the one that helps most.
+    """Return as text the fastest settling in ms for each constraint relaxed alone, and the most helpful one.
 
     Each of these is relaxed alone: limits on v (none), undershoot (none), largest step (half of it), overshoot (BAND),
     scenarios (no variation of the plant). The fastest settling of each is searched anew, on few scenarios.

@@ -150,7 +150,7 @@ def synthesise_design(design: DesignOptions) -> Synthesis:
 
 def _require_possible(plant: Transfer, design: DesignOptions) -> None:
     """Raise NoController for a static error that no controller can meet: the plant has no gain at 0 Hz, or the largest
-    command cannot hold the reference within this error. Without a required static error, nothing is raised.
+    command cannot hold the reference within this error. Without a required static error, it does not raise.
     """
     specification, gain = design.specification, abs(plant.dc_gain)
     if specification.static_error_percent is not None and gain == 0:

@@ -110,8 +110,8 @@ def _add_contradictions(
     """Return the verification with the contradictions between axis and hardware, also as warnings, and with the loop
     judged on the simulated rig.
 
-    Its `on_rig` is None for drivers other than a simulated rig, for an axis without a linear loop on a model of its
-    own, and without a contradiction if the loop is stable on the rig. Raises ValueError for a rig's plant with direct
+    Its `on_rig` is None for drivers other than a simulated rig, for an axis without a linear loop on its own
+    model, and without a contradiction if the loop is stable on the rig. Raises ValueError for a rig's plant with direct
     feedthrough.
     """
     axis = next(axis for axis in configuration.axes if axis.name == check.name)

@@ -123,7 +123,7 @@ class Verification:
     `weights`, and `gamma`, the H∞ norm of the loop with these weights, are None without C(s) and where the
     specification defines no weights. `contradictions` has a line for each key that makes the loop differ from the
     verified one. `on_rig` judges the loop on the simulated rig. It is None for drivers other than a simulated rig, for
-    an axis without a linear loop on a model of its own, and without a contradiction if the loop is stable on the rig.
+    an axis without a linear loop on its own model, and without a contradiction if the loop is stable on the rig.
     """
 
     rows: tuple[Row, ...]

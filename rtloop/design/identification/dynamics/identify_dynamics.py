@@ -173,8 +173,9 @@ def _validation_rms(model: Innovations, runs: Sequence[Excitation]) -> float:
 
 def _choose_order_index(candidates: Sequence[Candidate], score: Callable[[Candidate], float], *, by_aic: bool) -> int:
     """Return the index of the smallest order whose score is within LEAST_IMPROVEMENT of the least score and, if
-    `by_aic`, whose AIC is no larger than that of any smaller order; without such an order, the index of the least
-    score. `candidates` are in rising order.
+    `by_aic`, whose AIC is the least among all orders up to it; without such an order, the index of the least score.
+
+    `candidates` are in rising order.
     """
     limit = min(map(score, candidates)) * (1 + LEAST_IMPROVEMENT)
     for i, candidate in enumerate(candidates):
