@@ -1,7 +1,8 @@
 """Design of verified controllers from recordings and specifications.
 
-`rtloop.design` is this room and the public function of the same name. Python stores the room under its name in `rtloop`
-once a module of the room is imported; so the room can be called, and passes the call to `rtloop.workbench.design`.
+`rtloop.design` names this package and the public function `rtloop.workbench.design.design`. Once a module of the
+package is imported, Python stores the package under that name; so the package can be called, and passes the call to the
+function.
 """
 
 from __future__ import annotations

@@ -41,11 +41,12 @@ from rtloop.hysteresis.plays import model_output
 from rtloop.values import count_text
 
 LARGEST_NOISE_RATIO, HYSTERESIS_SHARE = 3.0, 3e-4
-"""Largest rms prediction error of a model that a loop is designed on: multiple of the noise, or of HYSTERESIS_SHARE
-times the actuator's range, which the hysteresis model may leave.
+"""Largest rms prediction error of a model that a loop is designed on: a multiple of the noise, or if larger, of
+HYSTERESIS_SHARE times the range of the modelled hysteresis in the step, an error that its model may leave.
 """
 SWINGS = 8
-"""Swings of a lightly damped mode, each within one and a half periods, that trip the written loop."""
+"""Swings of the slowest lightly damped mode that trip the written loop, each at most 3/4 of its period after the last.
+"""
 
 
 @dataclass(frozen=True)
@@ -70,7 +71,7 @@ class Stage:
         return design.model_copy(update={"plant": plant, "controller": output})
 
     def describe(self) -> str:
-        """Return the relative height h/H of the hysteresis loop (%), modes and delay as one line of text."""
+        """Return one line of text: relative height h/H of the modelled hysteresis loop (%), modes (Hz, ζ) and delay."""
         modes = ", ".join(f"{mode.frequency_hz:.1f} Hz (ζ {mode.damping:.4f})" for mode in self.dynamics.modes)
         delay = f"{count_text(self.dynamics.delay_ticks, 'sample')} of delay"
         return f"hysteresis h/H {self.hysteresis.model_loop.percent:.2f} %; modes at {modes}; {delay}"
@@ -90,7 +91,7 @@ def identify_stage(hysteresis: AxisRecording, step: AxisRecording, order: int | 
 
     `hysteresis` records a slow sine, `step` a step of the drive. Raises UnsuitableData for a step without a
     configuration, as in an imported file, if ticks of the step are missing or late, if no model explains the step, and
-    as `identify_hysteresis` and `identify_dynamics`; its message calls the recordings swapped if `hysteresis` has steps
+    as `identify_hysteresis` and `identify_dynamics`; the message calls the recordings swapped if `hysteresis` has steps
     of the drive and `step` has none. Raises ArithmeticError for a model with an unstable predictor.
     """
     try:
@@ -136,7 +137,7 @@ def design_controller(stage: Stage, design: DesignOptions) -> Chain:
 
 
 def _require_explained(step: AxisRecording, dynamics: DynamicsFit, noise_um: float) -> None:
-    """Raise UnsuitableData for a model whose rms error exceeds LARGEST_NOISE_RATIO times `noise_um`."""
+    """Raise UnsuitableData if the rms prediction error of `dynamics` exceeds LARGEST_NOISE_RATIO times `noise_um`."""
     allowed_um = LARGEST_NOISE_RATIO * noise_um
     if dynamics.rms_error_um > allowed_um:
         raise UnsuitableData(
@@ -150,9 +151,9 @@ def _require_explained(step: AxisRecording, dynamics: DynamicsFit, noise_um: flo
 def configuration_text(chain: Chain, axis: str | None, spec_name: str, spec_text: str) -> str:
     """Return as TOML the step recording's configuration in closed loop, with the design in `axis`.
 
-    `axis` is the name of one of its axes, None the first. `spec_name` is the specification's path relative to the
-    configuration, `spec_text` its content, whose SHA-256 a comment has. Raises UnsuitableData for weights of the
-    hysteresis without an inverse.
+    `axis` is the name of one of the recording's axes, None the first. `spec_name` is the specification's path relative
+    to the configuration, `spec_text` its content, whose SHA-256 is in a comment. Raises UnsuitableData for weights of
+    the hysteresis without an inverse.
     """
     parts = {"controller": controller_values(chain.synthesis.controller, chain.design.controller)}
     comments = provenance(chain.synthesis, chain.design, spec_name, spec_text)
@@ -164,9 +165,10 @@ def stage_configuration(
 ) -> str:
     """Return as TOML the step recording's configuration in closed loop, with the stage in `axis`.
 
-    `axis` is the name of one of its axes, None the first. It receives feedforward and model of the identified stage, a
-    reference of steps, an interlock against oscillation, the specification's path `spec_name`, and the sections of
-    `parts`, by name. [schedule] is left out. `comments` follow those on the identification at the head of the text.
+    `axis` is the name of one of the recording's axes, None the first. This axis receives feedforward and model of the
+    identified stage, a reference of steps, the interlock against oscillation (`_enable_oscillation`), the
+    specification's path `spec_name`, and the sections of `parts`, by name. [schedule] is left out. The text begins with
+    comments on the identification, then `comments`.
     Raises UnsuitableData for weights of the hysteresis without an inverse.
     """
     configuration = tomllib.loads(stage.fast.configuration)
@@ -195,7 +197,7 @@ def reference_values(stage: Stage, axis: str | None) -> StepsReference:
     """Return the table [axis.reference], a square wave as `steps_reference` makes, for the step recording's axis.
 
     It is {"kind": "steps", "levels": two in µm, "dwell_s": the duration of each}. `axis` is the name of one of the
-    recording's axes, None the first.
+    recording's axes, None the first. Raises ValueError for weights of the hysteresis without an inverse.
     """
     limits = LimitsOptions.model_validate(_axis_table(tomllib.loads(stage.fast.configuration), axis).get("limits", {}))
     slowest_hz = min((mode.frequency_hz for mode in stage.dynamics.modes), default=math.inf)
@@ -208,10 +210,10 @@ def _axis_table(configuration: Mapping[str, Any], axis: str | None) -> dict[str,
 
 
 def _enable_oscillation(interlocks: Mapping[str, object], dynamics: DynamicsFit, period_s: float) -> dict[str, object]:
-    """Return the interlocks with the one against a growing resonance enabled, by `oscillation_swings` and
-    `swing_ticks`; the identification runs without it.
+    """Return a copy of [axis.interlocks] with the interlock against a growing resonance enabled: `oscillation_swings`
+    is SWINGS, `swing_ticks` is 3/4 of the period of the slowest lightly damped mode, in ticks.
 
-    Without a lightly damped mode, or with the interlock set already, the copy is unchanged.
+    The copy is unchanged without a lightly damped mode, or if `oscillation_swings` is above 0 already.
     """
     lowest_hz = min((mode.frequency_hz for mode in dynamics.modes if mode.damping < LIGHT_DAMPING), default=None)
     if lowest_hz is None or interlocks.get("oscillation_swings", 0):

@@ -36,7 +36,7 @@ def label_panel(panel: Axes, x: str, y: str, title: str, *, legend: bool = True)
 
 
 def finish_figure(figure: Figure, panels: Iterable[Axes], title: str) -> bytes:
-    """Add a grid and a legend to each of `panels` (an iterable), and the title to the figure. Returns the PNG."""
+    """Add a grid and a legend to each of `panels`, and the title to the figure. Returns the figure as PNG bytes."""
     for panel in panels:
         panel.grid(visible=True, which="both", alpha=0.2)
         panel.legend(fontsize=8, framealpha=0.9)

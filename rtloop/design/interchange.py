@@ -41,7 +41,7 @@ def to_control(
 def from_control(system: Any) -> Transfer | FrequencyResponse:
     """Return a continuous plant or controller as zeros, poles and gain, or a frequency response.
 
-    A response has no coherence in python-control; it is taken as 1. Raises ValueError for another class than
+    The coherence of a response, which python-control lacks, is set to 1. Raises ValueError for another class than
     StateSpace, TransferFunction and FrequencyResponseData, for several inputs or outputs, for discrete time
     (`discretise_controller` makes C(z) of C(s)), and for an improper system.
     """

@@ -81,7 +81,7 @@ def draw_pictures(
 
 
 def _copy_layout(source: Figure, target: Figure) -> None:
-    """Place each panel of `target` where the panel of the same number of `source` stands.
+    """Place each panel of `target` where the panel of `source` with the same index stands.
 
     The figures differ in their colours only. matplotlib's own layout takes half of the time to draw a picture.
     """

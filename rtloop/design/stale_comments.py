@@ -1,4 +1,4 @@
-"""Comments of a TOML text that describe sections which are written anew."""
+"""Removal of comments in a TOML text that describe sections which a design writes anew."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ _COMMENT = re.compile(r"^\s*#")
 
 
 def split_schema_line(text: str) -> tuple[str, str]:
-    """Return the first line of a text with its end if it is `#:schema`, else "", and the rest."""
+    """Return the first line of a text with its line end if it begins with "#:schema ", otherwise "", and the rest."""
     match = _SCHEMA.match(text)
     return (match.group(), text[match.end() :]) if match else ("", text)
 
@@ -30,10 +30,11 @@ def remove_first_comments(text: str) -> str:
 
 
 def remove_stale_comments(text: str, values: Mapping[str, object], rewritten: Collection[str]) -> str:
-    """Return `text` without the comments of sections that `values` lacks, or that differ and are named in `rewritten`.
+    """Return `text` without the comments of sections that `values` lacks, or that differ from `values` and lie in a
+    table named in `rewritten`.
 
     Comments of a section are those directly above its heading, without an empty line between, and those above its keys.
-    Comments behind a value stay. If the text would then hold other values, it is returned unchanged. Raises
+    Comments behind a value stay. If the removal would change values, the text is returned unchanged. Raises
     TOMLDecodeError for a text that is not TOML.
     """
     old_values = tomllib.loads(text)
@@ -62,7 +63,7 @@ def _heading(line: str, values: Mapping[str, object], counts: dict[str, int]) ->
     """Return the path of the section that a line begins, with indices of tables in lists, such as ["axis", 0, "model"];
     None for another line.
 
-    `counts` holds the count of headings [[…]] so far by name, and is brought up to date.
+    `counts` has the number of headings [[…]] above this line by name, and is updated.
     """
     match = _HEADER.match(line)
     if match is None:

@@ -23,7 +23,7 @@ def write_section(name: str, values: Mapping[str, object], comments: Sequence[st
     """Return TOML of `[name]` with its keys, below `comments`, lines without #; nested tables become sections, lists of
     tables [[…]].
 
-    For `name` "", `values` are the whole document; dots in it nest sections.
+    For `name` "", `values` are the whole document; dots in `name` nest sections.
     """
     document = tomlkit.document()
     for comment in comments:
@@ -61,8 +61,8 @@ def edit_text(
 def _update_table(table: Any, values: Mapping[str, object]) -> None:
     """Change a parsed table in place so that it holds `values` and no other keys.
 
-    Comments stay, but for one behind a value that changes. Those at the end of the table stay there: they describe what
-    follows it.
+    Comments stay, but for one behind a value that changes. Comments at the end of the table stay at its end: they
+    describe the table that follows.
     """
     for key in [key for key in table if key not in values]:
         table.remove(key)
@@ -94,8 +94,8 @@ def _take_last_lines(table: object) -> list[tuple[Key | None, Item]]:
 
 
 def _find_last_entries(table: object) -> list[tuple[Key | None, Item]]:
-    """Return the list of entries, (key or None, item), of the last table within a table or document, or its own if it
-    contains none. It is tomlkit's own list: changes of it change the document.
+    """Return the list of entries, (key or None, item), of the last table within a table or document, or of that itself
+    if it contains no table. The list is tomlkit's own: a change of the list changes the document.
     """
     while True:
         if isinstance(table, AoT):
@@ -110,8 +110,8 @@ def _find_last_entries(table: object) -> list[tuple[Key | None, Item]]:
 
 
 def toml_item(value: object) -> Item:
-    """Return a value as TOML item: a list of mappings as tables [[…]], a mapping within another list as inline
-    table.
+    """Return a value as TOML item: a mapping as table, a list of mappings as tables [[…]], another list as array, in
+    which mappings are inline tables.
     """
     if isinstance(value, Mapping):
         return _table(value, holds_tables_alone=bool(value) and all(map(_is_table, value.values())))
@@ -136,7 +136,7 @@ def zpk_values(transfer: Transfer) -> dict[str, object]:
 
 
 def _table(values: Mapping[str, object], holds_tables_alone: bool = False) -> Table:
-    """Return a mapping as TOML table; `holds_tables_alone` leaves out its own heading."""
+    """Return a mapping as TOML table; `holds_tables_alone` leaves out the table's heading, as all values are tables."""
     table = tomlkit.table(is_super_table=holds_tables_alone)
     for key, value in _order_values(values):
         table.add(key, toml_item(value))

@@ -24,12 +24,12 @@ class StepsReference(TypedDict):
 
 
 def steps_reference(limits: LimitsOptions, actuator: PlayModel, slowest_hz: float, period_s: float) -> StepsReference:
-    """Return [axis.reference]: a square wave of STEP_PART of the largest command, to one significant digit, and 0.
+    """Return [axis.reference]: a square wave between 0 and STEP_PART of the largest command, to one significant digit.
 
     An actuator that does not come back to 0 within the drive's limits gets a square wave within the positions that it
-    does come back to. Each level lasts whole ticks: at least LEAST_DWELL_S, and DWELL_SWINGS periods of `slowest_hz`
-    (inf without a mode). Its keys are `kind`, `levels` (two, in µm, the farther from rest first) and `dwell_s`. Raises
-    ValueError for an actuator without inverse.
+    does come back to. Each level lasts whole ticks: at least LEAST_DWELL_S, and at least DWELL_SWINGS periods of the
+    slowest mode, whose frequency is `slowest_hz` (inf without a mode). Its keys are `kind`, `levels` (two, in µm, the
+    farther from rest first) and `dwell_s`. Raises ValueError for an actuator without inverse.
     """
     dwell_s = max(LEAST_DWELL_S, DWELL_SWINGS / slowest_hz)
     dwell_s = math.ceil(dwell_s / period_s) * period_s
@@ -38,13 +38,13 @@ def steps_reference(limits: LimitsOptions, actuator: PlayModel, slowest_hz: floa
 
 
 def describe_reference(values: StepsReference) -> str:
-    """Return `values`, as of `steps_reference`, as words: both levels in µm, and the duration of each."""
+    """Return the table that `steps_reference` makes as words: both levels in µm, and the duration of each in s."""
     levels = " and ".join(f"{level:g}" for level in values["levels"])
     return f"steps between {levels} µm, {values['dwell_s']:g} s each"
 
 
 def _levels_um(limits: LimitsOptions, actuator: PlayModel) -> list[float]:
-    """Return both levels of the square wave in µm, the farther first."""
+    """Return both levels of the square wave in µm, the one farther from rest first."""
     low_um, high_um = reachable_range(actuator, limits.lowest_v, limits.drive_v)
     if low_um <= 0 <= high_um:
         return [float(f"{STEP_PART * limits.command_um:.1g}"), 0.0]

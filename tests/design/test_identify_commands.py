@@ -169,7 +169,7 @@ def test_the_dynamics_of_a_loop_that_stays_closed(tmp_path: Path) -> None:
     sine_text = text.replace(CHIRP, 'kind = "sine"\namplitude = 8.0\nfrequency_hz = 2.0')
     limited = record(tmp_path / "limited.mcap", sine_text.replace("command_um = 42.0", "command_um = 2.0"), 4000)[0]
     for message, *arguments in (
-        ("a limit changed the command at tick", limited, "--input", "command"),
+        ("a limit or a ramp changed the command at tick", limited, "--input", "command"),
         ("the recording has no x_wobble", path, "--outside", "x_wobble"),
         ("an imported recording has no model of the hysteresis; use --hysteresis FILE", tmp_path / "again.mcap"),
     ):

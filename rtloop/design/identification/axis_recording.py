@@ -25,7 +25,7 @@ LARGEST_ANTICORRELATION = -0.5
 JUMP_SHARE = 0.2
 """A drive that changes by this fraction of its span within one tick jumps: it has a step, and is no slow sine."""
 PLATEAU_DRIVE = 0.02
-"""A reading constant at its extreme while the drive moves by more than this fraction of its span is clipped."""
+"""A reading constant at its extreme while the drive moves by more than this fraction of the drive's span is clipped."""
 _TRIP_REMEDIES = {
     "sensor_range": "The sensor was at the end of its range: use a smaller drive, or a smaller step, because a lightly "
     "damped stage overshoots. Wider interlocks.sensor_min_v and sensor_max_v help only inside the converter's range.",
@@ -34,7 +34,7 @@ _TRIP_REMEDIES = {
     "frozen": "The reading stood still while the drive moved: check the sensor and its wires.",
 }
 _OTHER_REMEDY = "A smaller drive does not prevent this trip: see the cause in `rtloop info`, and record again."
-"""Sentences that tell how to avoid a trip, by its cause, and the one for all other causes."""
+"""Sentence that tells how to avoid a trip of any cause that `_TRIP_REMEDIES` lacks."""
 PLATEAU_TICKS, PLATEAU_JUMP = 4, 10.0
 """A plateau of PLATEAU_TICKS or more is clipped too if a jump of PLATEAU_JUMP usual changes begins or ends it."""
 
@@ -52,8 +52,8 @@ class AxisRecording:
     An imported recording samples both together (`is_sampled_together`) unless it says that the position came first; its
     rows are shifted on reading, so that a drive acts on the next tick's position here too. `command_um` is NaN where it
     was not recorded. `is_even` says that no tick is missing or late by a period; `digest` is the SHA-256 of the
-    recording's files. `time_s` (ticks,) is when each tick was due,
-    from an arbitrary origin; None stands for equal intervals.
+    recording's files. `time_s` (ticks,) is the time in s at which each tick was due, from an arbitrary origin; None
+    stands for equal intervals.
     """
 
     name: str
@@ -79,8 +79,9 @@ class AxisRecording:
 def read_axis_recording(path: Path, axis: str | None = None) -> AxisRecording:
     """Read one axis of a recording (None: its only one).
 
-    Raises RecordingError for a file that cannot be read and for an unknown or ambiguous axis; UnsuitableData for
-    missing signals, fewer than LEAST_TICKS ticks, a trip, times that do not rise, and like `require_usable`.
+    Raises RecordingError for a file that cannot be read, an unknown axis, None with several axes, and a recording
+    without axes; UnsuitableData for a missing signal, fewer than LEAST_TICKS ticks, a trip, tick times that do not
+    rise, and as `require_usable`.
     """
     recording = load(path)
     axis = select_axis(recording, axis, path)
@@ -115,10 +116,11 @@ def read_axis_recording(path: Path, axis: str | None = None) -> AxisRecording:
 
 
 def shifted_rows(recording: Recording) -> int:
-    """Return by how many rows the position must move, later in time, so that a drive acts on the next row's position.
+    """Return the number of rows by which positions must move to later rows, so that a row's drive acts on the position
+    of the next row: 1 or 0.
 
     It is 1 if drive and position of a row were sampled together: in an imported recording, unless its header says that
-    the position was sampled before the drive changed. It is 0 for all others.
+    the position was sampled before the drive changed. It is 0 for every other recording.
     """
     imported = recording.header.get("imported")
     return int(imported is not None and not imported.get("position_first", False))
@@ -152,7 +154,7 @@ def _tick_digest(run: AxisRecording) -> str:
 def _signals(recording: Recording, path: Path, *names: str) -> list[Real]:
     """Return named signals in full, each (ticks,), in the order of `names`.
 
-    Raises UnsuitableData with the names that are missing.
+    Raises UnsuitableData, with the missing names, if the recording lacks any of them.
     """
     missing = [name for name in names if name not in recording]
     if missing:
@@ -189,8 +191,8 @@ def require_usable(name: str, drive_v: Real, position_um: Real, adc_v: Real | No
 
 
 def jumps(run: AxisRecording) -> bool:
-    """Whether the drive changes by JUMP_SHARE of its span, or more, within one tick, and in the ticks before and after
-    it by less than a tenth of that.
+    """Whether the drive changes at some tick by JUMP_SHARE of its span, or more, and at the ticks before and after this
+    one by less than a tenth of this change. The first and the last change never count.
     """
     changes = np.abs(np.diff(run.drive_v))
     padded = np.concatenate([[np.inf], changes, [np.inf]])
@@ -199,7 +201,7 @@ def jumps(run: AxisRecording) -> bool:
 
 
 def excitation_warnings(runs: Sequence[AxisRecording]) -> list[str]:
-    """Return a sentence for each run whose drive is no slow excitation: made by a controller, or with steps."""
+    """Return a warning, with a remedy, for each run whose drive was made by a controller or has steps (`jumps`)."""
     remedy = (
         'Record a slow sine without a controller: `rtloop run` with mode = "raw" and a reference in V, as in '
         "deploy/characterise.toml"
@@ -232,7 +234,7 @@ def require_rising(run: AxisRecording) -> None:
 def wrong_sign(name: str, observation: str) -> UnsuitableData:
     """Return the error for the recording `name`, in which the position falls where it should rise.
 
-    `observation` is a clause that tells how this was seen.
+    `observation` is a clause that says how the recording shows this.
     """
     return UnsuitableData(
         f"{name}: the sign of drive or position is wrong: {observation}. A loop with this sign is unstable. Change "
@@ -249,10 +251,12 @@ def noise_std(position: Real) -> float:
 
 
 def _first_clipped_tick(drive: Real, adc: Real) -> int | None:
-    """Return the first tick of a plateau of `adc`, readings or positions, that clipping caused; None without one.
+    """Return the first tick of the first plateau of `adc`, readings or positions, that clipping caused; None without
+    one.
 
-    A plateau is at the maximum, or else at the minimum, for PLATEAU_TICKS or more. It counts if the drive moves
-    meanwhile or `adc` jumps at one of its ends, and not at the start of the recording.
+    A plateau is PLATEAU_TICKS or more at the maximum of `adc`, or if none there counts, at its minimum. It counts if
+    the drive moves meanwhile by more than PLATEAU_DRIVE of its span or `adc` jumps at one of the plateau's ends
+    (PLATEAU_JUMP); a plateau at the start of the recording does not count.
     """
     changes = np.abs(np.diff(adc))
     usual_change = max(float(np.median(changes)), float(changes[changes > 0].min(initial=np.inf)))
@@ -284,7 +288,7 @@ def _require_untripped(path: Path, flags: Real) -> None:
 
 
 def trip_remedy(causes: Sequence[str]) -> str:
-    """Return sentences that tell how to prevent a trip of these causes, named as by `trip_causes`, in a recording."""
+    """Return sentences that tell how to record again without a trip of these causes, named as `trip_causes` does."""
     remedies = dict.fromkeys(_TRIP_REMEDIES.get(cause, _OTHER_REMEDY) for cause in causes)
     return " ".join(remedies)
 
@@ -296,8 +300,8 @@ def select_axis(recording: Recording, axis: str | None, path: Path) -> str:
     axes = recording.header.get("axes", [])
     if not axes:
         raise RecordingError(
-            f"{path}: the recording has no axis; import drive and position again, as in "
-            "--map 'x_drive_v=COLUMN [V]' --map 'x_position_um=COLUMN [µm]'"
+            f"{path}: the recording has no axis; import drive and position again, as in `rtloop import FILE "
+            "--map 'x_drive_v=COLUMN [V]' --map 'x_position_um=COLUMN [µm]'`"
         )
     if axis is None and len(axes) == 1:
         return str(axes[0])
@@ -308,7 +312,7 @@ def select_axis(recording: Recording, axis: str | None, path: Path) -> str:
 
 
 def _digest(paths: tuple[Path, ...]) -> str:
-    """Return the SHA-256 of the files' contents one after the other, in hex.
+    """Return the SHA-256, in hex, of the files' contents joined in the order of `paths`.
 
     Raises RecordingError for a file that cannot be read.
     """

@@ -1,9 +1,10 @@
-"""A frequency response measured from a recorded chirp or multisine, with coherence, beside a model's.
+"""A frequency response measured from a recorded chirp or multisine, with coherence, and its comparison with a model.
 
     H₁ = S_ux / S_uu,     γ² = |S_ux|² / (S_uu S_xx)          Welch 1967; Bendat & Piersol 2010, chapter 6
     H = S_wx / S_wu,      γ² = |S_wx|² / (S_ww S_xx)          in closed loop: Wellstead 1981
 
-w is what moved a closed loop from outside, or follows from that alone: S_ux would hold the noise that C(z) brings back.
+w is the external excitation of a closed loop, or a signal that follows from it alone: S_ux would contain the noise that
+C(z) feeds back.
 
 Where the coherence is low, noise or nonlinearity is measured and not the plant; such frequencies are left out.
 """
@@ -49,7 +50,8 @@ class FrequencyResponse:
 
 @dataclass(frozen=True)
 class Agreement:
-    """Model against measurement where it can be trusted: relative deviations of the complex response, and the peaks.
+    """Model against measurement at the trusted frequencies, `from_hz` … `to_hz`: relative deviations of the complex
+    response as fractions, and the frequencies of the peaks.
 
     `resolution_hz` is the measurement's resolution.
     """
@@ -90,8 +92,8 @@ def estimate_response(
 
 
 def recording_response(run: Excitation) -> FrequencyResponse:
-    """Return the response of a recording from input to position; in closed loop, the external excitation is the
-    instrument.
+    """Return the response of a recording from input to position; in closed loop, the part of the input that follows
+    from the external excitation is the instrument.
 
     A recording shorter than two segments of SEGMENT_S gets two segments of half its length. Raises UnsuitableData where
     these have fewer than LEAST_SEGMENT samples, and for external signals that all stand still.
@@ -107,17 +109,16 @@ def _require_two_segments(samples: int, period_s: float, segment_s: float = SEGM
     if samples < 2 * round(segment_s / period_s):
         raise UnsuitableData(
             f"the recording has {samples * period_s:g} s of excitation; a frequency response needs at least "
-            f"{2 * segment_s:g} s"
+            f"{2 * segment_s:g} s. Record longer"
         )
 
 
 def compare_responses(model: Innovations, measured_curve: FrequencyResponse) -> Agreement:
     """Compare a sampled model with a measured response at the trusted frequencies.
 
-    Returns the median and the largest of |model − measured|/|measured| as fractions, the frequency of the latter, and
-    the frequencies in Hz at which either magnitude is largest, all among the trusted frequencies.
-
-    Raises UnsuitableData if no frequency is trusted.
+    Returns the median and the largest of |model − measured|/|measured| as fractions, the frequency of the largest, the
+    frequencies at which the measured and the modelled magnitude are largest, the lowest and highest trusted frequency,
+    and the resolution, all in Hz. Raises UnsuitableData if no frequency is trusted.
     """
     is_trusted = measured_curve.is_trusted
     if not np.any(is_trusted):

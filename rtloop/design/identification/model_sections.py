@@ -29,7 +29,7 @@ from rtloop.values import count_text
 from rtloop.version import __version__
 
 SAMPLED_TOGETHER = "because drive and position of a row count as sampled at the same time"
-"""Convention of the delay of an imported recording."""
+"""Reason for the delay that dynamics from an imported recording have."""
 Section = TypeVar("Section", bound=Options)
 
 
@@ -99,10 +99,10 @@ def dynamics_provenance(fit: DynamicsFit, run: AxisRecording, input_kind: str) -
 
 
 def static_gain_text(gain: float, input_kind: str, spread: str = "") -> str:
-    """Return a clause with the static gain of the dynamics, and where in a configuration it belongs.
+    """Return a clause with the static gain of the dynamics, and its place in a configuration.
 
-    This depends on the input of the identification, `input_kind`: "hysteresis", "command" or "drive". `spread` follows
-    the number, such as " ± 0.1 (1σ)".
+    The place depends on the input of the identification, `input_kind`: "hysteresis", "command" or "drive". With "drive"
+    and a gain not above 0, the clause tells to change a sign. `spread` follows the number, such as " ± 0.1 (1σ)".
     """
     number = f"the identified static gain of {gain:.6g}{spread}"
     if input_kind == "hysteresis":
@@ -120,7 +120,7 @@ def proportional_actuator(gain_um_per_v: float) -> PlayModel | None:
 
 
 def describe_sources(runs: Sequence[AxisRecording]) -> str:
-    """Return the file names and shortened digests of recordings as text."""
+    """Return the file names of recordings, each with the first 16 digits of its SHA-256, as text."""
     return ", ".join(f"{Path(run.name).name} (SHA-256 {run.digest[:16]}…)" for run in runs)
 
 
@@ -137,8 +137,8 @@ class PlantSections(NamedTuple):
 
 
 def read_identified(path: Path, axis: str | None = None) -> PlantSections:
-    """Read [axis.model] and [axis.feedforward] (None where there is none) from a file: as `identify` wrote it, or of
-    axis `axis` (None: first) of a configuration.
+    """Read [axis.model] and [axis.feedforward] (None where there is none) from a file: one that `rtloop identify`
+    wrote, or a configuration, of its axis `axis` (None: first).
 
     Raises InputFileError for a file that cannot be read; ConfigError for text that is no TOML, a missing axis or
     [axis.model], and invalid options.
@@ -170,8 +170,8 @@ def parse_feedforward(content: str, source: str, axis: str | None = None) -> Pra
 
 
 def _axis_table(content: str, source: str, axis: str | None) -> dict[str, object]:
-    """Return the table [axis], whatever its name, or, from a list [[axis]], the table named `axis` (None: the first);
-    {} if there is none.
+    """Return the table of an axis in TOML text: [axis], whatever `axis` is, or, from a list [[axis]], the table with
+    the name `axis` (None: the first); {} if there is none.
 
     Raises ConfigError for text that is no TOML.
     """
@@ -194,7 +194,7 @@ def _missing_section(source: str, section: str, axis: str | None) -> ConfigError
 def _validated(model: type[Section], table: Mapping[str, object], section: str, source: str) -> Section:
     """Return `table[section]`, which must exist, as options of the class `model`.
 
-    Raises ConfigError, which names the file `source`, for invalid ones.
+    Raises ConfigError, which names the file `source`, for invalid options.
     """
     try:
         return model.model_validate(table[section])
@@ -212,7 +212,7 @@ def require_new(path: Path | None) -> None:
 
 
 def write_new_file(path: Path, content: str) -> None:
-    """Write a text file under a temporary name and rename it to `path`, so that it is there in full or not at all.
+    """Write a text file under a temporary name and rename it to `path`, so that `path` is complete or does not exist.
 
     Raises OutputError if `path` exists, with nothing written, or cannot be written.
     """

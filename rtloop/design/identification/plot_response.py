@@ -65,13 +65,13 @@ def _plot_with_spread(panel: Axes, hz: Real, size: Real, std: Real) -> None:
 
 
 def _complex(pairs: Sequence[Sequence[float | None]]) -> Complex:
-    """Return pairs [real, imaginary] as complex numbers (k,)."""
+    """Return pairs [real, imaginary] as complex numbers (k,); a part that is None becomes NaN."""
     parts = np.array(pairs, dtype=float)
     return parts[:, 0] + 1j * parts[:, 1]
 
 
 def _format_margin(margin: Mapping[str, float | None]) -> str:
-    """Return a margin, its "value" ± its "std", as text; "–" for a std, or a value, that is None."""
+    """Return a margin as text, "value ± std", with "–" for a std that is None; "–" alone for a value that is None."""
     if margin["value"] is None:
         return "–"
     std = "–" if margin["std"] is None else f"{margin['std']:.2g}"

@@ -32,10 +32,10 @@ ZOOM_PERIODS, LEAST_ZOOM = 12, 60
 
 
 def draw_hysteresis(fit: HysteresisFit, judgements: Sequence[Judgement]) -> Figure:
-    """Return a picture of measured and modelled loops (Fig 4 of the paper) and the errors, each recording held out of
-    its model.
+    """Return a figure of measured and modelled loops (Fig 4 of the paper), and of the held-out errors over time and
+    over the drive.
 
-    Errors where the memory is not known, but estimated, are pale. Raises MissingExtra without matplotlib.
+    Errors in blocks whose memory is not known, but estimated, are pale. Raises MissingExtra without matplotlib.
     """
     figure, (loop_panel, time_panel, drive_panel) = create_figure(1, 3, (17, 5))
     for i, judgement in enumerate(judgements):
@@ -63,8 +63,8 @@ def draw_hysteresis(fit: HysteresisFit, judgements: Sequence[Judgement]) -> Figu
 
 
 def draw_dynamics(fit: DynamicsFit, run: Excitation, measured: FrequencyResponse | None, input_unit: str) -> Figure:
-    """Return a picture of response and model in time (Fig 5 of the paper), over ZOOM_PERIODS periods, their difference,
-    and both over frequency, in magnitude and phase.
+    """Return a figure of measured and modelled position over time (Fig 5 of the paper), a part of them enlarged, their
+    difference, and the responses over frequency, in magnitude and phase.
 
     `input_unit` is "V" or "µm". The input of `run` is already delayed by the model's delay, which the phase leaves out.
     `measured` None omits the measured frequency response. Raises MissingExtra without matplotlib.
@@ -103,8 +103,10 @@ def _draw_in_time(fit: DynamicsFit, run: Excitation, full: Axes, zoom: Axes, dif
 
 
 def _zoom_range(fit: DynamicsFit, run: Excitation) -> tuple[int, int]:
-    """Return first sample and last sample + 1 of ZOOM_PERIODS periods of the slowest mode, or LEAST_ZOOM samples if
-    these are more, from just before the largest change of the input on.
+    """Return first sample and last sample + 1 of the enlarged part: ZOOM_PERIODS periods of the slowest mode, or
+    LEAST_ZOOM samples if these are more, from just before the largest change of the input on.
+
+    The part lies within the first POINTS samples of the run, and is shorter where these are fewer.
     """
     slowest_hz = min((mode.frequency_hz for mode in fit.modes if mode.frequency_hz > 0), default=np.inf)
     length = min(max(round(ZOOM_PERIODS / (slowest_hz * run.period_s)), LEAST_ZOOM), run.input.size, POINTS)

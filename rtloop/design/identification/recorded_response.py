@@ -22,10 +22,10 @@ def recorded_measurement(path: Path, axis: str | None = None, near_hz: float | N
     """Measure a closed loop's response in a recording, from the longest multisine in the reference of an axis (None:
     the only one).
 
-    The model comes from the recorded configuration; there is none for a user's law. The lightly damped mode is searched
-    near `near_hz`; None means near the model's resonance, or without one where the plant answers most. Raises
-    RecordingError for a bad file, an unknown axis, and None with several axes; UnsuitableData for an imported recording
-    and for signals that `measure_loop` refuses.
+    The model comes from the recorded configuration; a user's law has no model. The lightly damped mode is searched near
+    `near_hz`; None means near the model's resonance, or without one where the plant's response is largest. Raises
+    RecordingError for a bad file and as `select_axis`; UnsuitableData for an imported recording and for signals that
+    `measure_loop` refuses.
     """
     recording = load(path)
     if "imported" in recording.header:

@@ -58,7 +58,7 @@ class Certificate(NamedTuple):
         checks = [
             ("max |S|", self.sensitivity, walls.sensitivity),
             (f"|S| at {walls.disturbance_hz:g} Hz", self.disturbance, walls.disturbance),
-            ("noise gain into v", self.noise_gain, walls.noise_gain),
+            ("noise gain from sensor to v", self.noise_gain, walls.noise_gain),
             ("time constant in ms of the slowest mode around a resonance", self.decay_ms, decay_ms or math.inf),
         ]
         return [
@@ -73,9 +73,10 @@ class Certificate(NamedTuple):
 
 
 def certify(controller: DiscreteController, family: Family, walls: Walls, seed: int = 0) -> Certificate:
-    """Certify a controller over a family's corners, sweeps and random draws (`seed`): the worst of each measure.
+    """Return the certificate of a controller over a family's corners, sweeps and random draws (`seed`): the worst value
+    of each measure, with its scenario.
 
-    `walls` gives the disturbance's frequency; its limits are not checked here.
+    Only the disturbance's frequency of `walls` is used; `Certificate.violations` checks the limits.
     """
     scenarios = dict.fromkeys(
         [
@@ -90,8 +91,8 @@ def certify(controller: DiscreteController, family: Family, walls: Walls, seed: 
 
 
 def slowest_ms(loop: Loop, bands: Iterable[tuple[float, float]]) -> float:
-    """Return 1/|Re s| in ms of the slowest closed-loop mode whose |Im s| is in the bands (rad/s); of all modes if a
-    band has none, or without bands; inf if the loop is unstable.
+    """Return 1/|Re s| in ms of the slowest closed-loop mode whose |Im s| is in one of the bands (rad/s); of the slowest
+    of all modes if a band has no mode, or without bands; inf if the loop is unstable.
     """
     if not loop.is_stable:
         return math.inf
@@ -113,8 +114,8 @@ def noise_gain(loop: Loop) -> float:
 def _measure_loop(
     controller: DiscreteController, family: Family, walls: Walls, scenario: Scenario
 ) -> tuple[float, float, float, float, float]:
-    """Return largest |pole|, `slowest_ms`, max |S|, |S| at the disturbance's frequency, noise gain; all but the first
-    are infinite if unstable, and the disturbance is 0 without a frequency.
+    """Return largest |pole|, `slowest_ms`, max |S|, |S| at the disturbance's frequency (0 without a disturbance), noise
+    gain; all but the first are infinite if the loop is unstable.
     """
     loop = discrete_loop(controller, family.plant(scenario), scenario.delay_ticks)
     radius = float(np.max(np.abs(loop.poles)))

@@ -41,9 +41,9 @@ from rtloop.errors import ConfigError, NoDesign
 from rtloop.linear.discretise import discretise_controller
 
 RANGES_PERCENT = (10.0, 5.0, 2.0)
-"""Resonance ranges (±%) tried for the controller if [scenarios] is left out."""
+"""Resonance ranges (±%) tried for the controller if the specification has no [scenarios]."""
 TAPS_RANGES_PERCENT = (5.0, 2.0, 1.0, 0.0)
-"""Resonance ranges (±%) tried for the taps if [shape.scenarios] is left out."""
+"""Resonance ranges (±%) tried for the taps if the specification has no [shape.scenarios]."""
 TAP_PERIODS = 2.9
 """Default length of the taps, in periods of the slowest leading mode."""
 NARROW_PERCENT = 2.5
@@ -162,9 +162,9 @@ OTHER_SIZES_TEXT = ". The recording does not show how steps of other sizes behav
 
 
 def _require_play_model(stage: Stage, design: DesignOptions) -> None:
-    """Raise NoDesign where steps cannot be predicted, because the actuator is no sum of plays.
+    """Raise NoDesign if no sum of plays describes the actuator (`unexplained_um`), so that steps cannot be predicted.
 
-    With `simulation.residual_percent` in the specification, that much hysteresis is simulated instead.
+    With `simulation.residual_percent` in the specification, it does not raise: that much hysteresis is simulated.
     """
     left_um = unexplained_um([stage.slow], stage.hysteresis)
     if left_um and "residual_percent" not in design.simulation.model_fields_set:
@@ -220,8 +220,8 @@ def _find_damped_controller(design: DesignOptions, progress: Progress) -> Robust
 
 
 def _least_damped_mode(robust: RobustDesign) -> tuple[float, float]:
-    """Return frequency (Hz) and damping of the least damped closed-loop mode of the model near its leading modes;
-    without a mode there, the damping is 1, and the frequency has no meaning.
+    """Return frequency |s|/2π (Hz) and damping ratio of the least damped closed-loop mode of the model near its leading
+    modes (FREQUENCY_FACTOR); without a mode there, the damping is 1, and the frequency has no meaning.
     """
     family = robust.family
     controller = discretise_controller(robust.controller, family.period_s, "matched")
@@ -233,7 +233,7 @@ def _least_damped_mode(robust: RobustDesign) -> tuple[float, float]:
 
 
 def _candidate_designs(design: DesignOptions) -> Iterator[DesignOptions]:
-    """Yield the requested design. If it has no [scenarios], yield it once for each range of the plant's resonance in
+    """Yield `design` alone if it has [scenarios]; otherwise yield a copy of it for each resonance range in
     RANGES_PERCENT, widest first.
     """
     if "scenarios" in design.model_fields_set:
@@ -245,7 +245,7 @@ def _candidate_designs(design: DesignOptions) -> Iterator[DesignOptions]:
 
 
 def _add_disturbance(design: DesignOptions) -> DesignOptions:
-    """Return `design` with the default disturbance if it has none: otherwise the slowest integrator would suffice.
+    """Return `design`, with the default disturbance if it has none: without one, the slowest integrator would suffice.
 
     A design without a plant is returned unchanged.
     """
@@ -274,7 +274,7 @@ def _choose_tap_options(design: DesignOptions, family: Family) -> DesignOptions:
 
 
 def _slowest_hz(family: Family) -> float:
-    """Return the lowest leading frequency in Hz, at most a tenth of the rate (also without a mode)."""
+    """Return the lowest frequency of a leading mode in Hz, at most a tenth of the rate; that tenth without a mode."""
     leading = np.abs(family.modes[list(family.leading)]) / (2 * np.pi)
     return float(np.min(leading, initial=0.1 / family.period_s))
 
@@ -293,10 +293,10 @@ def _limit_command(subject: Subject, design: DesignOptions) -> Subject:
 
 
 def _find_taps(subject: Subject, is_range_fixed: bool, progress: Progress) -> tuple[Subject, TapDesign]:
-    """Return the subject with the widest resonance range that has taps, and the taps; only the requested range if
-    `is_range_fixed`.
+    """Return the subject with the widest range of TAPS_RANGES_PERCENT that has taps, and the taps; only the subject's
+    own range is tried if `is_range_fixed`.
 
-    Raises NoDesign if the last range has none either.
+    Raises NoDesign if the last range has no taps either.
     """
     if is_range_fixed:
         return subject, design_taps(subject, progress=progress)

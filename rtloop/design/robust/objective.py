@@ -1,6 +1,6 @@
 """Cost function of the search: the slowest decay around the resonances over all scenarios, with limits as penalties.
 
-    cost = log(τ/T) + 10 Σ max(0, log(value/limit))        stable in every scenario; with two leading modes
+    cost = log(τ/T) + 10 Σ max(0, log(value/(0.99 limit))) stable in every scenario; with two leading modes
                                                            half the worst, half the mean of both log(τ/T)
          = UNSTABLE_COST·(1 + largest |pole|)                         otherwise
 
@@ -22,7 +22,7 @@ from rtloop.linear.realisation import System
 
 UNSTABLE_COST, WALL_SLOPE = 100.0, 10.0
 INSIDE_SHARE = 0.99
-"""Margin of a search to its limits, for the gaps between its frequencies and its scenarios."""
+"""Fraction of a limit that a search aims at, because of the gaps between its frequencies and its scenarios."""
 
 
 class Walls(NamedTuple):
@@ -92,7 +92,7 @@ class Objective:
         return cost + np.sum((points - clipped) ** 2, axis=1)
 
     def measure(self, points: Real) -> Measures:
-        """Return the worst of every quantity over the scenarios for points (k, n) within the bounds."""
+        """Return the worst value of each quantity over the scenarios for points (k, n), which must be within bounds."""
         controllers = build_candidates(points)
         z_poles = self._closed_loop_poles(*controllers.matrices())
         rates = np.log(np.maximum(np.abs(z_poles), 1e-300)) / self.period_s
@@ -124,8 +124,8 @@ class Objective:
 
 
 def _slowest_constant(constants: Real, sizes: Real, low: float, high: float) -> Real:
-    """Return the largest (k,) of `constants`, 1/|rate| in s (k, scenarios, n), whose pole has |Im s| (`sizes`) in the
-    band.
+    """Return the largest (k,) of the time constants in s, `constants` (k, scenarios, n), whose pole has its |Im s| in
+    rad/s, in `sizes`, from `low` to `high`.
 
     In a scenario without such a pole, all poles count.
     """
@@ -149,7 +149,7 @@ def _stack_plants(plants: Sequence[System]) -> tuple[Real, Real, Real]:
 def _frequency_grid(family: Family, walls: Walls) -> tuple[Real, Real]:
     """Return frequencies in Hz and the weight of each in a mean over 0 Hz … half the rate, both (f,).
 
-    The disturbance's frequency is first, with weight 0; without a disturbance, the lowest frequency stands there.
+    The first frequency, with weight 0, is the disturbance's; the lowest of the grid if that is lower or 0 (none).
     """
     top = 0.5 / family.period_s
     grids = [np.geomspace(1e-4 * top, 0.999 * top, 110), np.linspace(0.02 * top, 0.999 * top, 40)]

@@ -58,8 +58,8 @@ class Bounds(NamedTuple):
         return max(self.lowest_um, 0.0) + self.step_um
 
     def command_limits(self, static: Real) -> tuple[Real, Real]:
-        """Return least and largest v per unit step such that v fits from any level to any level, in the shape of
-        `static`, v/x at rest.
+        """Return least and largest v per unit step that keep v within `low_um` … `high_um` in every step of up to
+        `step_um` between the levels, in the shape of `static`, v/x at rest.
         """
         step, lowest, highest = self.step_um, self.lowest_um, self.highest_um
         low = np.maximum(self.low_um - lowest * static, highest * static - self.high_um) / step
@@ -79,7 +79,7 @@ class Programme:
     """Linear programme over the responses of scenarios; the first one is the model.
 
     `taps` is the number in each row, `points` the number of position samples per tick, `band` the settling band, a
-    fraction. Of the band and of a largest overshoot, solutions use USED_SHARE. Rows that a solution violated stay in
+    fraction. Solutions use USED_SHARE of the band and of the largest overshoot. Rows that a solution violated stay in
     `active`, so that later solutions begin with them. A solution raises NoDesign if no solver finishes.
     """
 
@@ -106,21 +106,21 @@ class Programme:
         self.static = np.concatenate([np.ones(taps), np.zeros(taps)])
 
     def is_feasible(self, settling: float, overshoot: float) -> bool:
-        """Whether some taps settle in `settling` ticks with an overshoot up to USED_SHARE of `overshoot`, a fraction of
-        the step. Raises NoDesign if no solver finishes.
+        """Whether some taps settle in `settling` ticks in every scenario, with an overshoot up to USED_SHARE of
+        `overshoot`, a fraction of the step. Raises NoDesign if no solver finishes.
         """
         return self._solve(settling, np.eye(2 * self.taps + 1)[-1], overshoot) is not None
 
     def least_overshoot_taps(self, settling: float) -> Taps | None:
-        """Return the taps of least overshoot ε that settle in `settling` ticks; None if there are none with ε up to
-        USED_SHARE of the band. Raises NoDesign if no solver finishes.
+        """Return the taps of least overshoot ε that settle in `settling` ticks in every scenario; None if none do with
+        ε up to USED_SHARE of the band. Raises NoDesign if no solver finishes.
         """
         solved = self._solve(settling, np.eye(2 * self.taps + 1)[-1], None)
         return None if solved is None else self._split_taps(solved)
 
     def quietest_taps(self, settling: float, overshoot: float) -> Taps | None:
-        """Return the taps whose step on the model settles in `settling` ticks, with an overshoot up to USED_SHARE of
-        `overshoot`, and with the least total variation of the command v; None if no taps do.
+        """Return the taps that settle in `settling` ticks in every scenario, with an overshoot up to USED_SHARE of
+        `overshoot`, and with the least total variation of the command v on the model; None if no taps settle so.
 
         Raises NoDesign if no solver finishes.
         """

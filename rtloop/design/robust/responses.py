@@ -57,8 +57,9 @@ def step_responses(
 def horizon_ticks(
     controller: DiscreteController | SampledController, family: Family, scenarios: list[Scenario], taps: int
 ) -> int:
-    """Return the tick by which, after the last tap, the slowest mode of all scenarios' loops has decayed; at most
-    MOST_TICKS. If one of the loops is unstable, no time is added for decay.
+    """Return the tick by which the slowest mode of all scenarios' loops has decayed after the last tap
+    (TIME_CONSTANTS), and 20 ticks more; at most MOST_TICKS. If one of the loops is unstable, no time is added for
+    decay.
     """
     radius = 0.0
     for scenario in scenarios:

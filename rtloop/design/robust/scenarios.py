@@ -45,7 +45,7 @@ class Family:
     """
 
     def __init__(self, model: Transfer, delay_ticks: int, options: ScenarioOptions, period_s: float):
-        """Find the lightly damped modes of `model` below half the rate, and which of them lead.
+        """Find the lightly damped modes of `model` below half the rate, and the leading ones: the highest peaks.
 
         `delay_ticks` is the delay in samples unless `options` list delays.
         """
@@ -69,8 +69,8 @@ class Family:
         return bands[list(self.leading)]
 
     def plant(self, scenario: Scenario) -> Transfer:
-        """Return the plant of a scenario, its delay left out; damping ratios and D(0) change only by the scenario's
-        factors.
+        """Return the plant of a scenario, without its delay; a shifted frequency changes neither damping ratio nor
+        D(0), which change by the scenario's own factors.
         """
         poles, gain = self.model.poles.copy(), self.model.gain * (1 + scenario.gain / 100)
         for mode, percent in zip(self.modes, scenario.resonance, strict=True):
@@ -89,7 +89,8 @@ class Family:
         """Return the unchanged model, and for each delay every combination of the ends of resonance, damping and gain.
 
         Resonances in the middle are included, and resonances halfway to the ends with the least damping. Modes other
-        than the LEADING_COUNT leading ones stay, or move with all; the proof moves each alone.
+        than the LEADING_COUNT leading ones stay, or all modes move alike; `random_scenarios` moves each by its own
+        shift.
         """
         r, g = self.options.resonance_percent, self.options.gain_percent
         ends = sorted({*self.options.damping})

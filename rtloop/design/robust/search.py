@@ -57,10 +57,12 @@ class RobustDesign(NamedTuple):
 
 
 def find_robust_controller(design: DesignOptions, progress: Progress = lambda _: None) -> RobustDesign:
-    """Find a controller for all scenarios of `design`; `progress` receives a sentence after each search and proof.
+    """Find a controller for all scenarios of `design`; `progress` receives a sentence after each search of the first
+    round and after each proof.
 
-    Raises ValueError for an incomplete specification and for a plant that is unstable, has direct feedthrough or no
-    gain above 0 at 0 Hz; NoController, with the missed limits, if the search finds none.
+    Raises ValueError without a plant, for a plant that is unstable, has direct feedthrough or no gain above 0 at 0 Hz,
+    and as `design_walls`; NoController if no controller is stable in all scenarios, and, with the missed limits, if the
+    last proof misses some.
     """
     plant = design.sensor.add_sensor_lag(design.required_plant.transfer())
     if not plant.is_strictly_proper or plant.dc_gain <= 0 or not plant.is_stable:
@@ -111,7 +113,7 @@ def minimise(
 ) -> Minimum:
     """Minimise `cost`, which takes points (k, n) and returns (k,), from `start` (n,) with standard deviation `spread`.
 
-    All random numbers come from `random`. Returns `start` where no generation is better.
+    All random numbers come from `random`. Returns `start` if no point of any generation is better.
     """
     import cma  # takes a second: only a search needs it
 
@@ -156,10 +158,10 @@ def design_walls(design: DesignOptions) -> Walls:
 
 
 def _tighten(search_walls: Walls, walls: Walls, proof: Certificate) -> Walls:
-    """Return limits for another round of the search: `search_walls`, each lowered by its excess over the requested
-    `walls` in the proof, by LEAST_FACTOR at most.
+    """Return limits for another round of the search: `search_walls`, each multiplied by limit/value if the value in the
+    proof exceeds the limit in the requested `walls`, but at least by LEAST_FACTOR; the limit on |S| stays 1 or more.
 
-    A peak may lie between a search's points.
+    A peak may lie between the frequencies and scenarios of a search.
     """
     cases = [(proof.sensitivity, walls.sensitivity), (proof.noise_gain, walls.noise_gain),
              (proof.disturbance, walls.disturbance)]  # fmt: skip
@@ -191,8 +193,8 @@ def _run_searches(
 
 
 def _random_points(objective: Objective, sections: int, random: np.random.Generator) -> Real:
-    """Return RANDOM_POINTS random points (k, n) with low gains and sections near the resonance; some may be out of
-    bounds.
+    """Return RANDOM_POINTS random points (k, n) with low gains and sections near the resonance; some may lie outside
+    the bounds of the search.
     """
     middle = (
         np.log(np.mean(objective.bands) * objective.period_s) if np.all(np.isfinite(objective.bands)) else np.log(0.3)
@@ -203,7 +205,7 @@ def _random_points(objective: Objective, sections: int, random: np.random.Genera
 
 
 def _describe_minimum(objective: Objective, minimum: Minimum) -> str:
-    """Return the measures of a search's best point as text."""
+    """Return the measures of a search's best point as text; for an unstable one, its largest |pole| alone."""
     measures = objective.measure(np.clip(minimum.point, objective.low, objective.high)[None])
     if minimum.cost >= UNSTABLE_COST:
         return f"unstable, largest |pole| {measures.radius[0]:.4f}"

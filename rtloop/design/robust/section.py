@@ -17,7 +17,7 @@ from rtloop.version import __version__
 
 
 def robust_section(robust: RobustDesign, design: DesignOptions, source: str, text: str) -> str:
-    """Return [axis.controller] as TOML below comments on its origin; it depends on the specification alone.
+    """Return [axis.controller] as TOML below comments on its origin, to insert below an [[axis]].
 
     `source` is the specification's name, `text` its content.
     """
@@ -77,8 +77,8 @@ def taps_values(taps: Taps) -> dict[str, list[float]]:
 
 
 def taps_provenance(tap_design: TapDesign, subject: Subject, source: str) -> list[str]:
-    """Return comment lines, without #, on the origin of taps; `source` is the name of the file with their controller
-    or specification.
+    """Return comment lines, without #, on the origin of taps and their proved figures; `source` is the name of the
+    configuration with their controller, or of the specification for both.
     """
     options, proof = subject.options.scenarios, tap_design.proof
     return [
@@ -91,7 +91,7 @@ def taps_provenance(tap_design: TapDesign, subject: Subject, source: str) -> lis
 
 
 def certified_values(proof: Certificate) -> list[tuple[str, float, str]]:
-    """Return label, worst value and scenario, as text, of each certified figure but the largest |pole|."""
+    """Return (label, worst value, text of its scenario) for each certified figure but the largest |pole|."""
     return [
         (
             "time constant of the slowest mode around a resonance, ms",
@@ -100,7 +100,7 @@ def certified_values(proof: Certificate) -> list[tuple[str, float, str]]:
         ),
         ("max |S|", proof.sensitivity.value, str(proof.sensitivity.scenario)),
         ("|S| at the disturbance's frequency", proof.disturbance.value, str(proof.disturbance.scenario)),
-        ("noise gain into v", proof.noise_gain.value, str(proof.noise_gain.scenario)),
+        ("noise gain from sensor to v", proof.noise_gain.value, str(proof.noise_gain.scenario)),
     ]
 
 
@@ -114,7 +114,7 @@ def robust_values(robust: RobustDesign, design: DesignOptions) -> dict[str, obje
 def provenance(robust: RobustDesign, design: DesignOptions, source: str, text: str) -> list[str]:
     """Return comment lines, without #, on the origin of a controller and its certified figures.
 
-    `source` and `text` are the specification's name and content, which is named by its digest.
+    `source` and `text` are the specification's name and content; a comment has the content's SHA-256.
     """
     digest, options = hashlib.sha256(text.encode()).hexdigest(), design.robust
     return [
@@ -140,8 +140,8 @@ def _replace_in_axis(text: str, axis: str, parts: Mapping[str, object], comments
 
 
 def _remove_provenance(text: str, heading: str) -> str:
-    """Return `text` without the comment paragraphs that the same command wrote before, recognised by the first two
-    words of `heading`.
+    """Return `text` without the paragraphs that begin with "# " and the first two words of `heading`: the comments that
+    the same command wrote before.
     """
     paragraphs, mark = text.split("\n\n"), "# " + " ".join(heading.split()[:2]) + " "
     return "\n\n".join(paragraph for paragraph in paragraphs if not paragraph.startswith(mark))

@@ -24,7 +24,7 @@ SWEEP_PLACES, PROOF_PLACES, MOST_ROUNDS = 7, 41, 6
 scenarios.
 """
 PROOF_POINTS = 10
-"""Points per tick at which a proof knows the position."""
+"""Points per tick at which a proof computes the position."""
 ALLOWED_EXCESS = 1e-4
 """Largest excess of v over its limits in a proof, per unit step: 4 nm of 40 µm."""
 LONGEST_SHARE = 0.9
@@ -98,11 +98,11 @@ def design_taps(
     """Design the taps of reference and feedforward for the loop of `subject`.
 
     The taps settle fastest, or in `subject.options.settling_ms` if set; of these the ones with the least variation of
-    the command v. They are designed for some plants of the family, and proved by a simulated step on many; a round adds
-    the plants that fail. `curve` adds the trade-off of settling time and overshoot, `progress` receives a sentence per
-    round. `may_be_late`: if `settling_ms` cannot be reached, return the fastest taps instead. Raises NoDesign with the
-    binding limit and possible relaxations if no taps exist, if the proof fails MOST_ROUNDS times, if the loop of a
-    plant is unstable, and if no solver finishes.
+    the command v. They are designed for some plants of the family, and proved by a simulated step on many; a further
+    round adds the worst plants of a failed proof. `curve` adds the trade-off of settling time and overshoot, `progress`
+    receives a sentence per round. `may_be_late`: if `settling_ms` cannot be reached, return the fastest taps instead of
+    raising. Raises NoDesign, with possible relaxations, if no taps exist; NoDesign also if the proof fails MOST_ROUNDS
+    times, if the loop of a plant is unstable, and if no solver finishes.
     """
     options, tick_ms, family = subject.options, 1e3 * subject.controller.period_s, subject.family()
     scenarios = list(dict.fromkeys([family.nominal, *family.sweep_scenarios(SWEEP_PLACES)]))
@@ -226,7 +226,7 @@ def _worst_measures(all_measures: Iterable[StepMeasures]) -> StepMeasures:
 
 
 def measure_step(subject: Subject, taps: Taps, scenario: Scenario) -> StepMeasures:
-    """Simulate a unit step on one plant and return its figures. Raises NoDesign if its loop is unstable.
+    """Simulate a unit step on the plant of `scenario` and return its figures. Raises NoDesign if the loop is unstable.
 
     The settling time is the simulation's end if the step never stays within ±5 %.
     """
@@ -270,7 +270,7 @@ def _scenario_responses(subject: Subject, family: Family, scenario: Scenario, po
 
 
 def _explain_no_taps(subject: Subject, programme: Programme) -> str:
-    """Return a sentence on why no settling time is feasible."""
+    """Return the reason why no settling time is feasible, and remedies, as text."""
     longest = int(LONGEST_SHARE * programme.taps)
     tick_ms, best_taps = 1e3 * subject.controller.period_s, programme.least_overshoot_taps(longest)
     if best_taps is not None:
@@ -301,10 +301,10 @@ def _proof_failure(subject: Subject, settling_ms: float, proof: StepMeasures, pl
 
 
 def _describe_relaxations(subject: Subject) -> str:
-    """Return in two sentences the fastest settling in ms with one constraint relaxed, and which of these helps most.
+    """Return as text the fastest settling in ms for each constraint relaxed alone, and the most helpful one.
 
-    Relaxed alone are: the limits on v and the undershoot (none), the largest step (half of it), the overshoot (to
-    BAND), and the scenarios (the model alone). Each is searched anew, on few scenarios.
+    Each of these is relaxed alone: limits on v (none), undershoot (none), largest step (half of it), overshoot (BAND),
+    scenarios (no variation of the plant). The fastest settling of each is searched anew, on few scenarios.
     """
     options, bounds, tick_ms = subject.options, subject.bounds, 1e3 * subject.controller.period_s
     far = 1e3 * max(abs(bounds.low_um), abs(bounds.high_um))
@@ -318,7 +318,7 @@ def _describe_relaxations(subject: Subject) -> str:
         "no limit on v": replace(subject, bounds=bounds._replace(low_um=-far, high_um=far)),
         "any undershoot": replace(subject, bounds=bounds._replace(undershoot=far)),
         f"overshoot of {100 * BAND:g} %": replace(subject, overshoot=BAND),
-        "the model alone": replace(
+        "no variation in [shape.scenarios]": replace(
             subject, options=options.model_copy(update={"scenarios": nominal})
         ),
     }  # fmt: skip

@@ -23,8 +23,8 @@ def load_subject(configuration: Configuration, name: str, spec: Path | None) -> 
     """Load the axis `name`, its loop for the design of taps, and the path of its specification (`spec`, else the axis's
     own).
 
-    Raises ConfigError for an unknown axis, an invalid configuration or specification and a missing requirement;
-    InputFileError for a specification that cannot be read.
+    Raises ConfigError for an unknown axis, an invalid configuration or specification, a missing specification, and an
+    axis or specification that `build_subject` refuses; InputFileError for a specification that cannot be read.
     """
     axis = next((entry for entry in configuration.axes if entry.name == name), None)
     if axis is None:
@@ -66,7 +66,7 @@ def missing_requirements(specification: SpecificationOptions) -> list[str]:
 def build_subject(axis: AxisOptions, check: AxisCheck, design: DesignOptions, latency_ticks: int) -> Subject:
     """Build the loop of one axis for which taps are designed, with its bounds.
 
-    Its delay is the model's if the model states one, else the rig's `latency_ticks`, in samples.
+    The loop's delay in samples is the model's `delay_ticks` if the model states it, else `latency_ticks`, the driver's.
     Raises ValueError, naming the key, without a linear controller, a model or a requirement of `missing_requirements`,
     and for an axis with pre-filter sections, a slew limit or a reference that v cannot hold (`step_bounds`).
     """
@@ -95,13 +95,13 @@ def build_subject(axis: AxisOptions, check: AxisCheck, design: DesignOptions, la
 
 
 def step_bounds(axis: AxisOptions, model: ModelOptions, design: DesignOptions) -> Bounds:
-    """Return the bounds of a step of `specification.command.reference_um`, and the levels that it leads from and to.
+    """Return the bounds of a step by `specification.command.reference_um`, and the levels between which steps lead.
 
-    A range of v with equal sides gives levels to both sides of 0; so does one with unequal sides if the shorter one has
-    room for `command_um`. Otherwise the levels lie between 0 and the reference on the longer side, or in the middle of
-    a range without 0, as a drive of one sign has it; if the negative side is the longer one, the bounds are those of
-    the mirror image, with all signs changed. Raises ValueError, naming the key, for a reference that v cannot hold, and
-    without [specification.command].
+    The levels lie on both sides of 0 if the range of v has equal sides, or if its shorter side has room for
+    `command_um`. Otherwise they lie between 0 and the reference on the longer side, or in the middle of a range without
+    0, as a drive of one sign has it. If the negative side is the longer one, all bounds and levels have their signs
+    changed, because a loop and its mirror image have the same taps. Raises ValueError, naming the key, for a reference
+    that v cannot hold, and without [specification.command].
     """
     command, undershoot = design.specification.command, design.shape.undershoot_percent / 100
     if command is None:
@@ -135,10 +135,10 @@ def _controller_fault(check: AxisCheck) -> str:
 
 
 def command_range_um(axis: AxisOptions) -> tuple[float, float]:
-    """Return least and largest v in µm that the drive can hold in any order, with its memory, within the axis's
-    ±`limits.command_um`, which is always set.
+    """Return least and largest static command v in µm that the drive can hold whatever came before, within the axis's
+    ±`limits.command_um`.
 
-    For other feedforward than a play model, ±`limits.command_um`; the least is then 0 where the drive cannot be
+    For other feedforward than a play model, they are ±`limits.command_um`; the least is 0 where the drive cannot be
     negative.
     """
     limits, law = axis.limits, axis.feedforward

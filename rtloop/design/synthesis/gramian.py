@@ -20,7 +20,7 @@ from rtloop.linear.realisation import System
 
 
 def modal_root(poles: Complex, inputs: Complex) -> Real:
-    """Return L (n, n) with L Lᵀ the controllability Gramian of the real modal form; its first column carries most.
+    """Return L (n, n), lower triangular, with L Lᵀ the controllability Gramian of the real modal form.
 
     `poles` (n,) all stable, no two alike, conjugates side by side with the upper one first; `inputs` β (n,), conjugate
     alike. The real form has x = (√2 Re, √2 Im) of each upper mode, which is a unitary change of coordinates.

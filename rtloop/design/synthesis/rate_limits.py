@@ -65,8 +65,8 @@ def is_runnable(
 ) -> bool:
     """Whether C(z) with the plant, its hold and its delay is stable at this rate, with max |S| ≤ LARGEST_SENSITIVITY.
 
-    False too for an order above MAX_ORDER and where no C(z) exists. Near half the rate C(z) differs from C(s); a light
-    mode there may leave a loop that is stable on the model alone.
+    False too for an order above MAX_ORDER and if no C(z) exists. Near half the rate C(z) differs from C(s); with a
+    lightly damped mode there, a loop may be stable on the model and unstable on the stage.
     """
     if controller.order > MAX_ORDER:
         return False

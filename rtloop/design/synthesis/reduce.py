@@ -48,8 +48,8 @@ class _BalancedSystem(NamedTuple):
 
 
 def hankel_singular_values(transfer: Transfer) -> Real:
-    """Return the Hankel singular values σ of the stable part, falling; leaving a state out moves the response by about
-    2σ. Values that count as zero (LEAST_RELATIVE) are left out.
+    """Return the Hankel singular values σ of the stable part, falling; a state that is left out moves the response by
+    up to about 2σ. Values that count as zero (LEAST_RELATIVE) are not returned.
 
     Raises ValueError for repeated poles beside unstable ones.
     """
@@ -71,11 +71,12 @@ def reduce_order(
     method: ReductionMethod = "residualise",
     tolerance: float = 1e-3,
 ) -> ReducedController:
-    """Reduce a transfer function to `order` poles, by default as few as `tolerance` allows (see `order_within`).
+    """Reduce a transfer function to `order` poles, unstable ones included, by default to all unstable poles and as few
+    stable ones as `tolerance` allows (`order_within`).
 
-    There are fewer poles where the states beyond have no effect (LEAST_RELATIVE). "residualise" keeps the gain at 0 Hz,
-    "truncate" the gain at infinity. Raises ValueError for an order that is negative, above the original's, or below the
-    number of modes that are not stable, and for repeated poles beside unstable ones.
+    The result has fewer poles than `order` where further states have no effect (LEAST_RELATIVE). "residualise" keeps
+    the gain at 0 Hz, "truncate" the gain at infinity. Raises ValueError for an order that is negative, above the
+    original's, or below the number of modes that are not stable, and for repeated poles beside unstable ones.
     """
     stable, unstable = _split_stable(transfer)
     balanced = _balance(stable)
@@ -138,8 +139,8 @@ def _balance(part: ModalSystem | System) -> _BalancedSystem:
 def _reduce_states(balanced: _BalancedSystem, count: int, method: ReductionMethod) -> System:
     """Return the system of the first `count` balanced states, the others truncated or residualised.
 
-    Only the kept states are computed: residualising G(s) is truncating G(1/s), which has the same balanced coordinates.
-    So rounding in negligible states does not enter, and C(0) is preserved.
+    Only these states are computed: residualising G(s) is truncating G(1/s), which has the same balanced coordinates. So
+    rounding in negligible states does not enter, and C(0) is preserved.
     """
     (a, b, c, direct), forward, back = balanced.system, balanced.forward[:, :count], balanced.back[:count]
     if method == "truncate":

@@ -101,8 +101,8 @@ def configuration_around(
 
 
 def _separate_poles(plant: Transfer) -> Transfer:
-    """Return the plant; if poles repeat, its real poles, and likewise its pairs, are multiplied in order by 1,
-    1 + POLE_SPACING, 1 + 2·POLE_SPACING …, with the static gain preserved.
+    """Return the plant; if poles repeat, a copy in which the real poles, and likewise the pairs, are multiplied one
+    after the other by 1, 1 + POLE_SPACING, 1 + 2·POLE_SPACING …, with the static gain preserved.
     """
     try:
         modal_sum(plant.zeros, plant.poles, plant.gain)
@@ -118,7 +118,7 @@ def _separate_poles(plant: Transfer) -> Transfer:
 
 def provenance(synthesis: Synthesis, design: DesignOptions, source: str, text: str) -> list[str]:
     """Return comment lines, without #, on the origin of the controller; `source` and `text` are the specification's
-    name and content, which is named by its digest.
+    name and content, whose SHA-256 is in the first line.
     """
     hinf, weights = synthesis.hinf, synthesis.weights
     order, full_order = synthesis.controller.order, synthesis.full.order

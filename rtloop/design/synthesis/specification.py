@@ -116,7 +116,7 @@ QUANTITIES = {
     "settling_ms": ("settling (5 %)", "ms"),
     "overshoot_percent": ("overshoot", "%"),
     "peak_command": ("peak of v per unit step", ""),
-    "resonance_decay_ms": ("longest decay near the resonance", "ms"),
+    "resonance_decay_ms": ("longest decay time near the resonance", "ms"),
     "resonance_shift_percent": ("resonance may move by ±", "%"),
     "bandwidth_hz": ("bandwidth, |S| < 0.71", "Hz"),
     "disturbance_hz": ("disturbance held up to", "Hz"),
@@ -128,8 +128,8 @@ QUANTITIES = {
     "modulus_margin": ("modulus margin", ""),
     "max_sensitivity": ("max |S|", ""),
     "sensitivity_1hz": ("|S| at 1 Hz", ""),
-    "noise_x_nm": ("sensor noise in x, rms, linear", "nm"),
-    "noise_v_nm": ("sensor noise in v, rms, linear", "nm"),
+    "noise_x_nm": ("x due to sensor noise, rms, linear loop", "nm"),
+    "noise_v_nm": ("v due to sensor noise, rms, linear loop", "nm"),
     "gamma": ("‖F_l(P, C)‖∞ without delay", ""),
 }
 """Label and unit of each quantity computed for a loop."""
@@ -167,8 +167,8 @@ class SensorOptions(Options):
 
     @property
     def deviation_um(self) -> float:
-        """Noise and rounding combined, in µm rms: the rounding error is uniform over one step of resolution, hence
-        width/√12.
+        """Noise and rounding combined, in µm rms; the rounding error is uniform over one step of resolution, so that
+        its rms is `resolution_um`/√12.
         """
         return math.hypot(self.noise_um, self.resolution_um / math.sqrt(12))
 
@@ -319,8 +319,8 @@ def build_weights(design: DesignOptions) -> Weights:
     """Build W1, W2, W3: user-defined ones, otherwise by the paper's rules.
 
     Without `specification.command`, the rule of W2 takes a command as large as the reference; without a disturbance,
-    W3 is 0. Raises ValueError if W1's rule lacks the static error, or both settling time and bandwidth, and if a rule
-    has to invert a W1 with fewer zeros than poles.
+    W3 is 0. Raises ValueError if the rule of W1 lacks the static error, or has neither settling time nor bandwidth, and
+    if a rule has to invert a W1 with fewer zeros than poles.
     """
     own_weights, specification = design.weights, design.specification
     tracking = own_weights.tracking.transfer() if own_weights.tracking else _tracking_weight(specification)
@@ -345,7 +345,7 @@ def build_weights(design: DesignOptions) -> Weights:
 def _tracking_weight(specification: SpecificationOptions) -> Transfer:
     """Return the tracking weight, eq (15). A bandwidth has priority over 3/t rad/s from the settling time t.
 
-    Raises ValueError if the static error is missing, or both bandwidth and settling time.
+    Raises ValueError if the static error is missing, or if bandwidth and settling time are both missing.
     """
     if specification.static_error_percent is None:
         raise ValueError(

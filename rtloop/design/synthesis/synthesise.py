@@ -1,7 +1,7 @@
 """Synthesis of a runnable controller from a plant and weights: augmented plant, H∞ controller, reduction.
 
-The controller is written in s, and the loop's own rate makes C(z) of it. What `synthesise_design` returns is stable as
-it runs at that rate; `synthesise` alone knows of no rate.
+The controller is written in s, and the loop discretises it at its own rate to C(z). The controller of
+`synthesise_design` gives a stable loop at that rate; `synthesise` alone knows no rate.
 """
 
 from __future__ import annotations
@@ -97,10 +97,10 @@ def _reduce_and_finish(
     method: ReductionMethod,
     finish: Callable[[Transfer], Transfer | None],
 ) -> tuple[Transfer, float]:
-    """Return the reduced, finished controller and the weighted loop's norm with it; `full` and inf if `finish` accepts
-    none, and if numpy fails to compute them.
+    """Return the reduced, finished controller and the weighted loop's norm with it; `full` and inf if `finish` returns
+    None, and if numpy fails to compute them.
 
-    The norm is infinite if the loop is unstable. Raises ValueError for an order that `reduce_order` refuses.
+    The norm is infinite if the weighted loop is unstable. Raises ValueError for an order that `reduce_order` refuses.
     """
     try:
         controller = finish(full if order == full.order else reduce_order(full, order, method).transfer)
@@ -112,9 +112,10 @@ def _reduce_and_finish(
 def synthesise_design(design: DesignOptions) -> Synthesis:
     """Synthesise the controller of SPEC.toml, for a loop stable at [controller] rate_hz behind the plant's delay.
 
-    A delay, and half a period for the hold, belong to the design plant. Without a delay the hold is added only if
-    no controller runs otherwise. Raises as `synthesise`: NoController, with a remedy, for a contradictory
-    specification; ValueError for an order or a plant that is not allowed, and for an incomplete specification.
+    The synthesis takes the plant with its delay and half a period for the hold as dead time. A plant without delay gets
+    the half period only if no controller runs without it. Raises as `synthesise`: NoController, with a remedy, for a
+    contradictory specification; ValueError for an order or a plant that is not allowed, and for an incomplete
+    specification.
     """
     plant, weights, options = design.required_plant.transfer(), build_weights(design), design.synthesis
     _require_possible(plant, design)
@@ -148,8 +149,8 @@ def synthesise_design(design: DesignOptions) -> Synthesis:
 
 
 def _require_possible(plant: Transfer, design: DesignOptions) -> None:
-    """Raise NoController for requirements that no controller can meet: a static error without a gain at 0 Hz, or a
-    command that cannot hold its reference.
+    """Raise NoController for a static error that no controller can meet: the plant has no gain at 0 Hz, or the largest
+    command cannot hold the reference within this error. Without a required static error, it does not raise.
     """
     specification, gain = design.specification, abs(plant.dc_gain)
     if specification.static_error_percent is not None and gain == 0:
@@ -166,9 +167,9 @@ def _require_possible(plant: Transfer, design: DesignOptions) -> None:
 
 
 def _explain_contradiction(plant: Transfer, weights: Weights, gamma: float, largest: float) -> str:
-    """Return a message that names the weight that makes γ_opt, `gamma`, large, by γ_opt with each of them relaxed.
+    """Return a message that γ_opt, `gamma`, exceeds `largest`, with γ_opt for each weight relaxed alone.
 
-    `largest` is the largest γ_opt allowed.
+    The message names as the hardest requirement the weight whose relaxation gives the least γ_opt.
     """
     w1, w2, w3 = weights
     slower = Transfer(w1.zeros / 10, w1.poles / 10, w1.gain)

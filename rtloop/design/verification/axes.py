@@ -1,4 +1,4 @@
-"""The axes of a configuration judged by their specifications, on paper and on simulated rigs."""
+"""The axes of a configuration judged by their specifications: by their linear loops and on simulated rigs."""
 
 from __future__ import annotations
 
@@ -73,8 +73,9 @@ def _plant_differences(axis: AxisOptions, design: DesignOptions) -> list[str]:
 
     [] if it does not, and if one of them is missing.
 
-    It names gain at 0 Hz, resonance and delay where they differ by more than SAME_PLANT, else the frequency below ten
-    resonances or 10 kHz with the largest difference of the responses, if that is above SAME_RESPONSE.
+    The sentence names gain at 0 Hz, resonance and delay where they differ by more than SAME_PLANT. If none does, it
+    names the frequency, up to ten times the resonance (10 kHz without one), at which the responses differ most, if by
+    more than SAME_RESPONSE.
     """
     if axis.model is None or design.plant is None:
         return []
@@ -109,8 +110,9 @@ def _add_contradictions(
     """Return the verification with the contradictions between axis and hardware, also as warnings, and with the loop
     judged on the simulated rig.
 
-    Its `on_rig` is None for drivers other than a simulated rig, without a linear loop, and without a contradiction if
-    the loop is stable on the rig. Raises ValueError for a rig's plant with direct feedthrough.
+    Its `on_rig` is None for drivers other than a simulated rig, for an axis without a linear loop on its own
+    model, and without a contradiction if the loop is stable on the rig. Raises ValueError for a rig's plant with direct
+    feedthrough.
     """
     axis = next(axis for axis in configuration.axes if axis.name == check.name)
     (lines, on_rig), rig_verification = compare_with_rig(configuration, axis, check), None
@@ -150,7 +152,7 @@ def add_simulation(configuration: Configuration, verifications: Verifications) -
 
 
 def _simulate_axis(bench: Bench, axis: AxisOptions, verification: Verification, design: DesignOptions) -> Verification:
-    """Return a copy with the axis's simulated step responses, or with a warning if these cannot be evaluated."""
+    """Return a copy with the axis's simulated steps, or with a warning if `simulate` raises ValueError."""
     try:
         return replace(verification, simulated=simulate(bench, axis, verification.slowest_s, design))
     except ValueError as error:

@@ -1,8 +1,8 @@
 """A configuration on a simulated rig, run in this process and in virtual time by the same loop as on hardware.
 
-A configured rig is used unchanged. Hardware is replaced by a rig of its models: the dynamics of the axis's model with
-its delay, the model of its hysteresis, and the sensor of its specification. Hysteresis that the model does not describe
-is unknown here; `residual_percent` adds as much of it.
+A configured rig is used unchanged. Hardware is replaced by a rig of its models: for each axis the dynamics of its
+model, the model of its hysteresis, and the sensor of its specification, and for all axes the longest delay of one of
+them. Hysteresis that the model does not describe is unknown here; `residual_percent` adds as much of it.
 """
 
 from __future__ import annotations
@@ -67,8 +67,8 @@ class Bench:
         self._plan, self.rate_hz = replace(plan, mode=Mode.CLOSED_LOOP), plan.pacing.rate_hz
 
     def run(self, axis: str, levels_um: Sequence[float], dwell_s: float, noise_draw: int = 0) -> dict[str, Real]:
-        """Simulate `axis` going from rest through levels, each held for `dwell_s`. Returns every recorded column by
-        name, (ticks,); fewer ticks if the loop ends earlier.
+        """Simulate a run in which the reference of `axis` holds each of the levels for `dwell_s`, from rest on. Returns
+        every recorded column by name, (ticks,); fewer ticks if the loop ends earlier.
 
         `noise_draw` is added to the seed of the rig's noise. Each run begins anew from rest.
         """
@@ -89,7 +89,7 @@ class Bench:
         return dict(zip(plan.columns, run_in_process(plan, plan.driver(), ticks).T, strict=True))
 
     def true_positions(self, run: Mapping[str, Real], axis: str) -> Real:
-        """Return the true positions of a run at the POINTS of each period, in µm, (ticks, POINTS), the tick first."""
+        """Return the true positions of a run in µm at POINTS times in each period, the tick first, (ticks, POINTS)."""
         driver = cast("SimDriver", self._plan.driver())
         return true_positions(driver, driver.rig, axis, run, POINTS)
 
@@ -99,7 +99,7 @@ def _place_on_rig(
 ) -> tuple[Configuration, RigOptions]:
     """Return a copy of the configuration in closed loop, at rest, without schedule, on a rig, and the rig's options.
 
-    A configured rig is used; otherwise one is made. Raises ValueError for [inputs] and [outputs] without a configured
+    A configured rig is used; otherwise one is made. Raises ValueError for [inputs] or [outputs] without a configured
     rig 'sim', for an axis without a model, and for a residual hysteresis that cannot be made.
     """
     loop = configuration.loop.model_copy(update={"mode": "closed_loop", "enable_input": None, "hold_input": None})

@@ -44,7 +44,9 @@ def as_dict(verification: Verification) -> dict[str, object]:
 
 
 def _scenarios(scenarios: ScenarioResults) -> dict[str, object]:
-    """Return {count, rows}; each row has name, worst value (may be infinite or NaN), its plant, and verdict `met`."""
+    """Return {count, rows}; each row has `name`, `worst`, the worst value (may be infinite or NaN), its `plant`, and
+    the verdict `met`.
+    """
     rows = [
         {
             "name": row.name,
@@ -75,5 +77,5 @@ def _row(row: Row) -> dict[str, object]:
 
 
 def _percent(tolerated: PercentRange) -> list[float | None]:
-    """Return [−down, up] in percent; None for an unlimited end."""
+    """Return [−down, up] in percent; None for an end at which the search found no failure."""
     return [None if tolerated.down is None else -tolerated.down, tolerated.up]

@@ -17,7 +17,7 @@ from rtloop.linear.matrices import stationary_covariance
 
 
 class Limit(NamedTuple):
-    """Upper (`at_most`) or lower limit; infinite for an unbounded frequency range."""
+    """Upper limit (`at_most` True) or lower limit (False); infinite for an unbounded frequency range."""
 
     value: float
     at_most: bool
@@ -121,8 +121,8 @@ def loop_quantities(loop: Loop, sensor: SensorOptions) -> dict[str, float]:
 
 
 def sensitivity_limit_hz(loop: Loop, level: float) -> float:
-    """Return the frequency in Hz up to which |S| ≤ `level` from 0 Hz on: 0 if not even there, infinite if
-    everywhere.
+    """Return the frequency in Hz up to which |S| ≤ `level` from 0 Hz on: 0 if |S| exceeds it at 0 Hz, infinite if |S|
+    exceeds it nowhere.
     """
     if abs(1 / (1 + loop.static_gain)) > level:
         return 0.0

@@ -1,7 +1,7 @@
 """Pictures of a verification: the open loop, the sensitivities against their templates, the step.
 
-Templates ("gabarits" in the paper) are 1/W1 for |S| and 1/W2 for |CS|, eq
-(14): as specified, and relaxed by the factor γ that the controller reaches.
+Templates ("gabarits" in the paper) are 1/W1 for |S| and 1/W2 for |CS|, eq (14): as specified, and relaxed by the factor
+γ that the controller reaches.
 """
 
 from __future__ import annotations

@@ -89,7 +89,7 @@ def range_until_missed(
     """Return how far `change` may go, down and up in percent (both ≥ 0), with the loop stable and every limit of
     `required` met.
 
-    (0, 0) if one is missed without change; None for an end without a failure.
+    (0, 0) if the unchanged loop is unstable or misses one; None for an end without a failure within the search.
     """
     resonance = resonance_frequency(plant)
 
@@ -110,8 +110,8 @@ def delay_margin_us(loop: Loop) -> float:
 
 
 def tolerated_delay_ticks(delayed_loop: Callable[[int], Loop], most_ticks: int = 64) -> int:
-    """Return the largest delay, at most `most_ticks` samples, up to which the loop is stable for all delays from 0; −1
-    if unstable without delay.
+    """Return the largest delay in samples, at most `most_ticks`, for which the loop is stable with this and every
+    smaller delay; −1 if the loop is unstable without delay.
     """
     for ticks in range(most_ticks + 1):
         if not delayed_loop(ticks).is_stable:

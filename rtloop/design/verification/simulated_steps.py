@@ -38,8 +38,9 @@ class SimulatedStep(NamedTuple):
     levels_um: tuple[float, float] = (0.0, 0.0)
 
     def is_repeatable(self, name: str) -> bool:
-        """Whether the quantile of figure `name` exceeds the median by at most SPREAD_PERCENT points, or LARGEST_SPREAD
-        of itself for the settling time: noise does not decide it. An infinite quantile needs an infinite median.
+        """Whether noise does not decide the figure `name`: its quantile exceeds the median by at most SPREAD_PERCENT
+        points, or for the settling time by LARGEST_SPREAD of the quantile. An infinite quantile needs an infinite
+        median.
         """
         quantile, median = getattr(self, name), self.typical[JUDGED_QUANTITIES.index(name)]
         if math.isinf(quantile):
@@ -88,8 +89,8 @@ class SimulationResult:
 
     def as_dict(self) -> dict[str, object]:
         """Return the result for JSON: `truth`; `steps`, each with the fields of SimulatedStep and `met` {figure:
-        whether it meets its limit}, without figures that have none; `left_out_um`; `range_um` [low, high];
-        `noise_x_nm`; `noise_v_nm`; `judged`. Infinite figures are still infinite, not null.
+        whether it meets its limit}, without figures that have no limit; `left_out_um`, the omitted heights; `range_um`
+        [low, high]; `noise_x_nm`; `noise_v_nm`; `judged`. Infinite figures are still infinite, not null.
         """
         steps = [
             {

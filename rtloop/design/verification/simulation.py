@@ -34,7 +34,7 @@ SHORTEST_DWELL_S, LONGEST_DWELL_S, TIME_CONSTANTS = 0.1, 1.0, 12.0
 REST_S, SETTLING_S = 2.0, 0.5
 """Duration of the evaluation at rest, and of the settling before it."""
 REST_PLACES = (0.03, 0.12, 0.24, 0.48)
-"""Levels for the evaluation at rest, as fractions of the range."""
+"""Levels for the evaluation at rest, as fractions of the longer side of the range."""
 CYCLES, DRAWS, MORE_DRAWS = 12, 2, 8
 """Repetitions of four steps in a run; number of runs, each with its own noise; number of runs in all if noise
 determines the figures.
@@ -73,9 +73,10 @@ def simulate(bench: Bench, axis: AxisOptions, slowest_s: float, design: DesignOp
 
 
 def _noise_at_rest_nm(bench: Bench, axis: str, reach_um: float) -> list[float]:
-    """Return the rms noise of position and command at rest in nm, the root of its mean square over REST_PLACES of the
-    longer side of the range, which ends at `reach_um` (below 0 if it is the negative side): in a dead band a loop may
-    hunt.
+    """Return the rms noise of position and command at rest in nm, over all REST_PLACES: in a dead band a loop may hunt.
+
+    The places are fractions of `reach_um`, the end of the longer side of the range (below 0 if that is the negative
+    side).
     """
     squares = []
     for place in REST_PLACES:
@@ -86,7 +87,7 @@ def _noise_at_rest_nm(bench: Bench, axis: str, reach_um: float) -> list[float]:
 
 
 def _command_range(axis: AxisOptions) -> PositionRange:
-    """Return the range of static commands in µm that limits and drive allow, in any order.
+    """Return the range of static commands in µm that limits and drive allow, whatever command came before.
 
     Raises ValueError for a hysteresis model without inverse.
     """
@@ -97,9 +98,10 @@ def _command_range(axis: AxisOptions) -> PositionRange:
 def _levels(axis: AxisOptions, command_range: PositionRange, height_um: float) -> tuple[float, ...] | None:
     """Return the levels in µm of one cycle of steps of a height; None for a height that the range has no room for.
 
-    To both sides of 0 where the drive allows it. A range with unequal sides also has room for steps between 0 and a
-    level of its longer side, and for larger ones in its middle; a drive of one sign has them all there, away from the
-    drive's end at 0 V and from the remanence. Raises ValueError for a hysteresis model without inverse.
+    The levels lie on both sides of 0 where the drive can hold them. In a range with unequal sides they otherwise lie
+    between 0 and a level on the longer side, or for larger heights around the middle of the range. With a drive from 0
+    V up, all lie around the middle, away from the drive's end at 0 V and from the remanence. Raises ValueError for a
+    hysteresis model without inverse.
     """
     limits, actuator, (low_um, high_um) = axis.limits, axis.feedforward.actuator(), command_range
     middle_um = (low_um + high_um) / 2
@@ -129,7 +131,7 @@ class _SteppedRecord(NamedTuple):
 
 
 def _run_steps(bench: Bench, axis: str, levels_um: tuple[float, ...], dwell_s: float, draw: int) -> _SteppedRecord:
-    """Run CYCLES of steps between levels, from the last one; return the figures of each step.
+    """Run CYCLES cycles of steps through the levels, beginning at the last level; return the figures of each step.
 
     `draw` is added to the seed of the noise. Raises ValueError if the recorded reference has no step.
     """
@@ -167,7 +169,7 @@ def _summarise_steps(height_um: float, levels_um: tuple[float, ...], runs: Seque
 def step_quantiles(steps: Real) -> tuple[float, float, float]:
     """Return the STEP_QUANTILE quantiles of overshoot (%), settling time (ms) and static error (%) of `steps` (n, 3).
 
-    NaN, a step that missed its reference, counts as infinite: so is the quantile if there are too many.
+    NaN, a step that missed its reference, counts as infinite; the quantile is infinite if there are too many of them.
     """
     ranked = np.where(np.isnan(steps), np.inf, steps)
     method = "linear" if np.all(np.isfinite(ranked)) else "higher"

@@ -23,8 +23,8 @@ NOTE = "The row of the gain stands for D(0), the sensor's scale and all hysteres
 def table(verification: Verification) -> list[tuple[str, ...]]:
     """Return headings, then a row for the loop's stability and one for each quantity.
 
-    Its cells: label, required; the value of C(s), if it exists; value and verdict of C(z); the claim. The column of
-    claims is left out if the specification has none. C(s) does not run, and has no verdict.
+    Cells of a row: label, required; the value of C(s), if it exists; value and verdict of C(z); the claim. The column
+    of claims is left out if the specification has none. C(s) does not run, and has no verdict.
     """
     continuous, running = verification.continuous, verification.running
     rows: list[tuple[str, ...]] = [
@@ -77,7 +77,7 @@ def robustness(verification: Verification) -> list[tuple[str, ...]]:
     """
     on_paper = verification.continuous is not None
     limit_kinds = ("continuous", "running", "running_missed")[0 if on_paper else 1 :]
-    headings = ("C(s), until unstable", "C(z), until unstable", "C(z), until a met requirement is missed")
+    headings = ("C(s), until unstable", "C(z), until unstable", "C(z), until a requirement met now fails")
     rows = [("may move by", *headings[-len(limit_kinds) :])]
     rows += [
         (SHIFT_NAMES[name], *(format_range(ranges[kind]) for kind in limit_kinds))
@@ -93,8 +93,8 @@ def robustness(verification: Verification) -> list[tuple[str, ...]]:
 
 
 def scenarios(verification: Verification) -> list[tuple[str, ...]]:
-    """Return headings, then for each quantity label, limit, worst value, verdict and its plant; [] without
-    scenarios.
+    """Return headings, then a row for each quantity: label, limit, worst value, verdict, and the plant with the worst
+    value; [] without scenarios.
     """
     if verification.scenarios is None:
         return []
@@ -161,7 +161,9 @@ def _format_step_value(step: SimulatedStep, name: str) -> str:
 
 
 def simulation_notes(verification: Verification) -> list[str]:
-    """Return notes on the simulated system, omitted steps and the noise at rest; [] without simulation."""
+    """Return notes on the simulated system and its noise at rest, on omitted steps, on a static error because of which
+    steps miss their limit, and on verdicts that do not count; [] without simulation.
+    """
     if verification.simulated is None:
         return []
     result = verification.simulated
@@ -182,7 +184,8 @@ def simulation_notes(verification: Verification) -> list[str]:
 
 
 def _static_error_notes(verification: Verification) -> list[str]:
-    """Return a sentence on the static error of the linear loop where a simulated step misses its limit because of it.
+    """Return one note on the static error of the linear loop if a simulated step misses its limit because of this
+    error; otherwise [].
 
     The error is a part of the position: away from 0 it is a larger part of a small step.
     """
@@ -203,8 +206,8 @@ def _static_error_notes(verification: Verification) -> list[str]:
 
 
 def simultaneous_rows(margins: SimultaneousMargins) -> list[tuple[str, str]]:
-    """Return rows (label, text) of the margins of all axes of a controller together; one row "stable", "NO" if
-    unstable.
+    """Return rows (label, text) of the margins of all axes of a controller together; the single row ("stable", "NO") if
+    their loop is unstable.
     """
     if math.isnan(margins.max_sensitivity):
         return [("stable", "NO")]

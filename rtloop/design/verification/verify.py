@@ -43,8 +43,8 @@ SHOWN_DELAYS = (0, 1, 2)
 
 
 class Row(NamedTuple):
-    """Quantity of the loop in continuous and running form, None where undefined; `claim` quotes the controller's
-    source.
+    """Values of a quantity for the continuous and the running loop, None where the loop has no such value; `claim`
+    quotes the controller's source.
     """
 
     name: str
@@ -122,8 +122,8 @@ class Verification:
 
     `weights`, and `gamma`, the H∞ norm of the loop with these weights, are None without C(s) and where the
     specification defines no weights. `contradictions` has a line for each key that makes the loop differ from the
-    verified one. `on_rig` judges the loop on the simulated rig. It is None for drivers other than a simulated rig,
-    without a linear loop, and without a contradiction if the loop is stable on the rig.
+    verified one. `on_rig` judges the loop on the simulated rig. It is None for drivers other than a simulated rig, for
+    an axis without a linear loop on its own model, and without a contradiction if the loop is stable on the rig.
     """
 
     rows: tuple[Row, ...]
@@ -181,8 +181,8 @@ def verify(
 ) -> Verification:
     """Verify a loop on a plant behind `delay_ticks` samples. Raises ValueError for a plant with direct feedthrough.
 
-    `together` holds the margins of all axes of a coupled controller; `plants` are further plants on which the loop
-    must meet its specification. Robustness is computed on first use.
+    `together` holds the margins of all axes of a coupled controller; `plants` are further plants on which the loop must
+    meet its specification, except for STEP_QUANTITIES. Robustness is computed on first use.
     """
     specification, sensed_plant, controller = (
         design.specification,
@@ -233,7 +233,7 @@ def verify(
 
 
 def _weights(design: DesignOptions) -> Weights | None:
-    """Return the weights of the design; None if it lacks a value for them or a rule cannot make them."""
+    """Return the weights of `design`; None if `build_weights` raises ValueError."""
     try:
         return build_weights(design)
     except ValueError:

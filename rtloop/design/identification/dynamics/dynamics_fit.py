@@ -35,8 +35,9 @@ class Mode:
 
 @dataclass(frozen=True)
 class Candidate:
-    """Candidate order: rms one-step-ahead error (on the held-out samples, if there are some), Akaike's criterion ln(V)
-    + 2 d/N, and rms output error on other runs (NaN: none).
+    """Candidate order: rms one-step-ahead error in µm (on the held-out samples, if there are some), Akaike's criterion
+    ln(V) + 2 d/N (V: mean square of this error, d: unknowns, N: samples), and rms output error in µm on other runs
+    (NaN: none).
     """
 
     order: int
@@ -87,9 +88,9 @@ def continuous_transfer(model: Innovations) -> Transfer:
 def estimate_modes(model: Innovations, covariance: Real, *, noise: bool) -> tuple[Mode, ...]:
     """Return the modes in rising order of frequency, with standard deviations of frequency and damping.
 
-    `covariance` belongs to `model.pack(noise=noise)`: `noise` says whether it contains the noise gains.
-    A mode that decays faster than FASTEST_DECAY per tick is given as |s| = FASTEST_DECAY per tick with damping 1, and
-    infinite standard deviations.
+    `covariance` belongs to `model.pack(noise=noise)`, with or without the offset at its end: `noise` says whether it
+    contains the noise gains. A mode that decays faster than FASTEST_DECAY per tick is given as |s| = FASTEST_DECAY per
+    tick with damping 1, and infinite standard deviations.
     """
     modes, i = [], 0
     for rate, residue, z_pole in zip(model.rates, model.residues, model.z_poles, strict=True):
@@ -110,7 +111,9 @@ def estimate_modes(model: Innovations, covariance: Real, *, noise: bool) -> tupl
 
 
 def static_gain_std(model: Innovations, covariance: Real, *, noise: bool) -> float:
-    """Return the standard deviation of `model.static_gain`, from the `covariance` of `model.pack(noise=noise)`."""
+    """Return the standard deviation of `model.static_gain`, from the `covariance` of `model.pack(noise=noise)`, with or
+    without the offset at its end.
+    """
     slopes: list[float] = []
     for rate, residue, z_pole in zip(model.rates, model.residues, model.z_poles, strict=True):
         by_rate, by_residue = residue * model.period_s * z_pole / (1 - z_pole) ** 2, 1 / (1 - z_pole)
@@ -125,7 +128,7 @@ def _limit_fast_rates(rates: Complex, residues: Complex, period_s: float) -> tup
     """Return rates (n,) in rad/s and residues in z (m, n) with decay limited to FASTEST_DECAY per tick; D(0) is
     preserved.
 
-    A delay by a fraction of a tick makes a pole at z ≈ 0, which lies anywhere beyond reach in s.
+    A delay by a fraction of a tick makes a pole at z ≈ 0, whose rate in s is so fast that a recording does not show it.
     """
     limited: Complex = rates.copy()
     limited.real = np.maximum(rates.real, -FASTEST_DECAY / period_s)

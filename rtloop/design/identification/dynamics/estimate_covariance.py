@@ -38,7 +38,7 @@ def estimate_covariance(model: Innovations, run: Excitation, errors: Real, *, wh
 def _correlated(rows: Real, errors: Real) -> Real:
     """Return `rows` (k, samples) times the autocovariance matrix of `errors` (samples,): (k, samples).
 
-    The autocovariance is tapered linearly to 0 behind the lag samples/LAGS_PART.
+    The autocovariance is tapered linearly: it is 0 for lags above samples/LAGS_PART.
     """
     largest_lag = errors.size // LAGS_PART
     spectrum = np.fft.rfft(errors - errors.mean(), 2 * errors.size)

@@ -32,7 +32,7 @@ MOST_TICKS = 5
 LEAST_SHARE = 0.25
 """Least share of the squared changes of the input in each part of a recording, for fitting and for judging."""
 SIGNIFICANT_GROWTH = 30.0
-"""Growth of the squared error, in variances, from which a first coefficient counts as present."""
+"""Growth of the squared error without the first input coefficients, in variances, above which they are significant."""
 
 
 def delay_input(run: Excitation, ticks: int) -> Excitation:
@@ -91,8 +91,8 @@ def simplest_candidates(candidates: Sequence[Candidate]) -> list[Candidate]:
 def _judge_candidate(ticks: int, model: Innovations, run: Excitation, start: int | None) -> Candidate:
     """Return the candidate for a model that was fitted to the samples before `start` (None: to all, which judge it).
 
-    The input of `run` is delayed by `ticks` already.
-    An unstable predictor has an infinite error and counts as not independent.
+    The input of `run` is delayed by `ticks` already. A model with an unstable predictor has an infinite error and
+    counts as not independent.
     """
     errors = model.errors(run.input, run.position_um)
     if errors is None:
@@ -102,8 +102,8 @@ def _judge_candidate(ticks: int, model: Innovations, run: Excitation, start: int
 
 
 def _refitted_rms_um(model: Innovations, run: Excitation) -> float:
-    """Return the rms one-step-ahead error in µm after the model was fitted to the whole recording; infinite if the
-    result is not stable.
+    """Return the rms one-step-ahead error in µm after a fit of the model to the whole recording; infinite if a mode of
+    the fitted model does not decay or has no continuous form.
 
     For models with equally many unknowns it ranks as Akaike's criterion does. Raises ArithmeticError if the predictor
     of the fitted model is unstable.
@@ -121,7 +121,8 @@ def held_out_start(run: Excitation) -> int | None:
     """Return the first held-out sample; None if no change of the input leaves LEAST_SHARE of all squared changes both
     before it and from it on.
 
-    It is the first change that has half of all squared changes before it, or else LEAST_SHARE of them.
+    It is the first change that has at least half of all squared changes before it; if that leaves too few from it on,
+    the first change that has at least LEAST_SHARE of them before it.
     """
     changes = np.diff(run.input, prepend=0.0) ** 2
     share_before = (np.cumsum(changes) - changes) / max(float(changes.sum()), 1e-300)

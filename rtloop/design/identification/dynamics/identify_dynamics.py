@@ -49,7 +49,7 @@ from rtloop.design.identification.dynamics.residuals import residual_tests
 Criterion = Literal["aic", "held-out", "validation"]
 METHOD = "prediction errors (ARMAX), open loop"
 MOST_REPETITIONS = 3
-"""Further identifications of a recording that does not begin at rest, each without the free motion found before."""
+"""Most further identifications of a recording, each without the free motion found before."""
 LEAST_EXCITED_POLES = 4
 """Fewest poles that the input must excite if the order is searched."""
 
@@ -62,15 +62,15 @@ def identify_dynamics(
     validation: Sequence[Excitation] = (),
     delay_ticks: int | None = None,
 ) -> DynamicsFit:
-    """Identify a model of `order` poles behind `delay_ticks` samples of delay; for None, both are estimated, the order
-    by `criterion` up to `largest_order`.
+    """Identify a model of `order` poles behind `delay_ticks` samples of delay; each that is None is estimated, the
+    order by `criterion` up to `largest_order`.
 
-    "held-out" judges by the prediction of the second part of the run, and as "aic" does where the input does not change
-    there; "aic" by the run itself, which takes slow errors of the hysteresis model for modes; "validation" by the
-    free-running output error on `validation`. Free motion of a run that does not begin at rest is estimated and left
-    out. Raises UnsuitableData if the input excites too few poles, if no model is stable or none settles within the run,
-    and if D(0) is below 0; ValueError for "validation" without other recordings; ArithmeticError for a model with an
-    unstable predictor.
+    "held-out" judges by the prediction of the second part of the run, or as "aic" if the input changes too little for
+    two parts (`held_out_start`); "aic" by the run itself, which takes slow errors of the hysteresis model for modes;
+    "validation" by the free-running output error on `validation`. Free motion of a run that does not begin at rest is
+    estimated and left out. Raises UnsuitableData if the input excites too few poles, if no model is stable, if every
+    model has a time constant longer than the run, and if the static gain is below 0; ValueError for "validation"
+    without other recordings; ArithmeticError for a model with an unstable predictor.
     """
     left_out_um, duration_s, repetitions = np.zeros_like(run.position_um), 0.0, 0
     while True:
@@ -91,10 +91,10 @@ def _identify_from_rest(
     validation: Sequence[Excitation],
     delay_ticks: int | None,
 ) -> tuple[DynamicsFit, Excitation]:
-    """Identify a model as `identify_dynamics`, of a run from rest. Returns also the run that it was fitted to.
+    """Identify a model as `identify_dynamics`, of a run from rest. Returns also the run that the model was fitted to.
 
-    The input of that run is delayed and the levels it holds are corrected (`correct_levels`); its position is relative
-    to the first one. Raises as `identify_dynamics`.
+    The input of that run is delayed, and the levels that the input holds are corrected (`correct_levels`); its position
+    is relative to the first one. Raises as `identify_dynamics`.
     """
     if criterion == "validation" and not validation:
         raise ValueError("criterion 'validation' needs another recording for the validation; give a further RUN")
@@ -148,13 +148,13 @@ def _require_settled(models: Sequence[Innovations], run: Excitation) -> list[Inn
 
 
 def _has_settled(model: Innovations, run: Excitation) -> bool:
-    """Whether 1/|rate| of each pole, for a pair 1/ω_n rather than its decay, is at most the duration of the run."""
+    """Whether 1/|s| of each pole s, for a pair the inverse of its natural frequency, is at most the run's duration."""
     return float(np.abs(model.rates).min()) * run.input.size * run.period_s >= 1
 
 
 def _score_model(model: Innovations, run: Excitation, start: int | None, validation: Sequence[Excitation]) -> Candidate:
-    """Return a model's order, rms prediction error from sample `start` on (None: of all), AIC, and rms output error on
-    `validation` (NaN without). Raises ArithmeticError for an unstable predictor.
+    """Return a model's order, rms prediction error in µm from sample `start` on (None: of all), AIC, and rms output
+    error in µm on `validation` (NaN without). Raises ArithmeticError for an unstable predictor.
     """
     rms = rms_error(model, run, start or 0)
     unknowns = model.pack(noise=True).size
@@ -172,8 +172,10 @@ def _validation_rms(model: Innovations, runs: Sequence[Excitation]) -> float:
 
 
 def _choose_order_index(candidates: Sequence[Candidate], score: Callable[[Candidate], float], *, by_aic: bool) -> int:
-    """Return the index of the smallest order within LEAST_IMPROVEMENT of the best and, if `by_aic`, with no larger AIC
-    than any smaller order; the best one if there is none. `candidates` are in rising order.
+    """Return the index of the smallest order whose score is within LEAST_IMPROVEMENT of the least score and, if
+    `by_aic`, whose AIC is the least among all orders up to it; without such an order, the index of the least score.
+
+    `candidates` are in rising order.
     """
     limit = min(map(score, candidates)) * (1 + LEAST_IMPROVEMENT)
     for i, candidate in enumerate(candidates):
@@ -185,7 +187,7 @@ def _choose_order_index(candidates: Sequence[Candidate], score: Callable[[Candid
 def _build_fit(
     model: Innovations, run: Excitation, candidates: tuple[Candidate, ...], delay_ticks: int, corrected: float
 ) -> DynamicsFit:
-    """Return the result for the chosen model, with residual tests and standard deviations on the whole run.
+    """Return the result for the chosen model, with residual tests and standard deviations from the whole run.
 
     `candidates` are all models compared. The input of `run` is delayed by `delay_ticks` already; `corrected` is the
     largest correction of its levels (`correct_levels`), in its unit. Raises ArithmeticError for an unstable predictor.

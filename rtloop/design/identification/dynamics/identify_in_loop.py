@@ -1,8 +1,7 @@
 """Linear dynamics D(s) from a loop that stays closed, whose noise comes back to the plant's input.
 
 The reference is known and independent of the noise: it makes the instruments (`instrumental`). `nested_models` tries
-orders and delays and judges them on held-out blocks. The result has the form of
-`identify_dynamics`, D(0) = 1.
+orders and delays and judges them on held-out blocks. The result has the form of `identify_dynamics`, D(0) = 1.
 """
 
 from __future__ import annotations
@@ -83,11 +82,11 @@ def identify_in_loop(
     validation: Sequence[Excitation] = (),
     delay_ticks: int | None = None,
 ) -> DynamicsFit:
-    """Identify a model of `order` poles behind `delay_ticks` samples; None chooses them by the held-out part, the order
-    up to `largest_order`.
+    """Identify a model of `order` poles behind `delay_ticks` samples; each that is None is chosen by the errors in
+    held-out blocks, the order up to `largest_order`.
 
     The candidates also report their errors on `validation`. Raises UnsuitableData for fewer than LEAST_SAMPLES ticks,
-    for external signals that stand still, if no model is stable, and if no mode's frequency is certain.
+    for external signals that all stand still, if no fit settles, and if no mode's frequency is certain.
     """
     _require_samples(run)
     run = shift_to_zero(run)
@@ -114,8 +113,8 @@ def identify_in_loop(
 def _choose_final(search: ModelSearch, models: list[JudgedModel], equivalent: list[JudgedModel]) -> FinalModel | None:
     """Return the `equivalent` model of least total error, refitted on the whole recording.
 
-    Models whose refit does not settle are left out. Without another, take the first of `models`, by rising held-out
-    error, whose refit settles; None if no refit does.
+    Models whose refit does not settle are left out. If none is left, return the refit of the first settled one of
+    `models`, by rising held-out error, whose refit settles; None if no refit does.
     """
     finals = [final for model in equivalent if (final := search.refit_on_whole(model))]
     if finals:
@@ -127,9 +126,10 @@ def _choose_final(search: ModelSearch, models: list[JudgedModel], equivalent: li
 def _search_models(
     search: ModelSearch, order: int | None, largest_order: int, delay_ticks: int | None
 ) -> tuple[list[JudgedModel], list[JudgedModel]]:
-    """Return all models tried (of `order`, if given), and the models of fewest poles among those as good as the best.
+    """Return all models tried (of `order`, if given), and the models of fewest poles that are as good as the best one.
 
-    The latter are pruned if `order` is None, and then need not be among the former. Both are empty if none is stable.
+    The second list is pruned if `order` is None, so that its models need not be in the first list. Both are empty if no
+    fit succeeds.
     """
     most_poles, patience = order or largest_order, None if order else PATIENCE
     models = search.grow(None, delay_ticks or 0, most_poles, patience)
@@ -153,8 +153,8 @@ def _search_models(
 
 
 def _add_delays(search: ModelSearch, models: list[JudgedModel]) -> list[JudgedModel]:
-    """Return `models` and models of at most the preferred one's order behind 1 … MOST_TICKS samples more, until all
-    models get clearly worse by a further sample.
+    """Return `models`, and refits of the models of at most the preferred one's order behind 1 … MOST_TICKS further
+    samples of delay; the delay stops rising once a further sample makes all of them clearly worse.
     """
     best_model = preferred_models(models)[0]
     largest = best_model.model.order
@@ -199,7 +199,8 @@ def _build_fit(
 ) -> DynamicsFit:
     """Return the result for the final model. Raises UnsuitableData if no mode's frequency is certain.
 
-    The input of `data` is delayed by the model's delay already; `candidates` are all models compared at this delay.
+    The input of `data` is delayed by the model's delay already; `candidates` describe the settled models at this delay,
+    one for each order.
     """
     model = final.estimate.model
     modes = estimate_modes(model, final.estimate.covariance, noise=False)
@@ -223,8 +224,8 @@ def _build_fit(
 
 
 def _require_certain_mode(name: str, modes: tuple[Mode, ...]) -> None:
-    """Raise UnsuitableData if the best-known frequency has a standard deviation above LARGEST_RELATIVE_STD of
-    itself.
+    """Raise UnsuitableData if every mode's frequency has a standard deviation above LARGEST_RELATIVE_STD times the
+    frequency. `name` names the recording.
     """
     most_certain = min(modes, key=lambda mode: mode.frequency_std_hz / mode.frequency_hz)
     if most_certain.frequency_std_hz > LARGEST_RELATIVE_STD * most_certain.frequency_hz:

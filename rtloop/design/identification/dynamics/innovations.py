@@ -6,7 +6,7 @@
 This is the ARMAX model A y = B u + C ε (Ljung, System Identification, 1999, section 4.2) with orders
 na = nb = nc = n and one sample of delay, but its unknowns are modes and not coefficients of polynomials, which span
 many powers of ten where slow and fast poles meet. A mode is filtered as a first-order recursion, H⁻¹ as sections of
-second order; nothing is expanded. Before the first sample everything is at rest.
+second order; no product is expanded. Before the first sample everything is at rest.
 """
 
 from __future__ import annotations
@@ -22,7 +22,8 @@ from rtloop.foundation.modal import ModalSystem
 
 @dataclass(frozen=True)
 class Innovations:
-    """A model y = G u + H ε + offset at `period_s`: G = Σ r/(z − λ), H = 1 + Σ k/(z − λ) with white noise ε.
+    """A model y = G u + H ε + offset, sampled every `period_s`: G = Σ r/(z − λ), H = 1 + Σ k/(z − λ) with white noise
+    ε.
 
     `rates` (m,), log(λ)/T in rad/s, have one of each pair, real ones with imaginary part 0. The residues r (m,) and the
     noise gains k (m,) belong to these poles; the sums include the conjugates. Before the first sample all is at rest.
@@ -107,8 +108,8 @@ class Innovations:
     def sensitivities(self, u: Real, errors: Real, *, noise: bool) -> Real:
         """Return the derivative of the prediction errors ε by each unknown, (unknowns, samples), as `pack` orders them.
 
-        `errors` (samples,) are ε for the input `u` (samples,). They count with `noise` only, which adds the noise gains
-        to the unknowns; without it, the effect of the rates on H is left out.
+        `errors` (samples,) are ε for the input `u` (samples,). They are used only with `noise`, which adds the noise
+        gains to the unknowns; without `noise`, the effect of the rates on H is left out.
         """
         through_input = _mode_responses(self, u)
         through_noise = _mode_responses(self, errors) if noise else through_input
@@ -140,7 +141,7 @@ class Innovations:
     def unpack(self, values: Real, *, noise: bool) -> Innovations:
         """Return the model with the unknowns `values`, in the order of `pack`; pairs stay pairs, real modes stay real.
 
-        Without `noise`, the noise gains stay.
+        Without `noise`, the noise gains stay, and `values` lack them.
         """
         unknowns: list[list[complex]] = []
         numbers = iter(values[:-1].tolist())

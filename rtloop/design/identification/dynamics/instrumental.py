@@ -64,10 +64,9 @@ def estimate_plant(
 ) -> Estimate | None:
     """Estimate the model near `start` from the samples `selection`, all of which have their past (`past_mask`).
 
-    `whitening` are the taps of the noise filter A_n (`fit_whitening`).
-
-    If the iteration from `start` does not settle, it restarts from the two-stage method's model. None if that model
-    has no stable continuous form; the second iteration may be unsettled too.
+    `whitening` has the taps of the noise filter A_n (`fit_whitening`). If the iteration from `start` does not settle,
+    it restarts from the two-stage method's model. None if that model has no stable continuous form; the second
+    iteration may be unsettled too.
     """
     if (first_estimate := iterate_estimate(start, data, whitening, selection)).is_settled:
         return first_estimate
@@ -81,7 +80,8 @@ def iterate_estimate(
 ) -> Estimate:
     """Iterate from `first` until the instruments ψ and the errors ε, both filtered by `whitening`, are uncorrelated.
 
-    Returns `first`, not settled, if a mode stops decaying or has no continuous form, and after MOST_STEPS steps.
+    Returns `first`, not settled, if a mode stops decaying or has no continuous form, and if MOST_STEPS steps do not
+    suffice.
     """
     u, driven, x = (whiten(signal, whitening) for signal in (data.run.input, data.driven_input, data.run.position_um))
     step, initial_covariance = _newton_step(first, u, driven, x, selection)
@@ -140,7 +140,7 @@ def past_mask(samples: int) -> npt.NDArray[np.bool_]:
 
 
 def _free_decays(model: Innovations, samples: int) -> Real:
-    """Return rows of a constant and the free decays of all modes, (1 + states, samples)."""
+    """Return a row of ones, then each mode's free decay, real and imaginary part for a pair, (1 + order, samples)."""
     rows = [np.ones(samples)]
     for rate in model.rates:
         decay = np.exp(rate * model.period_s * np.arange(samples))
@@ -149,7 +149,8 @@ def _free_decays(model: Innovations, samples: int) -> Real:
 
 
 def _newton_step(model: Innovations, u: Real, driven: Real, x: Real, selection: SampleSelection) -> tuple[Real, Real]:
-    """Return the step (unknowns,) that makes instruments and errors uncorrelated, and its covariance.
+    """Return the step (unknowns,) that makes instruments and errors uncorrelated, and its covariance; the offset is not
+    among the unknowns.
 
     `u` is the model's input, `driven` the input that makes the instruments, `x` the position, each (samples,) and
     whitened over its whole length: a cut signal begins with a jump, which rings in the slopes but not in `x`.
@@ -173,10 +174,10 @@ def _newton_step(model: Innovations, u: Real, driven: Real, x: Real, selection: 
 
 
 def _bounded_update(model: Innovations, step: Real) -> Innovations:
-    """Return the model after `step`, halved while it moves a pole by more than LARGEST_MOVE or loses
-    the stable continuous form.
+    """Return the model after `step` (unknowns without the offset,), halved while it moves a pole by more than
+    LARGEST_MOVE of its magnitude or leaves a model without a stable continuous form.
 
-    After MOST_HALVINGS tries the last one is returned, even if it moves too far or has no such form.
+    The last of MOST_HALVINGS tries is returned even if it moves too far or has no such form.
     """
     updated = model
     for halvings in range(MOST_HALVINGS):

@@ -23,7 +23,7 @@ ARX_ORDER = 40
 HANKEL_ROWS = 150
 """Largest number of rows of the Hankel matrix."""
 CLEAR_FALL, LIKELY_FALL = 8.0, 3.0
-"""Noise makes singular values that fall slowly; what stands so much above the next is a mode, or most likely one."""
+"""Noise makes singular values that fall slowly; one that is so many times the next marks a mode, or most likely one."""
 SMALLEST_Z_POLE = 1e-3
 """Poles in z nearer to 0 are a delay, which has no rate."""
 
@@ -62,8 +62,8 @@ class ModeGuesses:
         self._left_vectors, self.singular_values, _ = np.linalg.svd(self._matrix[:-1])
 
     def order_at_gap(self, most_poles: int, least_fall: float) -> int:
-        """Return the largest order, at most `most_poles`, behind which the singular values fall by the factor
-        `least_fall`; 0 if none does.
+        """Return the largest order, at most `most_poles`, behind which the singular values fall by more than
+        the factor `least_fall`; 0 if none does.
         """
         values = self.singular_values[: most_poles + 1]
         falls = np.flatnonzero(values[:-1] > least_fall * values[1:])
@@ -72,8 +72,8 @@ class ModeGuesses:
     def initial_model(self, order: int) -> Innovations | None:
         """Return a model with the rates of `order` poles, both of a pair counted, and with residues and noise gains 0.
 
-        Poles outside the unit circle are shrunk to |z| = 0.9999, at the same angle. None where a pole is near z = 0 or
-        on the negative real axis: it has no continuous counterpart.
+        Poles outside the unit circle are shrunk to |z| = 0.9999, at the same angle. None if a pole is near z = 0 or
+        on the negative real axis: such a pole has no continuous counterpart.
         """
         z_poles = self._z_poles(order)
         if np.any((z_poles.imag == 0) & (z_poles.real < SMALLEST_Z_POLE)) or np.any(np.abs(z_poles) < SMALLEST_Z_POLE):

@@ -21,9 +21,9 @@ from rtloop.design.identification.dynamics.prediction_error import Excitation
 from rtloop.foundation.arrays import Real
 
 SHORTEST_TAIL = 50
-"""Samples of a mean, at least."""
+"""Least number of samples in a mean of the settled position."""
 RESTLESS = 1.2
-"""Spread of a position over its noise, above which the position still rings, drifts or creeps."""
+"""Standard deviation of a position over its noise, above which the position still rings, drifts or creeps."""
 APART = 4.0
 """Standard errors by which the two halves of a settled position may differ."""
 
@@ -38,9 +38,10 @@ class CorrectedLevels(NamedTuple):
 def correct_levels(run: Excitation) -> CorrectedLevels:
     """Return the recording with the levels of its input corrected by the settled positions; the first level stays.
 
-    A correction is the distance of the settled position from the line through all of them, divided by the line's slope.
-    The recording is unchanged, with a correction of 0, if its input holds fewer than three levels or one for less than
-    2 · SHORTEST_TAIL samples, and if the position does not settle at each.
+    A correction is the distance of the settled position from the line fitted to all of them, divided by the line's
+    slope, less the same value of the first level. The recording is unchanged, with a correction of 0, if its input
+    holds fewer than three levels or one for less than 2 · SHORTEST_TAIL samples, and if the position does not settle at
+    each.
     """
     changes = np.flatnonzero(np.diff(run.input)) + 1
     holds = [slice(*ends) for ends in pairwise([0, *changes.tolist(), run.input.size])]

@@ -19,7 +19,7 @@ Number = TypeVar("Number", np.float64, np.complex128)
 
 DAMPINGS = (0.01, 0.05, 0.25, 0.8)
 GRID_SPACING = 2.0
-"""Grid points of a pair, relative to its width: a lightly damped mode between two points farther apart is not seen."""
+"""Distance of grid points, relative to a pair's width: a lightly damped mode between points farther apart is missed."""
 REAL_POINTS, ZOOM_POINTS, ZOOMS = 90, 9, 2
 HIGHEST_SHARE = 0.9
 """Highest frequency searched, as a fraction of half the sampling rate."""

@@ -60,8 +60,8 @@ class JudgedModel:
         return float(np.sqrt(np.mean(self.squared_errors)))
 
     def is_worse_than(self, reference: JudgedModel) -> bool:
-        """Whether the mean square of the held-out errors exceeds that of `reference` by more than CLEAR_STD_ERRORS
-        standard errors of the difference.
+        """Whether the held-out errors have a larger mean square than the errors of `reference`, by more than
+        CLEAR_STD_ERRORS standard errors of the difference.
         """
         excess = self.squared_errors - reference.squared_errors
         return float(excess.mean()) > CLEAR_STD_ERRORS * float(excess.std()) / np.sqrt(excess.size)
@@ -94,8 +94,8 @@ class ModelSearch:
         """Add modes one by one to `start` (None: no modes), up to `most_poles` poles or until `patience` modes in a row
         bring no gain (None: no such limit).
 
-        Return all models in growing order, `start` first, up to the first fit that fails; [] if there is none. They are
-        judged with the whitening of the best one, which is stored for all later fits and judgements of this search.
+        Return all models in growing order, `start` first, up to the first fit that fails; [] if there is none. The
+        noise filter A_n of the best one judges them, and is stored for all later fits and judgements of this search.
         """
         data = delay_recording(self._data, delay_ticks)
         models = [start] if start else []
@@ -166,7 +166,7 @@ class ModelSearch:
         return FinalModel(estimate, whitening, self._judge_estimate(estimate, base_model.delay_ticks))
 
     def _next_rate(self, model: Innovations, data: InstrumentedRecording, *, pair_allowed: bool) -> complex:
-        """Return the rate in rad/s of the mode that best explains the whitened residuals."""
+        """Return the rate in rad/s of the mode that best explains the whitened residuals of `model` (`find_mode`)."""
         residual, driven = (
             whiten(signal, self._whitening) for signal in (residual_noise(model, data.run), data.driven_input)
         )
@@ -174,7 +174,7 @@ class ModelSearch:
         return Spectra(residual, driven, data.run.period_s).find_mode(pair_allowed=pair_allowed)
 
     def _fit_and_judge(self, start: Innovations, delay_ticks: int, *, refit: bool = False) -> JudgedModel | None:
-        """Return the judged estimate from `start`; `refit` fits the residues first. None if the estimate fails."""
+        """Return the judged estimate from `start`; `refit` fits its residues first. None if the estimate fails."""
         data, whitening = delay_recording(self._data, delay_ticks), self._judging_whitening
         if refit:
             start = fit_residues(
@@ -184,8 +184,8 @@ class ModelSearch:
         return self._judge_estimate(estimate, delay_ticks) if estimate else None
 
     def _judge_estimate(self, estimate: Estimate, delay_ticks: int) -> JudgedModel:
-        """Return an estimate with its squared prediction errors, whitened by the present judging filter: those over the
-        held-out blocks, and their sum over the whole recording.
+        """Return an estimate with its squared prediction errors, whitened by the filter A_n that the search now judges
+        with: the errors in the held-out blocks, and the sum over the whole recording.
         """
         errors = whiten(
             residual_noise(estimate.model, delay_recording(self._data, delay_ticks).run), self._judging_whitening
@@ -196,9 +196,10 @@ class ModelSearch:
 
 
 def preferred_models(models: list[JudgedModel]) -> list[JudgedModel]:
-    """Return those of `models`, one or more, of fewest poles that are not worse than the best, least total error first.
+    """Return the models of fewest poles among all that are not clearly worse (`is_worse_than`) than the best one, least
+    total error first.
 
-    If any model has settled, only settled models are considered.
+    `models` has at least one. If any model has settled, only settled models are considered.
     """
     eligible = [model for model in models if model.estimate.is_settled] or models
     best_model = min(eligible, key=lambda model: model.rms_um)

@@ -1,6 +1,6 @@
 """Models of each order that predict a recording best: minimise Σ ε_k² (Ljung 1999, sections 7.2 and 10.2).
 
-From a first guess of the modes: first as if all noise were the sensor's (H = 1), then with H free.
+Each fit starts from a first guess of the modes: first as if all noise were the sensor's (H = 1), then with H free.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ class Excitation:
 
 def fit_models(run: Excitation, orders: Sequence[int]) -> list[Innovations]:
     """Return models of increasing order, from two poles below the last clear gap in the singular values of the impulse
-    response, until two in a row beyond the last likely gap bring no gain.
+    response, until beyond the last likely gap the last two of five or more models bring no gain.
 
     A single order is fitted in any case; orders without a stable model are omitted, so that the list may be empty.
     Raises ArithmeticError for a model with an unstable predictor.
@@ -91,7 +91,8 @@ def fit_models_at_gap(run: Excitation, orders: Sequence[int]) -> list[Innovation
 def _fit_order(guesses: ModeGuesses, order: int, run: Excitation, smaller: Sequence[Innovations]) -> Innovations | None:
     """Return the fitted model of `order` poles, from the guess or else from the last of `smaller` and a fast pole.
 
-    None if there is no such start, or a fitted mode does not decay or has no continuous form.
+    None if there is no guess and `smaller` does not end with order − 1, or if a fitted mode does not decay or has no
+    continuous form.
     """
     start = guesses.initial_model(order)
     if start is None and smaller and smaller[-1].order == order - 1:
@@ -131,8 +132,8 @@ def minimise_errors(
 ) -> Innovations:
     """Return the model of least squared prediction errors over the samples `selection`, downhill from `model`.
 
-    `noise` fits its noise gains too; they stay otherwise.
-    The search ends after MOST_EVALUATIONS evaluations, converged or not.
+    `noise` fits the noise gains too; they stay otherwise. The search ends after MOST_EVALUATIONS evaluations, converged
+    or not.
     """
 
     def errors(values: Real) -> Real:

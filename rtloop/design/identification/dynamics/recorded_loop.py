@@ -1,4 +1,4 @@
-"""Whether a recording is of a loop that was closed, and what moved it from outside."""
+"""Longest part of a recording in closed loop, and the external signals that excited the loop."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class RecordedLoop:
     """Longest part of a recording without interruption in closed loop: ticks `start` … `end` − 1.
 
     `external` (k, all ticks of the recording) are the external signals, `names` their names.
-    In an imported recording ticks count the drive, one later than the position.
+    In an imported recording whose positions move by a row (`shifted_rows`), tick 0 is the second row of the file.
     """
 
     start: int
@@ -53,8 +53,8 @@ class RecordedLoop:
         """
         if self.first_limited_tick is not None:
             raise UnsuitableData(
-                f"{name}: a limit changed the command at tick {self.first_limited_tick} before it reached the plant; "
-                "use --input drive or --input hysteresis"
+                f"{name}: a limit or a ramp changed the command at tick {self.first_limited_tick} before it reached "
+                "the plant; use --input drive or --input hysteresis"
             )
 
 
@@ -63,9 +63,10 @@ def find_closed_loop(
 ) -> RecordedLoop | None:
     """Return the longest part of a recording in closed loop; None for an open loop.
 
-    `state` says which it is; for "auto", the recorded mode does. With "closed" and no tick recorded in closed loop, all
-    ticks count. `names` are the external signals, by default the axis's reference and feed. Raises RecordingError for a
-    bad file and an unknown axis; UnsuitableData if the recording lacks one of `names`, or all of the default ones.
+    `state` says whether the loop was "open" or "closed"; for "auto", the recorded mode does. With "closed" and no tick
+    recorded in closed loop, all ticks count. `names` are the external signals, by default the reference and the feed of
+    `axis`. Raises RecordingError for a bad file and, without `names`, as `select_axis`; UnsuitableData if the recording
+    lacks one of `names`, or without `names` both of the default signals.
     """
     recording = load(path)
     closed = recording["mode"] == Mode.CLOSED_LOOP if "mode" in recording else np.zeros(0, dtype=bool)

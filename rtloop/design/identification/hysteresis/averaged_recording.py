@@ -52,11 +52,11 @@ class AveragedRecording(NamedTuple):
 def average_recording(
     run: AxisRecording, runs: int, before_v: npt.ArrayLike | None = None, blocks: int = BLOCKS
 ) -> AveragedRecording:
-    """Return the recording `run` averaged over blocks, at most `blocks`/max(3, `runs`) or, if that is less,
-    LEAST_BLOCKS; `runs` is the number of recordings of the fit.
+    """Return the recording `run` averaged over blocks: at most `blocks` // max(3, `runs`) of them, but LEAST_BLOCKS if
+    this number is smaller. `runs` is the number of recordings of the fit.
 
     Each drive is paired with the position of the following tick. `before_v` (k,) is the drive in V from rest to the
-    first tick, [0] for a start at rest, None if unknown.
+    first tick, [0] for a start at rest, None if unknown. Unless it is None, the whole recording is one stretch.
     """
     most_blocks = max(LEAST_BLOCKS, blocks // max(3, runs))
     drive, size = run.drive_v[:-1], -(-(run.drive_v.size - 1) // most_blocks)
@@ -80,9 +80,9 @@ def build_equations(
 ) -> Equations:
     """Build the equations for plays at `thresholds` (V) and `terms`, with a row for each of the run's blocks.
 
-    `terms` are "drift" and "creep", which lags over time or, by `clock`, over the drive's path, the sum of its changes.
-    `duration_s` and `path_v` are the longest duration and path of all runs. Unknown memory is assumed to come from
-    earlier repetitions of the same drive.
+    `terms` may contain "drift" and "creep", a lag of the drive over time or, if `clock` is "path", over the path: the
+    sum of the drive's changes. `duration_s` and `path_v` are the longest duration and path of all runs. The memory
+    before the first tick, if unknown, is assumed to come from earlier repetitions of the same drive.
     """
     if run.before_v is None:
         memory = periodic_memory(run.full_v, thresholds)
@@ -107,10 +107,11 @@ def build_equations(
 
 
 def _number_stretches(drive: Real, size: int) -> tuple[npt.NDArray[np.intp], float]:
-    """Return for every block of `size` ticks its stretch, (blocks,), and the longest stroke within one in V, 0 if none.
+    """Return the number of the stretch of every block of `size` ticks, (blocks,), and the largest range of the drive
+    within a numbered stretch in V, 0 if there is none.
 
-    Stretches, in which the state of all plays that move is known, are numbered from 0; −1 marks blocks that are not in
-    a single one, and all blocks of a stretch with fewer than PIECES. An incomplete block at the end is omitted.
+    Stretches, in which the state of all plays that move is known, are numbered from 0; −1 marks blocks that are not
+    wholly in one stretch, and all blocks of a stretch with fewer than PIECES. An incomplete last block is omitted.
     """
     numbers = covered_intervals(drive)
     tick_numbers = numbers[: drive.size // size * size].reshape(-1, size)
@@ -123,7 +124,9 @@ def _number_stretches(drive: Real, size: int) -> tuple[npt.NDArray[np.intp], flo
 
 
 def play_block_means(run: AveragedRecording, thresholds: Real, state: Real) -> Real:
-    """Return the means of the plays over each complete block, (blocks, plays); the plays start at `state` (plays,)."""
+    """Return the means of the plays' outputs in V over each complete block, (blocks, plays); `state` (plays,) has their
+    outputs before the first tick.
+    """
     parts, chunk_ticks = [], max(1, CHUNK_TICKS // run.size) * run.size
     for start in range(0, run.full_v.size, chunk_ticks):
         outputs = play_outputs(run.full_v[start : start + chunk_ticks], thresholds, state)
@@ -139,9 +142,9 @@ def block_means(rows: Real, size: int) -> Real:
 
 
 def lagged_drive(drive_v: Real, elapsed: Real, time_constant: float) -> Real:
-    """Return the drive behind a first-order lag that starts at rest at the first drive, (blocks,).
+    """Return the drive in V behind a first-order lag, (blocks,); the lag starts at rest, at the first drive.
 
-    `time_constant` is in the unit of `elapsed` (blocks,).
+    `elapsed` (blocks,) is the time or the path of each block; `time_constant` has its unit.
     """
     shares = -np.expm1(-np.diff(elapsed, prepend=elapsed[0]) / time_constant)
     lagged, level = np.empty(drive_v.size), float(drive_v[0])

@@ -11,14 +11,14 @@ from rtloop.design.identification.hysteresis.thresholds import place_thresholds
 from rtloop.foundation.arrays import Real
 
 EXPLAINED_SHARE = 0.5
-"""Fraction of the residual that may remain with lags, for creep to be likely."""
+"""Creep is likely if less than this fraction of the rms residual remains with lags."""
 
 
 def is_creep_likely(run: AxisRecording) -> bool:
-    """Whether plays with lags of the drive leave less than EXPLAINED_SHARE of the rms residual of plays alone, noise
-    aside. `run` must begin at rest.
+    """Whether plays with lags of the drive leave less than EXPLAINED_SHARE of the rms residual of plays alone, each
+    less noise. `run` must begin at rest.
 
-    With a drive of one speed this is no proof of creep: a memory that fades with the drive's path looks the same.
+    True is no proof of creep with a drive of one speed: a memory that fades with the drive's path looks the same.
     """
     recordings = prepare_recordings([run], "free", [np.zeros(1)])
     thresholds = place_thresholds(FINEST_PLAYS, float(np.abs(run.drive_v).max()), "chebyshev-from-0")

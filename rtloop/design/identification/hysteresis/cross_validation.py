@@ -1,9 +1,9 @@
 """Errors of a sum of plays on data that were not used for its fit.
 
 A recording is left out whole, and slopes and creep come from the others, provided that two of them move every play
-nearly as far: from a single one, drift could be taken for hysteresis. Its own offsets and drift come from every other
-piece of it and are judged on the pieces between, and the reverse. All other recordings are left out piece by piece,
-all at once; the plays still follow the drive there.
+nearly as far: from a single one, drift could be taken for hysteresis. Its own offsets and drift come from every second
+piece of it and are judged on the pieces between, and the reverse. If no two others do, every FOLDS-th piece of all
+recordings is left out of a fit, which the left-out pieces judge; the plays still follow the drive there.
 """
 
 from __future__ import annotations
@@ -26,17 +26,18 @@ from rtloop.foundation.arrays import Real
 PIECES, FOLDS = 40, 10
 """Pieces of a stretch, and number of fits: each leaves out every FOLDS-th piece."""
 GROUPS = 5
-"""Most fits without whole recordings: more recordings than that are left out several at a time."""
+"""Most fits without whole recordings: of more recordings than that, each fit leaves out every GROUPS-th one."""
 COVERED_SHARE, LEAST_OTHERS = 0.95, 2
 """A recording is covered if LEAST_OTHERS others move every play by this fraction of its travel."""
 
 
 def cross_validate(recordings: Sequence[Equations], limits: Limits) -> list[Real]:
-    """Return errors in µm of every recording, (blocks, 2), by fits without it if LEAST_OTHERS other ones cover it, else
-    by fits without the piece that is judged.
+    """Return held-out errors in µm, measured minus modelled, of every recording, (blocks, 2).
 
-    Column 0: the whole model; column 1: the plays alone, as they are written, less their mean over each stretch of
-    known memory. NaN where memory, the state of the plays, is not known.
+    A recording that the others cover (`_is_covered`) is judged by a fit without it; with more than GROUPS recordings,
+    these others and this fit also lack every GROUPS-th one before and after it. All other recordings are judged by fits
+    without the judged piece. Column 0: the whole model; column 1: the plays alone, as they are written, less the mean
+    of these errors over each stretch of known memory. NaN where memory, the state of the plays, is not known.
     """
     errors_um = _errors_by_piece(recordings, limits)
     for group in range(GROUPS):
@@ -52,9 +53,9 @@ def cross_validate(recordings: Sequence[Equations], limits: Limits) -> list[Real
 def unseen_errors(recording: Equations, common: SharedGains) -> Real:
     """Return errors (blocks, 2) in µm, measured minus modelled, of a recording that was not used for `common`.
 
-    Column 0: the whole model; column 1: the plays alone, less their mean over each stretch of known memory. NaN where
-    memory is not known. The recording's own offsets and drift are fitted to every other piece and judged on the pieces
-    between, then the reverse.
+    Column 0: the whole model; column 1: the plays alone, less the mean of these errors over each stretch of known
+    memory. NaN where memory is not known. The recording's own offsets and drift are fitted to every second of the
+    PIECES pieces of each stretch and judged on the pieces between, then the reverse.
     """
     errors_um, is_odd = np.full((recording.is_known.size, 2), np.nan), piece_numbers(recording) % 2 == 1
     for fitted_blocks in (recording.is_known & is_odd, recording.is_known & ~is_odd):
@@ -68,8 +69,8 @@ def unseen_errors(recording: Equations, common: SharedGains) -> Real:
 
 
 def piece_numbers(recording: Equations) -> npt.NDArray[np.intp]:
-    """Return the number of each block's piece (blocks,), 0 … PIECES − 1 within its stretch of known memory; −1 where
-    memory is not known.
+    """Return the number of each block's piece (blocks,): a stretch of known memory is divided into PIECES pieces of
+    equal length, numbered from 0 in each stretch; −1 where memory is not known.
     """
     numbers = np.full(recording.is_known.size, -1)
     for column in (recording.offsets.T > 0) & recording.is_known:
@@ -78,11 +79,11 @@ def piece_numbers(recording: Equations) -> npt.NDArray[np.intp]:
 
 
 def _errors_by_piece(recordings: Sequence[Equations], limits: Limits) -> list[Real]:
-    """Return errors in µm (blocks, 2) of every recording; each fit leaves out one fold, every FOLDS-th piece of
-    each recording, and judges it.
+    """Return errors in µm (blocks, 2), measured minus modelled, of every recording; each fit leaves out one fold, every
+    FOLDS-th piece (`piece_numbers`) of each recording, and judges it.
 
-    Column 0: the whole model; column 1: the plays alone, less their mean over each stretch of known memory. NaN where
-    memory is unknown.
+    Column 0: the whole model; column 1: the plays alone, less the mean of these errors over each stretch of known
+    memory. NaN where memory is unknown.
     """
     errors_um = [np.full((recording.is_known.size, 2), np.nan) for recording in recordings]
     folds = [np.where(recording.is_known, piece_numbers(recording) % FOLDS, -1) for recording in recordings]
@@ -109,7 +110,8 @@ def _residual_columns(recording: Equations, common: SharedGains, own_gains: Real
 
 
 def _remove_play_offsets(recording: Equations, errors_um: Real) -> Real:
-    """Subtract from the errors of the plays alone their mean over each stretch of known memory: plays have no offset.
+    """Subtract from the errors of the plays alone the mean of these errors over each stretch of known memory, because
+    plays have no offset.
 
     `errors_um` (blocks, 2) has the errors of the whole model and of its plays alone. Column 1 is changed in place where
     memory is known; the array is returned.
@@ -120,8 +122,8 @@ def _remove_play_offsets(recording: Equations, errors_um: Real) -> Real:
 
 
 def _is_covered(recording: Equations, other_recordings: Sequence[Equations]) -> bool:
-    """Whether each play is moved by at least COVERED_SHARE of its travel in `recording` by LEAST_OTHERS of
-    `other_recordings`, not necessarily the same ones for each play.
+    """Whether LEAST_OTHERS or more of `other_recordings` move each play by at least COVERED_SHARE of its travel in
+    `recording`; they need not be the same ones for each play.
     """
     if len(other_recordings) < LEAST_OTHERS:
         return False
@@ -132,9 +134,9 @@ def _is_covered(recording: Equations, other_recordings: Sequence[Equations]) -> 
 
 
 def _play_travel(recording: Equations) -> Real:
-    """Return the largest range of every slope's column within one stretch of known memory, in V, (plays,).
+    """Return the largest range of the column of every slope within one stretch of known memory, in V, (plays,).
 
-    0 without such a stretch.
+    All are 0 without such a stretch.
     """
     stretches = (recording.offsets.T > 0) & recording.is_known
     return np.max(

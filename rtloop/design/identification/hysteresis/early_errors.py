@@ -3,7 +3,7 @@
     F_i,k = min(max(u_0 + Σ_{j≤i} d_j, low_ik), high_ik),     |d_j| ≤ r_j − r_{j−1}
 
 low and high are the plays that began at u_0 − r and at u_0 + r (successive clips are one clip), d the rises of the
-memory curve. The rises are fitted on every other piece and judged on the pieces between. This memory has so much
+memory curve. The rises are fitted on every second piece and judged on the pieces between. This memory has so much
 freedom that the error says little about the slopes, which are therefore not fitted here.
 """
 
@@ -25,9 +25,11 @@ INSIDE_SHARE = 0.999
 def early_errors(
     run: AveragedRecording, recording_equations: Equations, common: SharedGains, own_gains: Real, thresholds: Real
 ) -> Real:
-    """Return errors in µm (blocks,) where memory, the state of the plays, is unknown, with the best-fitting memory.
+    """Return errors in µm, measured minus modelled, (blocks,) where memory, the state of the plays, is unknown, with
+    the best-fitting memory; each is held out of the fit of this memory.
 
-    NaN elsewhere, and everywhere if memory is known in all blocks or in none. `own_gains` belong to this recording.
+    NaN elsewhere, and everywhere if memory is known in all blocks or in none. `own_gains` are the offsets and drift of
+    this recording.
     """
     early_um = np.full(recording_equations.is_known.size, np.nan)
     if recording_equations.is_known.all() or not recording_equations.is_known.any():

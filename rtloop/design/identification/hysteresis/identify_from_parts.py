@@ -35,11 +35,11 @@ from rtloop.hysteresis.plays import turning_points
 from rtloop.hysteresis.unknown_memory import missing_stroke
 
 IMPROVED_SHARE = 0.95
-"""Largest fraction of the held-out error that remains with drift or creep, for the term to be kept."""
+"""Fraction of the held-out rms error below which drift or creep must lower it, for the term to be kept."""
 LEAST_STD_ERRORS = 1.0
 """Least gain by creep, in standard errors over the recordings."""
 LEAST_KNOWN_SHARE = 0.25
-"""Least longest stroke of known memory, as a fraction of the drive's range."""
+"""Least length of the longest stroke of known memory, as a fraction of the drive's range."""
 WHOLE_SHARE = 0.98
 """Least fraction of the drive's range that counts as all of it."""
 TURN_SHARE, LEAST_TURNS = 0.5, 3
@@ -50,9 +50,9 @@ TURN_SHARE, LEAST_TURNS = 0.5, 3
 class PartsFit:
     """Model to write, judgement of each recording under it, and the choice of its terms.
 
-    `trial_errors_um` has the held-out error in µm rms of each trial, by name, `terms` the trials that lowered it
-    ("drift", "creep"), `creep_um` the range of creep. `stroke_v` is the longest stroke of known memory; `missing_drive`
-    names the drive that would show larger plays, "" if the drive covers its range.
+    `trial_errors_um` has the held-out error in µm rms of each trial, by name, `terms` the kept terms ("drift",
+    "creep"), which lowered this error, `creep_um` the range of creep, 0 without it. `stroke_v` is the longest stroke of
+    known memory; `missing_drive` names the drive that would show larger plays, "" if the stroke covers the range.
     """
 
     hysteresis: HysteresisFit
@@ -78,8 +78,8 @@ def identify_from_parts(
 
     `before_v` has for each run the drive in V from rest to its first tick, None if unknown; `count`, `placement`,
     `thresholds_v` and `weights` are as in `identify_hysteresis`. Raises UnsuitableData for a wrong sign, for too short
-    a stroke of known memory, for thresholds that it does not show, and if no model explains the runs; ValueError for
-    thresholds that do not ascend and a wrong `count` or `placement`.
+    a stroke of known memory, for thresholds of half of this stroke or more, and if no model explains the runs;
+    ValueError for a wrong `count`, `placement` or `thresholds_v`.
     """
     for run in runs:
         require_rising(run)
@@ -117,9 +117,10 @@ def _trial_of_user_thresholds(thresholds: Real, stroke_v: float, hint: str) -> T
 
 
 def _require_stroke(runs: Sequence[AxisRecording], work: RecordingSet) -> tuple[float, str]:
-    """Return the longest stroke of known memory in V, and a text on the drive that would show more, "" if none would.
+    """Return the longest stroke of known memory in V, and a text that names the stroke to record for larger thresholds.
 
-    Raises UnsuitableData if that stroke is shorter than LEAST_KNOWN_SHARE of the largest range of drive of the runs.
+    The text is "" if the stroke reaches WHOLE_SHARE of the largest range of drive of the runs. Raises UnsuitableData if
+    it is shorter than LEAST_KNOWN_SHARE of that range.
     """
     stroke_v = max(run.stroke_v for run in work.runs)
     if stroke_v >= WHOLE_SHARE * work.largest_v:
@@ -141,8 +142,8 @@ def _require_stroke(runs: Sequence[AxisRecording], work: RecordingSet) -> tuple[
 
 
 def _choose_trial(work: RecordingSet, trials: Sequence[Trial]) -> tuple[Trial, dict[str, float]]:
-    """Choose the placement of least held-out error, then drift, then creep, each if the error falls below
-    IMPROVED_SHARE of that without it; creep also needs `_is_lag_over_time`.
+    """Choose the placement of least held-out error, then add drift, then creep, each if the term lowers the error below
+    IMPROVED_SHARE of the error without it; creep also needs `_is_lag_over_time`.
 
     Returns the chosen trial and the held-out rms error in µm of every trial, by a name of placement and terms such as
     "chebyshev + drift + creep", with " by path" for creep over the drive's path.
@@ -169,8 +170,9 @@ def _lowers_error(squares: Real, reference_squares: Real) -> bool:
 def _is_lag_over_time(
     work: RecordingSet, trial: Trial, name: str, squares_by_name: dict[str, Real], reference_squares: Real
 ) -> bool:
-    """Whether the error with creep is less than without it, and than with a memory that fades with the drive's path:
-    both by LEAST_STD_ERRORS standard errors over the recordings, the second also by the factor IMPROVED_SHARE.
+    """Whether the error with creep is less than the error without it, and less than the error with a memory that fades
+    with the drive's path: both by more than LEAST_STD_ERRORS standard errors over the recordings, the second also below
+    IMPROVED_SHARE of that error.
 
     `squares_by_name` has the mean square errors of `trial`, which includes creep, under `name`; this function adds the
     errors with a memory by path under "NAME by path". An actuator that is no sum of plays may have such a memory (Bouc
@@ -188,7 +190,7 @@ def _is_lag_over_time(
 
 def _candidate_terms(work: RecordingSet) -> tuple[Term, ...]:
     """Return the terms that the data can identify: "drift" for several runs, or for one whose drive turns LEAST_TURNS
-    times; "creep" too for more than LEAST_OTHERS runs.
+    times or more, by TURN_SHARE of its range; "creep" too for more than LEAST_OTHERS runs.
 
     A drive that passes once fits drift and other weights alike; creep fits any single recording, unless it is held out.
     """

@@ -56,9 +56,9 @@ def identify_hysteresis(
 
     "auto": with a dead band ("chebyshev") or without ("chebyshev-from-0"), whichever has the smaller rms error.
     "invertible" `weights` have an inverse: no partial sum is below LEAST_SLOPE of the mean slope. "free" ones may have
-    none. Raises UnsuitableData for a run without rest or loop, a wrong sign, thresholds beyond the drive, weights that
-    cannot be told apart, and an actuator that no sum of plays explains; ValueError for a wrong `count`, `placement` or
-    `thresholds_v`.
+    none. Raises UnsuitableData for a run without rest or loop (`require_loop`), a wrong sign, thresholds that the drive
+    does not exceed, weights that the drives do not determine, and an rms error above LARGEST_RMS_SHARE of the range;
+    ValueError for a wrong `count`, `placement` or `thresholds_v`.
     """
     placements = candidate_placements(placement)
     for run in runs:
@@ -76,11 +76,11 @@ def identify_hysteresis(
 
 
 def unexplained_um(runs: Sequence[AxisRecording], fit: HysteresisFit) -> float:
-    """Return the rms in µm, beyond noise, that neither `fit` nor FINEST_PLAYS plays explain; 0 if at most
-    STRUCTURE_SHARE of the range.
+    """Return the rms error in µm, beyond noise, that remains with `fit` and with FINEST_PLAYS plays, the smaller of
+    both; 0 if it is at most STRUCTURE_SHARE of the range.
     """
     errors = fit.rms_error_um
-    with suppress(UnsuitableData):  # so many cannot be told apart
+    with suppress(UnsuitableData):  # the drives do not determine so many weights
         errors = min(errors, identify_hysteresis(runs, FINEST_PLAYS).rms_error_um)
     unexplained = math.sqrt(max(0.0, errors**2 - fit.noise_um**2))
     return unexplained if unexplained > STRUCTURE_SHARE * fit.range_um else 0.0

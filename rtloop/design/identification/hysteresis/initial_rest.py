@@ -13,8 +13,8 @@ REST_SHARE = 0.02
 
 
 def begins_at_rest(run: AxisRecording) -> bool:
-    """Whether the first drive is near 0 V (REST_SHARE) and the drive turns back at least twice, by half of its range,
-    which completes the major loop: `identify_hysteresis` requires both.
+    """Whether the first |drive| is at most REST_SHARE of the largest and the drive turns back at least twice by half of
+    its range, which completes the major loop: `identify_hysteresis` requires both.
     """
     turns = turning_points(run.drive_v, 0.5 * float(np.ptp(run.drive_v)))
     return abs(run.drive_v[0]) <= REST_SHARE * float(np.abs(run.drive_v).max()) and turns.size >= 2

@@ -1,4 +1,4 @@
-"""Judgement of recordings under a sum of plays fitted without them: held-out errors, offset, drift, memory."""
+"""Judgement of recordings under a sum of plays fitted to other data: held-out errors, offset, drift, memory."""
 
 from __future__ import annotations
 
@@ -36,14 +36,14 @@ branches differ in shape, or that creep, depart by half of it where their loops 
 
 @dataclass(frozen=True)
 class Judgement:
-    """Recording judged under a model fitted without it: averaged samples (blocks,) and its figures.
+    """Recording judged under a model fitted to other recordings or pieces: averaged samples (blocks,), and figures.
 
     `error_um` is held out, NaN where the memory is not known; `written_error_um` is the error of the written plays
     alone, without drift and creep; `early_error_um` is the error of the other blocks, with a memory estimated for them
     (`early_errors`), NaN elsewhere. `residual_um` is the residual of the fit to the blocks of known memory. `offset_um`
-    is the offset in its last stretch. `starts_from_rest`: the initial memory was given. `known_from_s` is the time from
-    which the memory of all plays is known, None if never. `unsettled_um` is the departure of the beginning from a
-    periodic loop; `drift_um` the drift over the duration.
+    is the offset in the recording's last stretch. `starts_from_rest`: the initial memory was given. `known_from_s` is
+    the time from which the memory of all plays is known, None if never. `unsettled_um` is the departure of the
+    beginning from a periodic loop; `drift_um` the drift over the duration.
     """
 
     name: str
@@ -125,10 +125,11 @@ def combine_errors(rms_um: Sequence[float]) -> CombinedError:
 def evaluate_from_rest(
     runs: Sequence[AxisRecording], shape: HysteresisFit, other_runs: Sequence[AxisRecording] = ()
 ) -> tuple[tuple[Judgement, ...], tuple[Judgement, ...]]:
-    """Judge `runs`, each from rest and held out of the fit in turn, and `other_runs`, whose memory is unknown.
+    """Judge `runs`, each from rest, by held-out errors (`cross_validate`), and `other_runs`, whose memory is unknown,
+    by the fit to `runs`.
 
-    Only thresholds and kind of weights come from `shape`; the weights are fitted anew. `runs` are not checked: they are
-    those of `identify_hysteresis`. Return the judgements of `runs` and the judgements of `other_runs`.
+    Only thresholds and kind of weights come from `shape`; the weights are fitted anew. `runs` are not checked: they
+    must have passed `identify_hysteresis`. Returns the judgements of `runs` and the judgements of `other_runs`.
     """
     recordings = prepare_recordings(runs, shape.weights, [np.zeros(1)] * len(runs))
     trial = Trial(shape.model.thresholds, shape.placement, ())
@@ -138,9 +139,10 @@ def evaluate_from_rest(
 def fit_and_judge(
     recording_set: RecordingSet, trial: Trial, other_runs: Sequence[AxisRecording]
 ) -> tuple[SharedGains, tuple[Judgement, ...], tuple[Judgement, ...]]:
-    """Fit all recordings of the set and judge each by a fit without it.
+    """Fit all recordings of the set and judge each by its held-out errors (`cross_validate`).
 
-    Returns the common gains, the judgements of `recording_set.runs`, and of `other_runs`, which are not fitted.
+    Returns the common gains, the judgements of `recording_set.runs`, and the judgements of `other_runs`, which take no
+    part in the fit of the common gains.
     """
     recordings = [recording_set.equations(run, trial) for run in recording_set.runs]
     common, gains = fit_gains(recordings, recording_set.limits)
@@ -163,7 +165,9 @@ def fit_and_judge(
 def _judge_recording(
     run: AveragedRecording, recording: Equations, own_gains: Real, error: Real, common: SharedGains, trial: Trial
 ) -> Judgement:
-    """Return the judgement of one recording, with its own gains and its held-out errors (blocks, 2)."""
+    """Return the judgement of one recording from its offsets and drift, `own_gains`, and its held-out errors, `error`
+    (blocks, 2), of the whole model and of the plays alone.
+    """
     residual_um, offsets = model_errors(recording, common, own_gains), own_gains[: recording.offsets.shape[1]]
     offset_changes = (recording.offsets @ offsets)[recording.is_known] - offsets[-1:]
     departures = np.concatenate([residual_um[~recording.is_known], offset_changes, np.zeros(1)])

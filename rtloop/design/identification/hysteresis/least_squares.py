@@ -35,7 +35,7 @@ class Equations(NamedTuple):
     offsets (blocks, stretches) and drift (blocks, 1), or (blocks, 0) without; position in µm (blocks,).
 
     A stretch is a part of the recording in which the state of all plays that move is known, and has an offset of its
-    own. `is_known` (blocks,) marks the blocks in one; in others the last stretch's offset applies.
+    own. `is_known` (blocks,) marks the blocks within a stretch; all other blocks have the offset of the last stretch.
     """
 
     slopes: Real
@@ -79,8 +79,8 @@ def fit_gains(recordings: Sequence[Equations], limits: Limits) -> tuple[SharedGa
 
     No slope is below `limits.least_slope`. Penalties pull neighbouring slopes together (SLOPE_PENALTY times
     `limits.drive_v`, so 0 V switches it off), drift to 0 (DRIFT_PENALTY) and each other gain to 0 (LEAST_PENALTY).
-    Returns the common gains and a list with one array (stretches + drifts,) for each of `recordings`: its offsets, µm,
-    then its drift.
+    Returns the common gains and a list with one array (stretches + drifts,) for each of `recordings`: its offsets in
+    µm, then its drift in µm over its duration.
     """
     known_blocks = [recording.select_blocks(recording.is_known) for recording in recordings]
     plays, creep = known_blocks[0].slopes.shape[1], known_blocks[0].creep.shape[1]
@@ -106,9 +106,9 @@ def fit_gains(recordings: Sequence[Equations], limits: Limits) -> tuple[SharedGa
 
 
 def fit_own_gains(recording: Equations, common: SharedGains) -> Real:
-    """Return a recording's own gains (stretches + drifts,), its offsets in µm and then its drift.
+    """Return a recording's own gains (stretches + drifts,): its offsets in µm, then its drift in µm over its duration.
 
-    They are fitted to its blocks of known memory; the gains `common` stay.
+    They are fitted to its blocks of known memory, by least squares with `gain_penalties`; the gains `common` stay.
     """
     known_blocks = recording.select_blocks(recording.is_known)
     penalty_rows = known_blocks.is_known.size**0.5 * np.diag(recording.gain_penalties)

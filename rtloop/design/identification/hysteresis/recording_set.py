@@ -40,7 +40,7 @@ class HysteresisFit:
 
     `offsets_um` are the sensor offsets of the recordings; errors and noise refer to averaged samples. `range_um` is the
     largest range of position, `drive_v` the largest |drive|; both loops are of the recording with the widest drive.
-    `least_slope_um_per_v` is the least partial sum of "invertible" weights, also where the `weights` are "free".
+    `least_slope_um_per_v` is the least partial sum that "invertible" weights may have, also where they are "free".
     """
 
     model: PlayModel
@@ -72,8 +72,8 @@ class Trial(NamedTuple):
 
 
 class RecordingSet(NamedTuple):
-    """Recordings that share a model, as `recorded` and averaged (`runs`), with the largest ranges of drive and
-    position, the least slope, and the longest duration and path of the drive.
+    """Recordings that share a model, as `recorded` and averaged (`runs`), with the largest ranges of drive in V
+    (`largest_v`) and position, the least slope in µm/V, and the longest duration and path of the drive.
     """
 
     recorded: Sequence[AxisRecording]
@@ -119,7 +119,7 @@ class RecordingSet(NamedTuple):
         )
 
     def require_explanation(self, fit: HysteresisFit) -> HysteresisFit:
-        """Return `fit` itself. Raises UnsuitableData if its rms error exceeds LARGEST_RMS_SHARE of the range."""
+        """Return `fit` itself. Raises UnsuitableData if its rms error exceeds LARGEST_RMS_SHARE of `range_um`."""
         error_share = fit.rms_error_um / fit.range_um
         if error_share > LARGEST_RMS_SHARE:
             raise UnsuitableData(
@@ -137,8 +137,8 @@ def prepare_recordings(
     before_v: Sequence[npt.ArrayLike | None] | None,
     blocks: int = BLOCKS,
 ) -> RecordingSet:
-    """Return the recordings, each averaged over at most `blocks`/3 blocks, or `blocks` divided by their number if there
-    are more than three (`average_recording`); the length of a block differs between recordings.
+    """Return the n recordings `runs`, each averaged over blocks, at most `blocks` // max(3, n) of them, or LEAST_BLOCKS
+    if this number is smaller (`average_recording`). The length of a block differs between recordings.
 
     `before_v` has for each recording the drive in V from rest to its first tick, [0] for a start at rest, None if
     unknown; None instead of a list: unknown for all.

@@ -45,4 +45,4 @@ def require_ascending(thresholds: Real) -> None:
     if thresholds.ndim != 1 or not 1 <= thresholds.size <= MAX_PLAYS:
         raise ValueError(f"thresholds: {thresholds.size} numbers; allowed: 1 to {MAX_PLAYS}")
     if not np.all(np.isfinite(thresholds)) or thresholds[0] < 0 or np.any(np.diff(thresholds) <= 0):
-        raise ValueError(f"thresholds: {thresholds.tolist()}; allowed: ascending numbers, 0 or more")
+        raise ValueError(f"thresholds: {thresholds.tolist()} V; allowed: ascending numbers, 0 or more")

@@ -4,7 +4,8 @@
     D12 has full column rank, D21 full row rank         otherwise u costs nothing, or y is known without noise
     [A − jω B2; C1 D12] full column rank, [A − jω B1; C2 D21] full row rank for all ω
 
-The last: a zero on the imaginary axis would have to be cancelled there (Zhou, Doyle & Glover 1996, section 17.1).
+Without the last condition, the controller would have to cancel a zero on the imaginary axis (Zhou, Doyle & Glover 1996,
+section 17.1).
 """
 
 from __future__ import annotations
@@ -54,7 +55,7 @@ def _unreachable_modes(condition: str, problem: str, a: Real, b: Real) -> list[s
 
 
 def _rank_faults(plant: GeneralisedPlant) -> list[str]:
-    """Return a fault for each of D12 and D21 without full rank."""
+    """Return a fault if D12 lacks full column rank, and one if D21 lacks full row rank; [] if both have it."""
     faults = []
     for name, matrix, requirement in (
         ("D12", plant.d12, "allowed: full column rank. Give every command u a weight at high frequencies"),

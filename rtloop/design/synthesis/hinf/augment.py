@@ -64,7 +64,7 @@ class GeneralisedPlant(NamedTuple):
         inverse = np.linalg.inv(loop_matrix)  # y = inverse (C2 x + D21 w + D22 C_K x_K)
         output_from_plant, output_from_w = inverse @ self.c2, inverse @ self.d21
         output_from_k = inverse @ self.d22 @ controller.c
-        command_from_k = controller.c + controller.d @ output_from_k  # u = D_K seen_plant x + own x_K + D_K seen_w w
+        command_from_k = controller.c + controller.d @ output_from_k  # u = D_K (y for x_K = 0) + command_from_k x_K
         command_from_plant, command_from_w = controller.d @ output_from_plant, controller.d @ output_from_w
         a = np.block([
             [self.a + self.b2 @ command_from_plant, self.b2 @ command_from_k],

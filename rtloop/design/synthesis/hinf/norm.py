@@ -66,7 +66,8 @@ def _highest_gain(system: Matrices, omega: Real) -> Peak:
 def _crossings(system: Matrices, gamma: float) -> Real:
     """Return the frequencies ≥ 0 in rad/s, rising, at which a singular value equals `gamma`.
 
-    0 stands in for a crossing at −ω, so that their number is even; none for `gamma` 0.
+    If their number is odd, 0 comes before them: the lowest one then pairs with its mirror image below 0. There are none
+    for `gamma` 0.
     """
     if gamma == 0:
         return np.empty(0)

@@ -40,7 +40,7 @@ class NormalForm(NamedTuple):
         """Return the controller for the original plant, D22 included, from a controller for the normal form."""
         a, b, c, d = controller
         b, c, d = b @ self.from_y, self.to_u @ c, self.to_u @ d @ self.from_y
-        inverse = np.linalg.inv(np.eye(d.shape[1]) + self.direct @ d)  # y − D22 u = seen (y − D22 C x)
+        inverse = np.linalg.inv(np.eye(d.shape[1]) + self.direct @ d)  # y − D22 u = inverse (y − D22 C x)
         return Matrices(
             a - b @ inverse @ self.direct @ c, b @ inverse, c - d @ inverse @ self.direct @ c, d @ inverse
         )  # fmt: skip
@@ -49,7 +49,7 @@ class NormalForm(NamedTuple):
 def normalise(plant: GeneralisedPlant) -> NormalForm:
     """Return the normal form of a plant, with D12 = [0; I] and D21 = [0 I].
 
-    Its own D12 must have full column rank, and its D21 full row rank.
+    D12 of `plant` must have full column rank, and D21 full row rank.
     """
     scale = _state_scale(plant)
     a = plant.a * scale / scale[:, None]

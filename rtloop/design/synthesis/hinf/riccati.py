@@ -22,6 +22,7 @@ class NoSolution(Exception):
     """X does not exist, or is not ≥ 0; `fault` says why."""
 
     def __init__(self, fault: Fault) -> None:
+        """Store `fault`, the reason, which is also the text of the exception."""
         super().__init__(fault)
         self.fault: Fault = fault
 

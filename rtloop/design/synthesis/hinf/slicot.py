@@ -9,10 +9,10 @@ from rtloop.errors import MissingExtra
 
 
 def slicot_gamma(plant: GeneralisedPlant, start: float) -> tuple[float, Matrices]:
-    """Return γ_opt by bisection down from `start`, a γ that can be reached, and the controller there, for the plant
-    with D22 = 0.
+    """Return γ_opt by bisection down from `start`, a γ that can be reached, and the controller that reaches it, for the
+    plant with D22 set to 0.
 
-    D22 does not change γ. Raises MissingExtra without slycot.
+    D22 does not change γ_opt. Raises MissingExtra without slycot.
     """
     try:
         import slycot  # pyright: ignore[reportMissingImports]

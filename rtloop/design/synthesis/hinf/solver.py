@@ -5,7 +5,7 @@ Glover, Robust and Optimal Control, 1996, theorem 17.1; the state-space idea is 
 Francis, IEEE TAC 34, 1989. Two Riccati equations decide whether a γ can be reached, and bisection finds the smallest
 that can.
 
-At γ_opt itself I − γ⁻²·Y·X is singular, and the controller has a pole that runs off to infinity: ask for a little more.
+At γ_opt itself I − γ⁻²·Y·X is singular, and the controller has a pole that goes to infinity: use a slightly larger γ.
 """
 
 from __future__ import annotations
@@ -54,8 +54,9 @@ def synthesise_hinf(
 ) -> Hinf:
     """Synthesise the central controller, of the plant's order, at `gamma`; None takes (1 + `backoff`)·γ_opt.
 
-    `tolerance` is the largest relative error of γ_opt. Raises NoController if an assumption fails, no γ up to
-    LARGEST_GAMMA or not `gamma` can be reached, or rounding has spoilt the controller.
+    `tolerance` is the largest relative error of γ_opt. Raises NoController if an assumption fails, if no γ up to
+    LARGEST_GAMMA can be reached, if `gamma` cannot be reached, and if the controller's loop exceeds γ by more than 1 %
+    because of rounding errors.
     """
     check_assumptions(plant)
     normal_form = normalise(plant)
