@@ -41,7 +41,8 @@ def to_control(
 def from_control(system: Any) -> Transfer | FrequencyResponse:
     """Return a continuous plant or controller as zeros, poles and gain, or a frequency response.
 
-    The coherence of a response, which python-control lacks, is set to 1. Raises ValueError for another class than
+    A response, which has no coherence in python-control, gets a coherence of 1, and as resolution the largest distance
+    of its frequencies. Raises ValueError for another class than
     StateSpace, TransferFunction and FrequencyResponseData, for several inputs or outputs, for discrete time
     (`discretise_controller` makes C(z) of C(s)), and for an improper system.
     """
@@ -54,7 +55,8 @@ def from_control(system: Any) -> Transfer | FrequencyResponse:
         raise ValueError(f"system: {system.ninputs} inputs and {system.noutputs} outputs; allowed: one of each")
     if isinstance(system, library.FrequencyResponseData):
         hz = np.asarray(system.omega) / (2 * np.pi)
-        return FrequencyResponse(hz, np.asarray(system.frdata)[0, 0], np.ones(hz.size))
+        resolution_hz = float(np.max(np.diff(np.sort(hz)), initial=0.0))
+        return FrequencyResponse(hz, np.asarray(system.frdata)[0, 0], np.ones(hz.size), resolution_hz)
     if system.dt not in (None, 0):
         raise ValueError(f"dt = {system.dt}: discrete time; allowed: continuous time (dt = 0)")
     if isinstance(system, library.TransferFunction):

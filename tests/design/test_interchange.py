@@ -57,6 +57,8 @@ def test_a_measured_response_goes_out_and_comes_back() -> None:
     assert imported.hz == pytest.approx(HZ, rel=1e-15)
     assert imported.response.tobytes() == measured.response.tobytes()
     assert imported.is_trusted.all()
+    assert imported.resolution_hz == pytest.approx(np.max(np.diff(HZ)))
+    assert from_control(control.frd([1.0], [5.0])).resolution_hz == 0.0
 
 
 @pytest.mark.parametrize(

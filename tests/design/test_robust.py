@@ -268,6 +268,15 @@ def test_what_cannot_be_is_refused_with_what_misses() -> None:
         find_robust_controller(DesignOptions.model_validate(raw))
 
 
+def test_a_search_without_a_disturbance_names_the_limits_that_it_misses() -> None:
+    """The error due to the disturbance is 0 then, and its limit stays as it is for the next round."""
+    raw = tomllib.loads(SPEC)
+    del raw["specification"]["disturbance"]
+    raw["robust"] |= {"largest_sensitivity": 1.01, "generations": 10, "restarts": 1}
+    with pytest.raises(NoController, match=r"the best controller found misses limits: .*allowed: up to 1\.01"):
+        find_robust_controller(DesignOptions.model_validate(raw))
+
+
 @pytest.mark.parametrize(
     ("section", "key", "value", "message"),
     [

@@ -165,7 +165,7 @@ def _tighten(search_walls: Walls, walls: Walls, proof: Certificate) -> Walls:
     """
     cases = [(proof.sensitivity, walls.sensitivity), (proof.noise_gain, walls.noise_gain),
              (proof.disturbance, walls.disturbance)]  # fmt: skip
-    factors = [min(1.0, limit / case.value) if math.isfinite(case.value) else 1.0 for case, limit in cases]
+    factors = [limit / case.value if limit < case.value < math.inf else 1.0 for case, limit in cases]
     sensitivity, noise, disturbance = (max(factor, LEAST_FACTOR) for factor in factors)
     return Walls(
         max(1.0, sensitivity * search_walls.sensitivity),
