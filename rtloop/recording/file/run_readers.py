@@ -22,7 +22,8 @@ RecordingPaths = Path | str | Sequence[Path | str]
 def find_files(files: RecordingPaths) -> list[Path]:
     """Paths of the given files and patterns, those of a pattern sorted; whether a named file exists is not checked.
 
-    Raises RecordingError if a pattern matches no file or none is given.
+    A text with wildcards is a pattern unless a file has this name. Raises RecordingError if a pattern matches no file,
+    or `files` is empty.
     """
     items = [files] if isinstance(files, str | Path) else list(files)
     paths: list[Path] = []

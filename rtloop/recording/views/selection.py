@@ -41,7 +41,7 @@ class Selection:
         for pattern in self.signals:
             if not any(fnmatchcase(name, pattern) for name in recording.columns):
                 available = ", ".join(recording.columns)
-                raise RecordingError(f"{recording.paths[0]}: no signal {pattern!r}; there are {available}")
+                raise RecordingError(f"{recording.paths[0]}: no signal {pattern!r}; allowed: {available}")
         patterns = (*REQUIRED_SIGNALS, *self.signals)
         return tuple(name for name in recording.columns if any(fnmatchcase(name, pattern) for pattern in patterns))
 
