@@ -201,7 +201,8 @@ class RecordedSignals:
     def snapshots(self) -> Generator[Snapshot]:
         """Yield the recorded snapshots of the law in order of their ticks, of the whole run also for a part.
 
-        Damaged ones are left out and added to `problems`. Raises RecordingError for a file that cannot be read.
+        Damaged snapshots are left out, and their faults added to `problems`. Raises RecordingError for a file that
+        cannot be read.
         """
         before = -1
         with self._open_readers() as readers:

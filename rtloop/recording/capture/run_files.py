@@ -50,7 +50,7 @@ def predecessor_file(path: Path, sequence: int) -> Path | None:
 class RunFiles:
     """Present and finished files of a run; `end_place` is tick and deadline after the last tick in a file.
 
-    The present file accounts for the ticks from `file_begin` on. `closed_bytes` is the size of the finished files.
+    The present file accounts for the ticks from `file_begin` on. `closed_bytes` is the size of the earlier files.
     """
 
     def __init__(
@@ -124,7 +124,7 @@ class RunFiles:
     def packing(self, rows: Real, start_unix_ns: int) -> Iterator[None]:
         """Pack rows (n, columns) of ticks on all processors, while the block writes them by `write`, chunk by chunk.
 
-        `start_unix_ns` as in `write`. Without a present file the block runs all the same.
+        `start_unix_ns` as in `write`. Without a present file, the block runs without packing.
         """
         if self.writer is None:
             yield

@@ -139,8 +139,8 @@ class SegmentBuffer:
         """Remove and return the oldest batch of data that is ready to be written; None if none is ready.
 
         The batch is retained ticks, an overview, or a cut: `file_is_due(tick)` tells whether a file should begin at the
-        snapshot of `tick`. Ticks that a later event may still retain are not ready, nor is an overview of less than
-        OVERVIEW_BATCH_S that no retained ticks follow; `decide_all` returns both as well.
+        snapshot of `tick`. Ticks that a later event may still retain are not ready, nor is an overview that is shorter
+        than OVERVIEW_BATCH_S or one interval and that no retained ticks follow; `decide_all` returns both as well.
         """
         while self._segments:
             head = self._segments[0]

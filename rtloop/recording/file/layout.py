@@ -49,7 +49,7 @@ class OwnLayout:
     def _find_chunks(self) -> list[ChunkEntry]:
         """Return the chunks by the index of the file or, if that is missing or damaged, by a scan of the file.
 
-        The missing index and the faults that the scan finds are added to `problems`, the latter to `left_out` too.
+        The missing index and the faults that the scan finds are added to `problems`, these faults also to `left_out`.
         """
         try:
             return read_chunk_index(self._source)

@@ -99,7 +99,7 @@ class RecoveryCopy:
     def _is_content(self, message: Message) -> bool:
         """Whether to copy a message: not the header and not the event that ends a file, which are written separately.
 
-        Stores the latter for `final_message`.
+        Stores the event that ends the file for `final_message`.
         """
         if message.channel == format.EVENTS and json.loads(message.payload)["kind"] in FINAL:
             self._original_final = message

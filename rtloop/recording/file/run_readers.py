@@ -14,7 +14,7 @@ from rtloop.recording.file.topics.events import ROTATED
 from rtloop.recording.file.topics.header import RUN_KEYS
 
 ReportTicks = Callable[[int], None]
-"""Progress callback that receives the number of ticks so far."""
+"""Progress callback that receives the number of ticks processed so far."""
 RecordingPaths = Path | str | Sequence[Path | str]
 """A file, a pattern such as `NAME-*.mcap`, or the files of one rotated run in any order."""
 

@@ -48,7 +48,7 @@ class TickPacker:
         self._template = _Template(columns)
 
     def pack(self, rows: Real, start_unix_ns: int) -> Iterator[PackedChunk]:
-        """Yield rows (n, columns) float64 of ticks in order as packed chunks, all but the last of them full.
+        """Yield rows (n, columns) float64 of ascending ticks as packed chunks, all but the last of them full.
 
         Ticks are logged at `start_unix_ns` plus their deadline. `rows` must not change before the last chunk is taken.
         """

@@ -103,7 +103,7 @@ class Writer:
             raise
 
     def write_ticks(self, rows: Real) -> None:
-        """Write rows (n, columns) float64 of ticks in order, as chunks of at most `format.chunk_rows` ticks.
+        """Write rows (n, columns) float64 of ascending ticks, as chunks of at most `format.chunk_rows` ticks.
 
         Raises OutputError if the file was removed, the free space is too small, or a write fails; the chunks before the
         failed one stay in the file.

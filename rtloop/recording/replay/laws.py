@@ -38,7 +38,7 @@ IMPORT = re.compile(r"^(from|import) rtloop\b", re.MULTILINE)
 
 
 def recorded_laws(recording: Recording, trust: TrustedLaws = NO_TRUST) -> tuple[LawReference, ...]:
-    """Return the laws of the recorded loop, in its order.
+    """Return the laws of the recorded loop, in the order of the header.
 
     Raises RecordingError for imported signals, for a law that is missing or differs from the recorded one, and if this
     version lays out the records of the laws differently; ConfigError if a law's code ends or blocks its process.

@@ -206,8 +206,8 @@ class Replay:
     def _check_totals(self, expected: int) -> None:
         """Compare the replayed ticks and snapshots with the totals of the files; `expected` follows the last tick.
 
-        Reported as unverified are missing ticks at the end, snapshots after the end of the run, problems that removed
-        data, and ticks from `expected` on if the last file has no totals.
+        Missing ticks at the end are reported as a gap. Unverified are those of them that were recorded, snapshots after
+        the end of the run, problems that removed data, and ticks from `expected` on if the last file has no totals.
         """
         extents = self._recording.extents
         last = extents[-1].totals
@@ -249,7 +249,7 @@ class Replay:
     def _take_snapshot(self, tick: int) -> Snapshot | None:
         """Take the recorded snapshot at `tick`: start a rerun from it if none runs, else return it to be compared.
 
-        In the latter case the rerun will take a snapshot of its own state at `tick`. None if there is no snapshot at
+        If a snapshot is returned, the rerun will take one of its state at `tick` too. None if there is no snapshot at
         `tick`, or the rerun started from it. Earlier snapshots are skipped. Raises RecordingError for a malformed one.
         """
         while self._next_snapshot is not None and self._next_snapshot.tick < tick:

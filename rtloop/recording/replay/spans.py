@@ -69,7 +69,7 @@ def _replay_in_spans(
 ) -> ReplayReport | None:
     """Return the report of a complete recording that is identical; None where a replay in one piece has to judge.
 
-    `progress` receives the number of ticks so far.
+    `progress` receives the number of replayed ticks.
     """
     if not _is_plain(recording):
         return None
@@ -217,7 +217,7 @@ def _within(snapshots: Iterator[Snapshot], span: Span) -> Iterator[Snapshot]:
 
 
 def _span_rows(readers: Sequence[Reader], span: Span) -> Iterator[Rows]:
-    """Yield blocks of rows for the ticks of a span, both ends included; `readers` are the files of the run in order."""
+    """Yield blocks of rows for the ticks of a span, both ends included; `readers` are in the order of the run."""
     chunks_before = span.chunk
     for reader in readers:
         entries = reader.tick_chunks[chunks_before:]

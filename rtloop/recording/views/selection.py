@@ -46,7 +46,7 @@ class Selection:
         return tuple(name for name in recording.columns if any(fnmatchcase(name, pattern) for pattern in patterns))
 
     def read_blocks(self, recording: RecordedSignals, names: Sequence[str]) -> Generator[Rows]:
-        """Yield arrays (n, names) of the selected ticks, in order.
+        """Yield arrays (n, names) of the selected ticks, ascending.
 
         Raises RecordingError if a limited time span holds no tick.
         """

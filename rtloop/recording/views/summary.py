@@ -355,7 +355,7 @@ def _bands_um(header: Header) -> dict[str, float | None]:
 
 
 def _sum_ticks(readers: Sequence[Reader], progress: ReportTicks | None) -> RecordingTotals:
-    """Sum up all ticks of all files, chunk by chunk; `progress` receives the number of ticks so far."""
+    """Sum up all ticks of all files, chunk by chunk; `progress` receives the number of ticks summed up."""
     header, axes = readers[0].header, readers[0].header["axes"]
     totals = RecordingTotals(_bands_um(header), header["imported"]["units"] if "imported" in header else {})
     names = [*COMMON, *(f"{axis}_{signal}" for axis in axes for signal in ("error_um", "drive_v", "position_um"))]
