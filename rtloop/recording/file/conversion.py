@@ -90,7 +90,7 @@ def _convert(source: McapSource, conversion: _Conversion) -> int:
             conversion.add(*item)
         return open_own(conversion.finish())
     except DamagedChunk as reason:
-        prefix = "" if conversion.has_begun else "the readable part holds no header of an rtloop recording: "
+        prefix = "" if conversion.has_begun else "the readable part is not a recording of rtloop: "
         raise RecordingError(
             f"{source.path}: {prefix}{reason}; `mcap recover` keeps the undamaged part of a file, `mcap sort` "
             "sorts the messages"
