@@ -113,7 +113,7 @@ class Session:
 
     @property
     def cursor(self) -> int:
-        """Number of ticks taken from the ring or lost in it."""
+        """Number of the next tick to take from the ring; all ticks before it were taken or lost."""
         return self._ticks.position
 
     @property

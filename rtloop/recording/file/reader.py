@@ -150,7 +150,7 @@ class Reader:
     def chunks_between(self, start_s: float, end_s: float) -> list[ChunkEntry] | None:
         """The chunks that may hold ticks due from `start_s` to `end_s` since the start, both included.
 
-        None stands for all of them.
+        None, which stands for all chunks, if `start_s` is at most 0 and `end_s` is infinite.
         """
         if start_s <= 0.0 and math.isinf(end_s):
             return None

@@ -164,7 +164,7 @@ def remove_leftover(output: Path, suffix: str) -> None:
 
 
 def is_being_written(path: Path) -> bool:
-    """Whether a recorder holds its lock on the file; False on Windows, and for a file that cannot be opened.
+    """Whether a process that writes the file holds its lock; False on Windows, and if the file cannot be opened.
 
     Raises RecordingError if the lock cannot be tested.
     """

@@ -37,7 +37,7 @@ class TickPacker:
     """Packer of the ticks of one recording into chunks of at most `chunk_rows` ticks."""
 
     def __init__(self, columns: Sequence[str], *, message_index: bool = False, workers: int | None = None) -> None:
-        """Pack ticks with these columns. `message_index` adds 16 bytes of index to every tick.
+        """Prepare to pack ticks with `columns`. `message_index` adds 16 bytes of index to every tick.
 
         `workers` is the number of threads that pack several chunks: by default one for each processor that this process
         may use, at most MAX_WORKERS.

@@ -49,7 +49,7 @@ def read_messages(source: McapSource) -> Iterator[Item]:
 
 
 def library_name(source: McapSource) -> str:
-    """Name of the library that wrote the file, from the file's header; empty if the header is unreadable."""
+    """Name of the library that wrote the file, from the file's header; "" if the header is unreadable."""
     try:
         header = next(_records(source), None)
     except (*UNREADABLE, DamagedChunk):

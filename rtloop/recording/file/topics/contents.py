@@ -50,7 +50,7 @@ def may_hold_slow(entry: ChunkEntry, channel: int) -> bool:
 def may_hold(entry: ChunkEntry, channel: int) -> bool:
     """Whether a chunk may hold messages of a channel; True without an index.
 
-    The index names the channels of a chunk; one that names none stands for ticks.
+    The index names the channels of a chunk; a chunk without named channels counts as one of ticks.
     """
     if entry.index is None:
         return True
