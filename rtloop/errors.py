@@ -55,6 +55,7 @@ class ConfigError(RtloopError):
     exit_code = 78
 
     def __init__(self, source: str, faults: Sequence[str]) -> None:
+        """Store `source`, the name of a file or request, and its `faults`; the message is their `fault_list`."""
         self.source, self.faults = source, list(faults)
         super().__init__(fault_list(source, self.faults))
 
@@ -71,6 +72,7 @@ class OutputError(RtloopError):
     exit_code = 73
 
     def __init__(self, message: str, number: int = 0) -> None:
+        """Store the message and the cause `number`: an errno, LOW_SPACE, or 0 for any other cause."""
         super().__init__(message)
         self.number = number
 
@@ -79,7 +81,7 @@ class OutputError(RtloopError):
 def output_errors(target: object) -> Iterator[None]:
     """Convert an OSError inside the block to an OutputError that names `target`, such as a path, and the cause.
 
-    Its `number` is the errno, 0 without one.
+    The `number` of the OutputError is the errno, 0 without an errno.
     """
     try:
         yield
@@ -93,7 +95,10 @@ class MissingExtra(RtloopError):
     exit_code = 78
 
     def __init__(self, message: str) -> None:
-        """Store the message, with the command for a wheel's file behind the one with the extra's name."""
+        """Store the message; if it tells to run pip install 'rtloop[NAME]', add the command for a wheel's file.
+
+        No command is added if the message has it already.
+        """
         extra = re.search(r"pip install 'rtloop\[(\w+)\]'(?! \(from a wheel)", message)
         super().__init__(f"{message} (from a wheel: pip install 'FILE.whl[{extra[1]}]')" if extra else message)
 

@@ -32,7 +32,7 @@ COMMON_SIGNALS = (
     Signal("exec_us", "µs", "time from the wake to the end of the tick; NaN in virtual time"),
     Signal("periods_missed", "1", "whole periods that were skipped before this tick"),
     Signal("flags", "1", "bits of Flag"),
-    Signal("mode", "1", "Mode in force during the tick"),
+    Signal("mode", "1", "number of the loop's Mode during the tick"),
     Signal("driver_status", "1", "return value of the driver's read: 0 good, above 0 degraded, below 0 failed"),
     Signal("sample_age_us", "µs", "age of the sample as the driver states it; 0: the read itself took the sample"),
     Signal("enable_v", "V", "voltage of the enable input; 0 if there is no enable input"),
@@ -45,7 +45,7 @@ AXIS_SIGNALS = (
     Signal("command_um", "µm", "command v to the inverse hysteresis, before its limit"),
     Signal("demand_v", "V", "drive that the law asks for, before the limits of voltage and slew rate"),
     Signal("drive_v", "V", "drive u written to the driver"),
-    Signal("feed_um", "µm", "second column of a table reference, added to v in closed loop; 0 without this column"),
+    Signal("feed_um", "µm", "second column of a table reference, added to the command v in closed loop; 0 if missing"),
 )
 (
     TICK,

@@ -44,9 +44,9 @@ def to_jsonable(value: Any) -> Any:
 
 
 def count_text(number: int, singular: str, plural: str = "") -> str:
-    """Return the number, with commas between thousands, and its noun, in the singular for 1.
+    """Return `number`, with commas between thousands, and its noun: `singular` for 1, else `plural`.
 
-    `plural` is for nouns whose plural is not formed by an s.
+    Without `plural`, the plural is `singular` and an s.
     """
     return f"{number:,} {singular if number == 1 else plural or f'{singular}s'}"
 

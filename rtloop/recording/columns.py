@@ -8,7 +8,7 @@ SUFFIX_UNITS = {"um": "µm", "v": "V", "us": "µs", "ns": "ns", "s": "s", "hz": 
 
 
 def signal_unit(name: str) -> str:
-    """Unit of a signal by its definition, or by the end of its name if only the driver defines it; "" if unknown."""
+    """Unit of a signal by its definition or, if rtloop does not define it, by the end of its name; "" if unknown."""
     return describe_signal(name).unit
 
 

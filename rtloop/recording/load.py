@@ -26,9 +26,9 @@ class Recording(RecordedSignals):
 
         `tick` and `deadline_ns` are always included. `start_s` and `end_s`, both included, limit the time; of these
         ticks, the first is taken, and those whose number is a multiple of `every` above it. The DataFrame's `attrs`
-        hold `units` (text by signal) and `events` (a list).
-        Raises RecordingError if a pattern fits no signal or a limited time span holds no tick, MissingExtra without
-        pandas.
+        hold `recording` (the path), `name`, `rate_hz`, `units` (text by signal) and `events` (a list).
+        Raises RecordingError if a pattern fits no signal, a limited time span holds no tick, or `every` is below 1;
+        MissingExtra without pandas.
 
         >>> rtloop.load("run.mcap").to_pandas(["x_position_um"], start_s=0.1, end_s=0.1002).round(2)
                   tick  deadline_ns  x_position_um
@@ -44,9 +44,10 @@ class Recording(RecordedSignals):
     ) -> xarray.Dataset:
         """Return signals (names or patterns, all by default) as a Dataset over the time in s since the start.
 
-        Arguments and signals as in `to_pandas`. Units are in each variable's `attrs`, the events as JSON in the
-        Dataset's. Raises RecordingError if a pattern fits no signal or a limited time span holds no tick, MissingExtra
-        without xarray.
+        Arguments and signals are the same as in `to_pandas`. The `attrs` of each variable hold its `units` and
+        `long_name`, the `attrs` of the Dataset `recording` (the path), `name`, `rate_hz` and `events` (JSON text).
+        Raises RecordingError if a pattern fits no signal, a limited time span holds no tick, or `every` is below 1;
+        MissingExtra without xarray.
         """
         return frames.to_xarray(self, Selection(tuple(signals), start_s, end_s, every))
 

@@ -168,11 +168,11 @@ class RecordedSignals:
         return [self._signals[name] for name in names]
 
     def blocks(self, names: Sequence[str] | None = None, *, ahead: bool = True) -> Generator[Rows]:
-        """Yield arrays (n, names) of the ticks, in order, for recordings larger than memory; None reads all columns.
+        """Yield arrays (n, names) of the ticks, ascending, for recordings larger than memory; None reads all columns.
 
-        A part of a recording yields its own ticks. Nothing is cached. Damaged chunks are skipped and added to
-        `problems`. With `ahead`, threads decompress the next chunks. Raises RecordingError for an unknown name and for
-        a file that cannot be read.
+        A part of a recording yields its own ticks. No signal is cached. Damaged chunks are skipped and added to
+        `problems`. With `ahead`, and always for a part, threads decompress the next chunks. Raises RecordingError for
+        an unknown name and for a file that cannot be read.
         """
         if self.is_part:
             yield from self.between(self.columns if names is None else names, self._start_s, self._end_s)
@@ -201,7 +201,8 @@ class RecordedSignals:
     def snapshots(self) -> Generator[Snapshot]:
         """Yield the recorded snapshots of the law in order of their ticks, of the whole run also for a part.
 
-        Damaged ones are left out and added to `problems`. Raises RecordingError for a file that cannot be read.
+        Damaged snapshots are left out, and their faults added to `problems`. Raises RecordingError for a file that
+        cannot be read.
         """
         before = -1
         with self._open_readers() as readers:
@@ -225,7 +226,8 @@ class RecordedSignals:
             is_number = isinstance(limit, RealNumber) and not math.isnan(limit)
             if limit is not None and not is_number:
                 raise RecordingError(
-                    f"{self.paths[0]}: slice: limit is {limit!r}; allowed: seconds since the start of the run"
+                    f"{self.paths[0]}: slice: limit is {limit!r}; allowed: a number, in seconds since the start of the "
+                    "run"
                 )
         part = copy.copy(self)
         part._signals = {}

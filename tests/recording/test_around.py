@@ -286,7 +286,7 @@ def test_a_malformed_condition_is_refused(text: str):
 
 def test_an_unknown_signal_of_a_condition_is_named():
     names = ", ".join(COLUMNS)
-    assert signal_problem("vv > 1", COLUMNS) == f"'vv > 1': no signal 'vv'; did you mean v?; there are {names}"
+    assert signal_problem("vv > 1", COLUMNS) == f"'vv > 1': no signal 'vv'; did you mean v?; allowed: {names}"
 
 
 def test_a_replacement_recorder_retains_as_many_ticks_as_after_an_event(tmp_path: Path):

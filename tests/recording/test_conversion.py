@@ -177,7 +177,7 @@ def test_a_full_temporary_folder_is_an_error_with_the_remedy(
 
     monkeypatch.setattr(conversion, "Writer", refuse)
     with pytest.raises(
-        RecordingError, match=r"rewritten\.mcap: no room to convert the file .*set TMPDIR to another folder"
+        RecordingError, match=r"rewritten\.mcap: the converted, temporary copy cannot be written .*set TMPDIR to an"
     ):
         load(write(path, run.messages))
 
@@ -186,7 +186,9 @@ def test_a_temporary_folder_that_does_not_exist_is_an_error_with_the_remedy(
     run: Original, path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     monkeypatch.setattr(tempfile, "tempdir", str(path.with_name("absent")))
-    with pytest.raises(RecordingError, match=r"rewritten\.mcap: no room to convert the file .*set TMPDIR to another"):
+    with pytest.raises(
+        RecordingError, match=r"rewritten\.mcap: the converted, temporary copy cannot be written .*set TMPDIR to an"
+    ):
         load(write(path, run.messages))
 
 

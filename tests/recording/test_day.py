@@ -53,7 +53,7 @@ def test_a_quota_leaves_the_files_around_a_trip(tmp_path: Path):
     [
         (
             'around = { on = ["x_positon_um > 3"] }',
-            "no signal 'x_positon_um'; did you mean x_position_um?; there are tick,",
+            "no signal 'x_positon_um'; did you mean x_position_um?; allowed: tick,",
         ),
         ('around = { on = ["x_error_um"] }', "'x_error_um': not a condition; allowed: trip, mode, command, late, or a"),
         ("around = { on = [] }", "at least 1 item"),

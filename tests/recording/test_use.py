@@ -129,7 +129,7 @@ def test_load_gives_signals_by_name(path: Path, rows: np.ndarray):
     assert (recording.units["x_drive_v"], signal_unit("x_true_position_um")) == ("V", "µm")
     assert recording.configuration.startswith("[loop]")
     assert (recording.events[0]["kind"], [*recording.snapshots()][1].tick) == ("set_mode", 1_000)
-    with pytest.raises(RecordingError, match="no signal 'y'; there are tick, "):
+    with pytest.raises(RecordingError, match="no signal 'y'; allowed: tick, "):
         recording["y"]
     with pytest.raises(ValueError, match="read-only"):
         recording["tick"][0] = 1.0

@@ -187,7 +187,7 @@ def test_ctl_drives_under_a_name(bench: Bench, ada: Client):
     assert json.loads(ctl("eve", "status")[1])["lock"]["name"] == "bob"
     assert ctl("bob", "release") == (0, "{}\n")
     assert ctl("a\x1bb", "arm") == (1, "rtloop: as: 'a\\x1bb'; allowed: 1 to 40 letters, digits, blanks and .-_@+', a "
-                                       "letter or digit first\n")  # fmt: skip
+                                       "letter or digit first, no blank last\n")  # fmt: skip
 
 
 def test_connect(bench: Bench, monkeypatch: pytest.MonkeyPatch):

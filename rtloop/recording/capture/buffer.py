@@ -37,19 +37,19 @@ class TickSpans:
 
     @property
     def end(self) -> int:
-        """The tick after the last one covered; only defined if there is one."""
+        """Number of the tick after the last covered tick; only defined if a tick is covered."""
         return int(self._last[-1, TICK]) + 1
 
     def gaps(self, expected: int) -> list[tuple[int, int]]:
-        """Return the missing ranges (first tick, count) from tick `expected` on, before and between the ticks."""
+        """Return the ranges (first tick, count) of missing ticks, from tick `expected` to the last covered tick."""
         if self.tick_count and self.end - expected == self.tick_count:  # The usual case: the ticks ascend.
             return []
         return missing_ranges(self._first[:, TICK], expected, self._last[:, TICK])
 
     def tick_time(self, tick: int, rate_hz: float) -> TickTime:
-        """Return `tick` with its deadline, extrapolated at `rate_hz` from the last covered tick before it.
+        """Return `tick` with its deadline, extrapolated at `rate_hz` from the end of the row or interval before `tick`.
 
-        There must be a covered tick before it.
+        A row or interval must end before `tick`.
         """
         row = self._last[np.searchsorted(self._last[:, TICK], tick) - 1]
         return TickTime(tick, round(row[DEADLINE] + (tick - row[TICK]) * NS_PER_S / rate_hz))
@@ -72,12 +72,12 @@ class TickBuffer:
 
     @property
     def rows(self) -> Real:
-        """All rows (n, columns): a view, valid until the next `take_from`."""
+        """All rows (n, columns) in the buffer: a view, valid until the next `take_from`."""
         return self._room[self._begin : self._end]
 
     @property
     def end(self) -> int:
-        """The tick after the last one; only defined if the buffer is not empty."""
+        """Number of the tick after the last row; only defined if the buffer is not empty."""
         return int(self._room[self._end - 1, TICK]) + 1
 
     @property
@@ -86,7 +86,7 @@ class TickBuffer:
         return len(self._room) - len(self)
 
     def take_from(self, reader: RingReader) -> int:
-        """Append ticks from the ring, as many as there is room for.
+        """Append the next ticks of the ring, as many as the buffer has room for.
 
         Returns the number of ticks appended plus the number of ticks lost in the ring before them.
         """
@@ -99,11 +99,11 @@ class TickBuffer:
         return copied + lost
 
     def count_before(self, tick: int) -> int:
-        """Count the rows before `tick`."""
+        """Count the rows in the buffer whose tick number is below `tick`."""
         return int(np.searchsorted(self.rows[:, TICK], tick))
 
     def drop(self, count: int) -> None:
-        """Discard the first `count` rows, at most `len()`; `tick_time` still extrapolates from the last of them."""
+        """Discard the first `count` rows, at most `len()`; `tick_time` can extrapolate from the last discarded row."""
         if count:
             self._begin += count
             self._anchor = (self._room[self._begin - 1, TICK], self._room[self._begin - 1, DEADLINE])
@@ -111,7 +111,7 @@ class TickBuffer:
     def tick_time(self, tick: int) -> TickTime:
         """Return `tick` with its deadline, taken from its row or extrapolated from the last row before it.
 
-        Without a row before it, the base is the last dropped row; before any was dropped, tick 0 with deadline 0.
+        Without a row before `tick`, the last dropped row is the base; before any was dropped, tick 0 with deadline 0.
         """
         base_tick, base_ns = self._anchor
         rows = self.rows

@@ -2,8 +2,9 @@
 
     "x_error_um > 0.5"      "abs(x_drive_v) >= 9.5"      "driver_status != 0"
 
-`trip`: the loop tripped, or its driver failed; `mode`: a change of mode took effect; `command`: any command did;
-`late`: a tick missed at least one period. A comparison holds at every tick at which it is true; it is false for NaN.
+`trip`: the loop tripped, or its driver failed; `mode`: a change of mode took effect; `command`: a command of any kind
+took effect; `late`: a tick missed at least one period. A comparison holds at every tick at which it is true; for NaN it
+is false.
 """
 
 from __future__ import annotations
@@ -50,7 +51,7 @@ class Hit(NamedTuple):
 
 
 def parse_comparison(text: str) -> Comparison | None:
-    """Parse a condition. Returns None for one of CONDITION_NAMES. Raises ValueError for any other text."""
+    """Return the comparison that `text` states; None for one of CONDITION_NAMES. Raises ValueError for other text."""
     if text in CONDITION_NAMES:
         return None
     match = _COMPARISON.fullmatch(text)
@@ -74,7 +75,7 @@ def signal_problem(text: str, columns: Sequence[str]) -> str | None:
 
     suggestions = get_close_matches(comparison.signal, columns, n=1)
     hint = f"; did you mean {suggestions[0]}?" if suggestions else ""
-    return f"{text!r}: no signal {comparison.signal!r}{hint}; there are {', '.join(columns)}"
+    return f"{text!r}: no signal {comparison.signal!r}{hint}; allowed: {', '.join(columns)}"
 
 
 class Conditions:
@@ -93,8 +94,8 @@ class Conditions:
     def find_hits(self, rows: Real, events: Sequence[tuple[int, str]]) -> list[Hit]:
         """Return a hit for each condition that holds in rows (n, columns) or events (tick, kind), sorted by first tick.
 
-        A hit spans all ticks from the first to the last at which the condition holds; it need not hold at every tick
-        between.
+        A hit spans all ticks from the first to the last at which the condition holds; between these two ticks the
+        condition may be false.
         """
         hits = []
         for text, kinds in self._kinds.items():
@@ -109,6 +110,6 @@ class Conditions:
 
 
 def _signal_hits(rows: Real, mask: npt.NDArray[np.bool_], condition: str) -> list[Hit]:
-    """Return one hit of `condition`, from the first to the last row where `mask` (n,) is true; [] if none is."""
+    """Return [hit] of `condition`, from the first to the last row where `mask` (n,) is true; [] if none is true."""
     indices = np.flatnonzero(mask)
     return [Hit(int(rows[indices[0], TICK]), int(rows[indices[-1], TICK]), condition)] if indices.size else []

@@ -46,7 +46,7 @@ class Decimation:
         return np.stack(intervals) if intervals else np.empty((0, self._columns, len(STATISTICS)))
 
     def requeue(self, intervals: Intervals) -> None:
-        """Put back intervals (n, columns, 3: minimum, maximum, mean) that could not be written, before all others."""
+        """Put back intervals (n, columns, 3: minimum, maximum, mean) that could not be written, as the first ones."""
         self._intervals = [*intervals, *self._intervals]
 
     def _add_run(self, run: Real) -> None:
@@ -69,9 +69,9 @@ class Decimation:
                 self._end_interval()
 
     def _end_interval(self) -> None:
-        """End the present interval, unless it has no tick, and queue its minimum, maximum and mean.
+        """End the present interval, unless it has no tick, and queue minimum, maximum and mean of every column.
 
-        The three are NaN for a column whose values are all NaN.
+        All three are NaN for a column whose values are all NaN.
         """
         if self._interval_ticks == 0:
             return

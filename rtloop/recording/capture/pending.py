@@ -61,7 +61,7 @@ class PendingMessages:
     def recorder_message(self, kind: str, place: TickTime, details: Mapping[str, object]) -> Message:
         """Return an event `kind` of the recorder, at tick and time of `place`, as a message, without appending it.
 
-        `details` becomes its `what`.
+        `details` becomes the field `what` of the event.
         """
         return event_message(recorder_event(kind, *place, details), self._start_unix_ns())
 
@@ -76,7 +76,7 @@ class PendingMessages:
         return entries
 
     def requeue_events(self, entries: list[PendingEntry]) -> None:
-        """Put back the events among `entries`, which were not written; all waiting snapshots are discarded.
+        """Put back the events among the unwritten `entries`; discard their snapshots and all waiting snapshots.
 
         The oldest MAX_PENDING_EVENTS events stay; events of the loop beyond them count as dropped.
         """

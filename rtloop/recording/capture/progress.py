@@ -29,7 +29,7 @@ class RingPosition(NamedTuple):
     lost: int
 
     def furthest(self, position: RingPosition) -> RingPosition:
-        """Return the larger of both positions' numbers for each ring, with `lost` of this one, not of `position`."""
+        """Return the larger number of this and the other `position` for each ring; `lost` is that of this position."""
         return self._make([*map(max, self[:3], position[:3]), self.lost])
 
 
@@ -41,11 +41,12 @@ class RecorderProgress:
     """Written and announced position of the recorder of `block`; they differ only while a write is in progress."""
 
     def __init__(self, block: SharedBlock) -> None:
+        """Keep `block`, whose words hold the progress; no word is read or stored yet."""
         self._block = block
 
     @property
     def flushed_position(self) -> RingPosition:
-        """Ring position before which all data is in files or lost, as the shared block has it."""
+        """Ring position before which all data is in files or lost, read from the shared block."""
         return self._load(FLUSHED)
 
     def store_flushed(self, position: RingPosition) -> None:
@@ -74,7 +75,8 @@ class RecorderProgress:
     def predecessor_position(self, part: Path | None) -> RingPosition:
         """Ring position that the dead recorder reached, by the shared block and its unfinished file `part`, if any.
 
-        A write that was announced, but not stored as done, counts if its chunk is in `part`.
+        An announced write counts, even if not stored as done: its ticks if their chunk is in `part`, its snapshots and
+        events if a chunk with messages is.
         """
         position, announced = self.flushed_position, self._load(ANNOUNCED)
         for content in _chunk_contents_from(part, self._block.load(Word.ANNOUNCED_BYTE)) if part else []:
@@ -95,7 +97,7 @@ class RecorderProgress:
 
 
 def _chunk_contents_from(part: Path, byte: int) -> list[bytes]:
-    """Return the contents of the undamaged chunks of a file from `byte` on; [] if it is missing or unreadable."""
+    """Return the contents of the undamaged chunks from `byte` of a file on; [] for a missing or unreadable file."""
     try:
         return list(chunk_contents_from(part, byte))
     except RecordingError:

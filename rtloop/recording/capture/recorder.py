@@ -2,12 +2,13 @@
 
     python -m rtloop.recording.capture.recorder --fd N [--names M]
 
-N is the descriptor of the shared block, M the one of the requesters' names. One JSON line on stdin starts a recording:
-{"path": ".../NAME.mcap", "header": {...}} and optionally "options": the fields of `session.Options`. Further lines
-report removed files: {"removed": {"file": NAME, "size_bytes": N, "reason": ...}}. Once the rings are empty, the
-recorder ends with the loop, or when stdin is closed and no process drives the block. It then prints one JSON line:
-{path, paths, ticks_logged, ticks_lost, events_lost, bytes, complete, error, cpu_s}. It ignores SIGINT and SIGTERM, so
-that the loop's last ticks are recorded too.
+N is the descriptor of the shared block, M the descriptor of the requesters' names. One JSON line on stdin starts a
+recording: {"path": ".../NAME.mcap", "header": {...}} and optionally "options": the fields of `session.Options`. Further
+lines report removed files: {"removed": {"file": NAME, "size_bytes": N, "reason": ...}}. Once the rings are empty, the
+recorder ends with the loop; if stdin is closed, also when no living process drives the block or ABANDONED_S passed
+without a new slot. It then prints one JSON line: {path, paths, ticks_logged, ticks_lost, events_lost, bytes, complete,
+error, cpu_s}, or {complete, error, cpu_s} if an RtloopError ended the recording. It ignores SIGINT and SIGTERM, so that
+the loop's last ticks are recorded too.
 
 RECORDER_STATE is FAILED while no file can be written, and RUNNING again afterwards.
 """
@@ -38,17 +39,18 @@ POLL_S = 0.4
 """Pause between two looks at the rings: the cost of a look is mostly cold memory, so half as many cost half as much."""
 UNPACED_POLL_S = 0.0002
 ABANDONED_S = 5.0
-"""Time without a new tick after which the loop counts as dead, if the supervisor has ended."""
+"""Time without a new slot in a ring after which the loop counts as dead, if stdin is closed."""
 
 
 class SupervisorOrders:
     """Reader of JSON lines on stdin, unbuffered, so that `is_closed` shows the end of stdin."""
 
     def __init__(self) -> None:
+        """Begin without reading stdin, which counts as open."""
         self._unread, self.is_closed = b"", False
 
     def next(self, wait_s: float | None = 0.0) -> dict[str, Any] | None:
-        """Return the next line's object; None if none arrives within `wait_s` (None: no limit) or stdin is closed.
+        """Return the object of the next line; None if none comes within `wait_s` (None: no limit) or stdin is closed.
 
         Sets `is_closed` at the end of stdin. Raises ValueError for a line that is not JSON.
         """
@@ -75,8 +77,9 @@ class Recorder:
     def record(self, session: Session, orders: SupervisorOrders, pause_s: float) -> str:
         """Poll the rings every `pause_s` until the loop ends. Returns how: "finished", "failed" or "abandoned".
 
-        Writes due data, records removed files, and stores cursor and state in the block. "abandoned": the supervisor
-        closed the orders, or died, and no living process drives the block or the rings were empty for ABANDONED_S.
+        Writes due data, records removed files, and stores cursor and state in the block. "abandoned": stdin is closed
+        (the supervisor closed it or died), the rings are empty, and either no living process drives the block or
+        ABANDONED_S passed without a new slot.
         """
         last_tick_s = time.monotonic()
         while True:
@@ -115,7 +118,7 @@ def record_run(fd: int, names: RequesterNames | None = None) -> int:
     """Record one run from the shared block at descriptor `fd`, as a line on stdin orders; print the totals as JSON.
 
     Waits for the block and the order, and stores RECORDER_STATE in the block. Returns the exit code: 0, also if the
-    supervisor ended before there was a block (without a print), or 1 if the totals name an error: an RtloopError, or a
+    supervisor ended before the block existed (without a print), or 1 if the totals name an error: an RtloopError, or a
     failed write, even if recording resumed. Other errors, such as those of a damaged block or a malformed order, are
     raised without a print.
     """

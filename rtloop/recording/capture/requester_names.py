@@ -30,13 +30,13 @@ class RequesterNames:
 
     @classmethod
     def create(cls) -> RequesterNames:
-        """Create an empty table in a memory file, whose descriptor child processes may inherit."""
+        """Create an empty table in a memory file, whose descriptor can be passed to a child process."""
         fd = os.memfd_create("rtloop-names")
         os.ftruncate(fd, EVENT_SLOTS * SLOT.itemsize)
         return cls(fd)
 
     def close(self) -> None:
-        """Close the descriptor, so that no further process inherits it; the mapping stays valid."""
+        """Close the descriptor, so that no further process receives it; this process can still use the table."""
         close_descriptor(self.fd)
 
     def store(self, identity: int, name: str) -> None:
@@ -49,12 +49,12 @@ class RequesterNames:
         store_release(self._identity_address(identity), identity)
 
     def requester(self, identity: int) -> str | None:
-        """Name of the requester of a command; None if none was stored or a later command has overwritten the slot."""
+        """Name of the requester of command `identity`; None if none was stored or a later name replaced it."""
         if identity <= 0 or load_acquire(self._identity_address(identity)) != identity:
             return None
         name = bytes(self._slots[identity % EVENT_SLOTS]["name"]).decode(errors="replace")
         return name if load_acquire(self._identity_address(identity)) == identity else None
 
     def _identity_address(self, identity: int) -> int:
-        """Address of the first field of the slot of `identity`."""
+        """Address in memory of the field `identity` in the slot of command `identity`."""
         return self._slots.ctypes.data + identity % EVENT_SLOTS * SLOT.itemsize

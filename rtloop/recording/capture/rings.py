@@ -22,7 +22,7 @@ class RingReader:
     def take_into(self, out: npt.NDArray[np.generic]) -> tuple[int, int]:
         """Copy the next slots into `out`, at most len(out), and move `position` behind them.
 
-        Returns (slots copied, slots lost before them); `lost` sums the latter.
+        Returns (slots copied, slots lost before them), and adds the lost slots to the attribute `lost`.
         """
         copied, first, lost = drain(self._ring, self.position, out)
         self.position = int(first) + copied

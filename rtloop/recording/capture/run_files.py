@@ -50,7 +50,7 @@ def predecessor_file(path: Path, sequence: int) -> Path | None:
 class RunFiles:
     """Present and finished files of a run; `end_place` is tick and deadline after the last tick in a file.
 
-    The present file accounts for the ticks from `file_begin` on. `closed_bytes` is the size of the finished files.
+    The present file accounts for the ticks from `file_begin` on. `closed_bytes` is the size of the earlier files.
     """
 
     def __init__(
@@ -65,7 +65,7 @@ class RunFiles:
         """Prepare the files of the run recorded as `path`, from `begin` on; no file is opened yet.
 
         `header` is the header of the run. `ticks_logged` counts the ticks before `begin` in files of earlier recorders.
-        An earlier recorder's file holds the ticks before `repeats_before` as well; None if no tick is repeated.
+        An earlier recorder's file also holds the ticks from `begin` to before `repeats_before`; None if it holds none.
         """
         self._path, self._header, self._options = path, header, options
         self._repeats_before = repeats_before
@@ -76,12 +76,12 @@ class RunFiles:
 
     @property
     def paths(self) -> list[Path]:
-        """Paths of the finished files that exist, oldest first."""
+        """Paths of the finished files of this recorder that still exist, oldest first."""
         return [path for path in self._opened_paths if path.exists()]
 
     @property
     def ticks_logged(self) -> int:
-        """Number of ticks in files, the present file and those of earlier recorders of the run included."""
+        """Number of ticks in the files of the run, the present file and the files of earlier recorders included."""
         return self._closed_ticks + (self.writer.ticks if self.writer else 0)
 
     @property
@@ -98,8 +98,8 @@ class RunFiles:
         """Open the next file, for the ticks from `end_place` on; `switch` makes it the present one.
 
         `log_time` (UNIX ns) is the log time of its header. If `room_bytes` is not 0, so many bytes must be free beyond
-        `min_free_bytes` and the end of the present file. Raises OutputError if the file cannot be created or the space
-        is not free.
+        `min_free_bytes` and the index of the present file. Raises OutputError if the file cannot be created or the
+        space is not free.
         """
         path, header, options = self._path, self._header, self._options
         sequence = len(self._opened_paths) + options.sequence
@@ -124,7 +124,7 @@ class RunFiles:
     def packing(self, rows: Real, start_unix_ns: int) -> Iterator[None]:
         """Pack rows (n, columns) of ticks on all processors, while the block writes them by `write`, chunk by chunk.
 
-        `start_unix_ns` as in `write`. Without a present file the block runs all the same.
+        `start_unix_ns` as in `write`. Without a present file, the block runs without packing.
         """
         if self.writer is None:
             yield
@@ -183,8 +183,7 @@ class RunFiles:
         return problem
 
     def discard_unusable(self) -> None:
-        """Give up a present file that was removed, whose ticks are then lost; remove a present file
-        with nothing but its header.
+        """Give up a present file that was removed: its ticks are lost. Remove a present file that has only a header.
 
         Ticks before `repeats_before` that are not written yet are left out: the dead recorder's file holds them. They
         count in `ticks_logged`, and `end_place` moves behind them.
@@ -200,7 +199,7 @@ class RunFiles:
             self.end_place = self._repeats_before
 
     def _abandon(self, writer: Writer) -> None:
-        """Close the present file, of `writer`, whose ticks are lost; no file is present afterwards.
+        """Close the present file, which `writer` writes and whose ticks are lost; no file is present afterwards.
 
         `end_place` moves back to the first tick of that file.
         """

@@ -1,8 +1,8 @@
 """Bounded memory of ticks that are not yet known to be worth recording, in segments from snapshot to snapshot.
 
 A segment is retained if any of its ticks lies within `before_s` before an event or `after_s` after one; an overview
-replaces every other segment. Segments are decided and released in order. The first segment of a file is always
-retained.
+replaces every other segment. Segments are decided and released by ascending ticks. The first segment of a file is
+always retained.
 """
 
 from __future__ import annotations
@@ -119,7 +119,7 @@ class SegmentBuffer:
     def begin_segment(self, tick: int) -> None:
         """End the present segment before the snapshot of `tick` and begin the next one with it.
 
-        The next one is retained if the retained span reaches it. Nothing changes if the present one begins at `tick`.
+        The next one is retained if the retained span reaches it. If the present one begins at `tick`, do nothing.
         """
         if tick == self._segments[-1].begin:
             return
@@ -136,11 +136,11 @@ class SegmentBuffer:
             segment.retain = True
 
     def next_batch(self, file_is_due: Callable[[int], bool], *, decide_all: bool = False) -> WriteBatch | None:
-        """Remove and return the next batch to write, in order; None if none is ready.
+        """Remove and return the oldest batch of data that is ready to be written; None if none is ready.
 
         The batch is retained ticks, an overview, or a cut: `file_is_due(tick)` tells whether a file should begin at the
-        snapshot of `tick`. Ticks that a later event may still retain are not ready, nor is an overview of less than
-        OVERVIEW_BATCH_S that no retained ticks follow; `decide_all` returns both as well.
+        snapshot of `tick`. Ticks that a later event may still retain are not ready, nor is an overview that is shorter
+        than OVERVIEW_BATCH_S or one interval and that no retained ticks follow; `decide_all` returns both as well.
         """
         while self._segments:
             head = self._segments[0]
@@ -173,7 +173,7 @@ class SegmentBuffer:
         )
 
     def requeue(self, batch: WriteBatch) -> None:
-        """Put back a batch that could not be written, before all others; a cut is ignored."""
+        """Put back a batch that could not be written, as the first one; ignore a batch that is a cut."""
         if len(batch.intervals):
             self._decimation.requeue(batch.intervals)
             self._skipped_entries, self._skipped_ticks = batch.entries + self._skipped_entries, self._overview_ticks
@@ -183,10 +183,10 @@ class SegmentBuffer:
             self._segments[0].batches.appendleft(DrainedBatch(batch.entries, batch.rows))
 
     def drop_excess(self) -> list[PendingEntry]:
-        """Drop waiting ticks and events beyond the limits, retained segments last; the newest events go first.
+        """Drop ticks of complete segments, retained ones last, and the loop's newest events, until the limits hold.
 
-        Ticks of the oldest segment, if not retained, become an overview while there is room. Returns the dropped events
-        of the loop.
+        Ticks of the oldest segment, if it is not retained, become an overview instead while there is room. Returns the
+        dropped events.
         """
         while sum(len(batch.rows) for batch in self._batches()) > self._max_waiting_ticks:
             complete_segments = [
@@ -224,7 +224,7 @@ class SegmentBuffer:
 
     @property
     def _skipped_is_empty(self) -> bool:
-        """Whether no omitted tick and no event of one waits to be written."""
+        """Whether neither an omitted tick nor an event of an omitted tick waits to be written."""
         return not (self._decimation.pending_count or self._skipped_entries)
 
     def _skip(self, batch: DrainedBatch) -> None:

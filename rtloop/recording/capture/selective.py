@@ -33,9 +33,9 @@ class SelectiveSession(Session):
         options: Options,
         names: RequesterNames | None = None,
     ) -> None:
-        """Begin as `Session` does. Raises OutputError as `Session` does.
+        """Open the first file and begin to read the rings as `Session` does, and make the buffer of segments.
 
-        Raises ValueError, with the first file open, if the header has no `around`.
+        Raises OutputError as `Session` does; ValueError, with the first file open, if `header` has no `around`.
         """
         super().__init__(block, path, header, options, names)
         window, rate_hz = EventWindow.from_header(header), header["rate_hz"]
@@ -48,10 +48,10 @@ class SelectiveSession(Session):
         self._segments = SegmentBuffer(window, header["columns"], rate_hz, self.cursor, retain_until)
 
     def _handle_snapshot(self, tick: int) -> None:
-        """At the law's snapshot of `tick`: move the ticks before it to the buffer, and begin a segment.
+        """Move the ticks and messages before the snapshot of `tick` to the segments; begin a segment at `tick`.
 
-        Then, after a failure of a paced run, try to resume in a new file. Finally write the segments that are decided:
-        retained ones, and overviews in place of the others.
+        Then, if a failure stopped a paced recording, try to resume in a new file. Finally write the segments that are
+        decided: retained ones, and overviews in place of the others.
         """
         self._write(self._buffer.count_before(tick), self._pending.take_entries(before=tick))
         self._segments.begin_segment(tick)
@@ -94,7 +94,7 @@ class SelectiveSession(Session):
         self._write_decided(decide_all=True)
 
     def _write_decided(self, *, decide_all: bool = False) -> None:
-        """Write the batches of segments that are decided (retained, or replaced by an overview); `decide_all`: of all.
+        """Write the batches of decided segments (retained, or replaced by an overview); `decide_all` decides all.
 
         A batch whose write fails is put back, and recording stops. While no file can be written, drop data beyond the
         limits of the segments.

@@ -108,12 +108,12 @@ class Session:
 
     @property
     def _buffer_chunks(self) -> int:
-        """Number of chunks of ticks that are drained before they are written; a paced run also writes after FLUSH_S."""
+        """Number of chunks of ticks to drain before a write: 1 in a paced run or around events, else UNPACED_CHUNKS."""
         return 1 if self._header["paced"] or self._header.get("around") else UNPACED_CHUNKS
 
     @property
     def cursor(self) -> int:
-        """Number of ticks taken from the ring or lost in it."""
+        """Number of the next tick to take from the ring; all ticks before it were taken or lost."""
         return self._ticks.position
 
     @property
@@ -160,8 +160,8 @@ class Session:
 
         `result`: how the loop ended, as `Recorder.record` returns it. Returns {path, paths, ticks_logged, ticks_lost,
         events_lost, bytes, complete, error}: `paths` are the finished files of this session that exist, `path` is the
-        last of them or, without one, the path of the run, `bytes` the size of the files that this session finished,
-        `error` the first failure or None. The counts of ticks include those of earlier recorders of the run.
+        last of them or, without one, the path of the run, `bytes` the size of the files that this session finished or
+        left unfinished, `error` the first failure or None. The counts of ticks include earlier recorders of the run.
         """
         self._write_remaining(result)
         self._pending.count_dropped(self._pending.take_entries())
@@ -197,9 +197,10 @@ class Session:
         return lost == 0 and self._events_lost == 0 and self.error is None and result in (FINISHED, ROTATED)
 
     def _handle_snapshot(self, tick: int) -> None:
-        """At the law's snapshot of `tick`, begin another file if the present one is large or old enough.
+        """Begin another file at the law's snapshot of `tick` if the present file is large or old enough.
 
-        The ticks before it are written first. After a failure, try to resume there instead, unless the run is unpaced.
+        The ticks before `tick` are written first. While a failure prevents recording, try to resume with a new file
+        instead if the run is paced, and do nothing if it is unpaced.
         """
         if self.failure:
             if self._header["paced"]:
@@ -210,9 +211,9 @@ class Session:
                 self._rotate(tick)
 
     def _is_file_due(self, tick: int) -> bool:
-        """Whether the present file is large or old enough to begin another one at the snapshot of `tick`.
+        """Whether another file is due at `tick`: the present one has `rotate_bytes`, or lasts `rotate_s` by then.
 
-        A file that began at `tick` itself is never replaced.
+        False for a file that began at `tick` itself.
         """
         options, age_s = self._options, (tick - self._cut_tick) / self._header["rate_hz"]
         is_large = options.rotate_bytes is not None and self._files.size_bytes >= options.rotate_bytes
@@ -222,8 +223,8 @@ class Session:
     def _rotate(self, tick: int) -> None:
         """Begin another file at `tick`, before which all ticks are written, and finish the present one.
 
-        If the new file cannot be opened, recording stops until a later snapshot; if the old one cannot be finished, the
-        error is reported and recording continues.
+        If the new file cannot be opened, recording stops: until a later snapshot in a paced run, for good in an unpaced
+        one. If the old file cannot be finished, the error is reported and recording continues.
         """
         try:
             self._begin_next_file(tick, self._start_unix_ns() + self._tick_time(tick).time_ns)
@@ -273,7 +274,10 @@ class Session:
                 self._block.store(Word.RECORDER_FAILURE, problem.number or errno.EIO)
 
     def _fail(self, error: OutputError) -> None:
-        """Queue the event of a failed write and stop recording until a file can be begun; the first sets `error`."""
+        """Queue the event of a failed write, and stop recording until a file can be begun.
+
+        The first failure also sets `error`.
+        """
         self.error = self.error or str(error)
         self._pending.add_event(recorder_event(RECORDING_FAILED, *self._failure_time(), {"error": str(error)}))
         self._stop_recording(error)
@@ -378,12 +382,15 @@ class Session:
         return self._pending.count_pending(channel)
 
     def _store_progress(self, tick: int) -> None:
-        """Store in the block that ticks before `tick` are in a file or lost; the other rings' positions stay."""
+        """Store in the block that all ticks before `tick` are in a file or lost; positions of the other rings stay."""
         lost = tick - self._files.ticks_logged - self._files.ticks_skipped
         self._progress.store_flushed(self._progress.flushed_position._replace(ticks=tick, lost=lost))
 
     def _start_unix_ns(self) -> int:
-        """Start of the run in UNIX ns; 0 in virtual time, so that two unpaced runs have the same log times."""
+        """Start of the run in UNIX ns: by the block or, before the block has it, by the header.
+
+        0 in virtual time, so that two unpaced runs have the same log times.
+        """
         if not self._header["paced"]:
             return 0
         return self._block.load(Word.START_UNIX_NS) or self._header["created_unix_ns"]

@@ -1,7 +1,7 @@
 """Cut a range of ticks out of a recording, as a recording that replays alone.
 
-It begins at the newest snapshot of the law at or before the range, from which a replay can verify every tick. Ticks,
-snapshots and events are copied bit for bit.
+The new recording begins at the newest snapshot of the law at or before the range, from which a replay can verify every
+tick. Ticks, snapshots and events are copied bit for bit.
 """
 
 from __future__ import annotations
@@ -38,9 +38,9 @@ class RangeCopy:
         self._skipped_ranges: list[Range] = []
 
     def run(self, progress: ReportTicks | None) -> None:
-        """Copy all ticks and messages of the range, in order, and set `gaps`.
+        """Copy all ticks and messages of the range, in the order of the files, and set `gaps`.
 
-        `progress` receives the number of ticks so far. Raises OutputError if a write fails, RecordingError if the
+        `progress` receives the number of copied ticks. Raises OutputError if a write fails, RecordingError if the
         source cannot be read.
         """
         for messages, rows in self._source.contents(self._range):
@@ -92,13 +92,14 @@ def cut(
 ) -> dict[str, object]:
     """Write the ticks from `first` to before `end` of a recording, finished, rotated or growing, as a recording.
 
-    `from_s` and `until_s`, in s since the start, give the first tick and the tick after the last one by their deadlines
-    instead; a limit that is None is the recording's. The ticks from the last snapshot before the range are copied as
-    well. Missing ticks are listed in `gaps`. `output` is by default NAME.cut-TICK.mcap beside the recording. At least
-    `min_free_bytes` of the disk stay free. `progress` receives the number of ticks so far.
+    `from_s` replaces `first`, `until_s` replaces `end`: each, in s since the start of the run, stands for the first
+    tick due then or later. A limit that is None is the recording's. The ticks from the newest snapshot of the law at or
+    before the range are copied as well. `output` is by default NAME.cut-TICK.mcap beside the recording. At least
+    `min_free_bytes` of the disk stay free. `progress` receives the number of copied ticks.
 
-    Returns {recording, output, first, end, begin, ticks, gaps [(first tick, count)], problems, complete}: `begin` is
-    the first copied tick, `ticks` the number of copied ones, `complete` whether there is no gap and no damage. Raises
+    Returns {recording, output, first, end, begin, ticks, gaps [(first tick, count)], problems, complete}: `first` and
+    `end` are the requested limits, `begin` is the first copied tick, `ticks` the number of copied ones, `gaps` lists
+    the missing ticks, `complete` tells whether there is no gap and no damage. Raises
     RecordingError for files that are no recording of one run, and for a range that is not in it or has no snapshot to
     begin from; OutputError for an output that exists or cannot be written. After an error no new file is left.
     """
@@ -177,8 +178,8 @@ def _write_copy(
 ) -> tuple[RangeCopy, int]:
     """Copy a range of ticks into the new recording `output`. Returns the copy and its number of ticks.
 
-    A leftover of an earlier attempt is removed. Raises OutputError if the output exists, another process is writing it
-    or it cannot be written, RecordingError if the source cannot be read; no output is left then.
+    An unfinished output of an earlier attempt is removed. Raises OutputError if the output exists, another process is
+    writing it or it cannot be written, RecordingError if the source cannot be read; no new output is left then.
     """
     remove_leftover(output, UNFINISHED_SUFFIX)
     log_time = header["created_unix_ns"] if header["paced"] else 0

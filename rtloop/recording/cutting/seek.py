@@ -48,15 +48,15 @@ class ChunkSeeker:
         return len(self.reader.entries)
 
     def first_span(self) -> ChunkSpan | None:
-        """Span of the first chunk with ticks; None if the file has no ticks."""
+        """Span of the first undamaged chunk with ticks; None without such a chunk."""
         return next(filter(None, map(self.span, range(self.end))), None)
 
     def last_span(self) -> ChunkSpan | None:
-        """Span of the last chunk with ticks; None if the file has no ticks."""
+        """Span of the last undamaged chunk with ticks; None without such a chunk."""
         return next(filter(None, map(self.span, reversed(range(self.end)))), None)
 
     def final_totals(self) -> Totals | None:
-        """Totals as `Reader.totals`, from the last chunk alone; None for an unfinished file or a damaged last chunk."""
+        """Totals as `Reader.totals`, from the last chunk alone; None if this chunk is damaged or holds no totals."""
         content = self.chunk(self.end - 1)
         events = (
             [json.loads(message.payload) for message in content if message.channel == EVENTS]
@@ -66,11 +66,11 @@ class ChunkSeeker:
         return next((event["what"] for event in reversed(events) if event["kind"] in FINAL), None)
 
     def find_place(self, tick: int) -> int:
-        """Index of the first chunk with `tick` or a later one; `end` if there is none."""
+        """Index of the first chunk with `tick` or a later tick; the number of chunks if there is none."""
         return self._first_place(lambda span: span.last >= tick)
 
     def has_tick(self, tick: int) -> bool:
-        """Whether the file holds `tick`."""
+        """Whether an undamaged chunk of the file holds `tick`."""
         return len(self.rows(self.find_place(tick), tick, tick + 1)) > 0
 
     def first_tick_due(self, time_ns: float) -> int | None:
@@ -81,8 +81,9 @@ class ChunkSeeker:
         return int(due_rows[0, TICK]) if len(due_rows) else None
 
     def rows(self, place: int, first: int, end: int) -> Rows:
-        """Rows (n, columns) of the ticks [first, end) in chunk number `place`; shape (0, 0) without any, also for a
-        damaged chunk and `end`.
+        """Rows (n, columns) of the ticks from `first` to before `end` in chunk number `place`.
+
+        An empty array without such ticks, for a damaged chunk, and if `place` is the number of chunks.
         """
         span = self.span(place) if place < self.end else None
         if span is None or span.last < first or span.first >= end:
@@ -92,12 +93,15 @@ class ChunkSeeker:
         return rows[begin:stop]
 
     def _all_rows(self, place: int) -> Rows:
-        """Rows (n, columns) of chunk number `place`; shape (0, 0) for no ticks, a damaged chunk and `end`."""
+        """Rows (n, columns) of chunk number `place`.
+
+        Shape (0, 0) without ticks, for a damaged chunk, and if `place` is the number of chunks.
+        """
         content = self.chunk(place) if place < self.end else None
         return content.rows if isinstance(content, Ticks) else np.empty((0, 0))
 
     def _read_chunk(self, place: int) -> Ticks | list[Message] | None:
-        """Ticks or messages of chunk number `place`; None if it is damaged. Its faults are stored in `damage`."""
+        """Ticks or messages of chunk number `place`; None if it is damaged. `damage` gets the faults of the chunk."""
         problem_count = len(self.reader.left_out)
         content = self.reader.chunk(self.reader.entries[place])
         if place not in self.damage:
@@ -114,9 +118,9 @@ class ChunkSeeker:
         )
 
     def _first_place(self, condition: Callable[[ChunkSpan], bool]) -> int:
-        """Index of the first chunk whose span meets `condition`; `end` if there is none.
+        """Index of the first chunk whose span meets `condition`; the number of chunks if there is none.
 
-        All later spans must meet it as well. Chunks without ticks are passed over.
+        All later spans must meet it as well. Chunks without ticks, and damaged ones, are passed over.
         """
         low, high, first_place = 0, self.end, self.end
         while low < high:

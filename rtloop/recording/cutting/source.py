@@ -32,7 +32,7 @@ class RunSource:
     """Files of one run, in its order."""
 
     def __init__(self, seekers: Sequence[ChunkSeeker]) -> None:
-        """Take the files of one run, one or more, in its order; `header` is the first one's without FILE_KEYS."""
+        """Take the files of one run, at least one, in its order; `header` is the first file's, without FILE_KEYS."""
         self._seekers = seekers
         header = seekers[0].reader.header
         self.header: dict[str, Any] = {key: value for key, value in header.items() if key not in FILE_KEYS}
@@ -53,7 +53,7 @@ class RunSource:
 
     @property
     def full_range(self) -> TickRange:
-        """Range from the first tick in a chunk to after the last one, which may be omitted by intention.
+        """Range from the first recorded tick to after the last one that is recorded or was omitted by intention.
 
         Raises RecordingError if no file holds a tick.
         """
@@ -69,7 +69,7 @@ class RunSource:
         return next(filter(None, (seeker.last_span() for seeker in reversed(self._seekers))), None)
 
     def first_tick_due(self, time_s: float) -> int:
-        """First tick with a deadline of `time_s` after the start or later. Raises RecordingError if there is none."""
+        """First tick due `time_s` (s) after the start of the run or later. Raises RecordingError if there is none."""
         for seeker in self._seekers:
             if (tick := seeker.first_tick_due(time_s * 1e9)) is not None:
                 return tick
@@ -78,9 +78,9 @@ class RunSource:
         raise RecordingError(f"{self.path}: {time_s:g} s is not in the recording; {end}")
 
     def first_tick_due_or_skipped(self, time_s: float) -> int:
-        """First tick due `time_s` after the start or later. Raises RecordingError if there is none.
+        """First tick due `time_s` (s) after the start of the run or later. Raises RecordingError if there is none.
 
-        If that time is in an overview interval of omitted ticks, it is the first tick of the interval.
+        If that time lies in an overview interval of omitted ticks, return the first tick of the interval.
         """
         for overview in (seeker.reader.overview for seeker in self._seekers):
             includes_time = (overview[:, DEADLINE, MINIMUM] <= time_s * 1e9) & (
@@ -110,8 +110,9 @@ class RunSource:
         )
 
     def replayable_range(self, requested: TickRange) -> TickRange:
-        """Range that can be cut: from the newest snapshot at or before `requested`, without omitted ticks at its ends.
+        """Range that can be cut: from the newest snapshot at or before the first of `requested` that was not omitted.
 
+        The range ends as `requested` does or, if that end is within an overview interval, before this interval.
         Raises RecordingError if all requested ticks were omitted by intention, or there is no such snapshot.
         """
         end = requested.end
@@ -124,12 +125,13 @@ class RunSource:
                     end = int(first)
         if not requested.first < end:
             raise RecordingError(
-                f"{self.path}: the requested ticks were omitted; this recording has only ticks around events"
+                f"{self.path}: the requested ticks were omitted; this recording has only ticks around events. Request "
+                "ticks around an event"
             )
         return TickRange(self.snapshot_tick_before(requested.first), end)
 
     def skipped_ranges(self, messages: Sequence[Message]) -> list[Range]:
-        """Ranges of omitted ticks that the overviews among `messages` cover."""
+        """Ranges (first tick, count) of omitted ticks that the overviews among `messages` cover."""
         return tick_ranges(
             self._layout.parse_intervals(
                 [message.payload for message in messages if message.channel == format.OVERVIEW]
@@ -137,7 +139,7 @@ class RunSource:
         )
 
     def file_names(self, tick_range: TickRange) -> list[str]:
-        """Names of the files that hold ticks of a range."""
+        """Names of the files, without their folder, that hold ticks of a range."""
         return [
             seeker.reader.path.name
             for seeker in self._seekers
@@ -147,10 +149,11 @@ class RunSource:
         ]
 
     def contents(self, tick_range: TickRange) -> Iterator[tuple[list[Message], Rows]]:
-        """Yield (messages, rows) of each chunk with data of a range: one of the two is empty.
+        """Yield (messages, rows) of each chunk with data of a range; one of the two is empty.
 
-        Messages are of topics other than /ticks, rows (n, columns) are ticks. Data in two files of the run comes once.
-        Damaged chunks are left out; their faults are appended to `problems`.
+        The chunks come in the order of the files. Messages are of topics other than /ticks, rows (n, columns) are
+        ticks. Data in two files of the run comes once. Damaged chunks are left out; their faults are appended to
+        `problems`.
         """
         next_tick = tick_range.first
         for seeker in self._seekers:

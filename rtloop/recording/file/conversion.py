@@ -45,7 +45,7 @@ def open_converted_copy(source: McapSource) -> McapSource:
     """Open the copy of a file in rtloop's own layout; the first call for a file makes the copy.
 
     The caller closes the returned source; `source` stays open, and the copy itself stays until `forget_copies`.
-    Raises RecordingError if the file holds no recording or several, is damaged, or if there is no room for the copy.
+    Raises RecordingError if the file holds no recording or several, is damaged, or if the copy cannot be written.
     """
     with _lock:
         if source.identity not in _copies:
@@ -62,9 +62,9 @@ def forget_copies() -> None:
 
 
 def _copy(source: McapSource) -> int:
-    """Convert a file. Returns the descriptor of the copy, a file without a name.
+    """Convert a file into rtloop's own layout. Returns the descriptor of the copy, a file without a name.
 
-    Raises RecordingError if the file holds no recording or several, is damaged, or if there is no room for the copy.
+    Raises RecordingError if the file holds no recording or several, is damaged, or if the copy cannot be written.
     """
     try:
         with (
@@ -74,7 +74,7 @@ def _copy(source: McapSource) -> int:
             return _convert(source, conversion)
     except (OutputError, OSError) as error:
         raise RecordingError(
-            f"{source.path}: no room to convert the file ({error}); set TMPDIR to another folder"
+            f"{source.path}: the converted, temporary copy cannot be written ({error}); set TMPDIR to another folder"
         ) from None
 
 
@@ -120,8 +120,8 @@ class _Conversion:
         """Add a message; messages of topics that rtloop does not write are ignored.
 
         Raises RecordingError for a malformed or a second header, and for ticks before the header or of another schema;
-        DamagedChunk for a malformed tick, ticks out of order or log times that contradict the deadlines; OutputError if
-        the copy cannot be written.
+        DamagedChunk for a malformed tick, ticks out of order or log times that contradict the deadlines, some of them
+        only at a later message; OutputError if the copy cannot be written.
         """
         number = CHANNEL_IDS.get(channel.topic)
         if self._writer is None:
@@ -134,10 +134,10 @@ class _Conversion:
             self._add_slow_message(Message(number, message.log_time, message.data))
 
     def finish(self) -> Path:
-        """Complete the copy. Returns its path, the one of an unfinished file if no event ends the recording.
+        """Complete the copy. Returns its path; if no event ends the recording, the copy stays an unfinished file.
 
-        Raises RecordingError if no header was added; DamagedChunk for ticks out of order or log times that contradict
-        the deadlines; OutputError if the copy cannot be written.
+        Raises RecordingError if no header was added; DamagedChunk for malformed ticks, ticks out of order or log times
+        that contradict the deadlines; OutputError if the copy cannot be written.
         """
         if self._writer is None:
             raise RecordingError(
@@ -152,7 +152,7 @@ class _Conversion:
         return self._target
 
     def close(self) -> None:
-        """Close the copy; idempotent."""
+        """Close the copy without completing it; do nothing if it is closed or was never begun."""
         if self._writer is not None:
             self._writer.close()
 
@@ -169,7 +169,7 @@ class _Conversion:
         self._header = read_header(self._path, message.data)
         log.warning(
             "%s: another tool wrote this recording; rtloop converts it into a temporary file. `rtloop recover` writes "
-            "a permanent one", self._path
+            "a permanent file", self._path
         )  # fmt: skip
         header: dict[str, Any] = {key: value for key, value in self._header.items() if key != "configuration_sha256"}
         self._layout = TickLayout(header["columns"])
@@ -178,10 +178,10 @@ class _Conversion:
         self._writer = Writer(self._target, header, message.log_time, message_index=True)
 
     def _add_slow_message(self, message: Message) -> None:
-        """Queue a message of a topic other than /ticks; store the event that ends the file for `finish`.
+        """Queue a message of a topic other than /ticks, but store the event that ends the file for `finish`.
 
-        Ticks before the message are written first, and a queue of more than one chunk is written. Raises DamagedChunk
-        for ticks out of order, OutputError if the copy cannot be written.
+        Queued ticks with an earlier log time are written first, and a queue of more than one chunk is written. Raises
+        DamagedChunk for queued ticks that `_flush` refuses, OutputError if the copy cannot be written.
         """
         if self._writer is None:
             self._slow_messages.append(message)
@@ -198,8 +198,8 @@ class _Conversion:
     def _add_tick(self, schema: Schema | None, channel: Channel, message: McapMessage) -> None:
         """Queue a tick, in protobuf or JSON, and write the queue before it if that fills a chunk.
 
-        Raises RecordingError before the header or for another schema; DamagedChunk for malformed JSON and for ticks out
-        of order; OutputError if the copy cannot be written.
+        Raises RecordingError before the header or for another schema; DamagedChunk for malformed JSON and for queued
+        ticks that `_flush` refuses; OutputError if the copy cannot be written.
         """
         if self._writer is None:
             raise RecordingError(
@@ -238,8 +238,8 @@ class _Conversion:
     def _flush(self, writer: Writer) -> None:
         """Write the waiting messages of topics other than /ticks, then the waiting ticks, and empty both queues.
 
-        Raises DamagedChunk for ticks out of order or log times that contradict the deadlines; OutputError if the copy
-        cannot be written.
+        Raises DamagedChunk for malformed ticks, ticks out of order or log times that contradict the deadlines;
+        OutputError if the copy cannot be written.
         """
         writer.write_messages(self._slow_messages)
         self._slow_messages = []

@@ -32,7 +32,7 @@ class EventWindow(NamedTuple):
 
     @property
     def max_delay_s(self) -> float:
-        """Longest time from the execution of a tick to its write to the file."""
+        """Longest time, in s, from the execution of a tick to its write to the file."""
         return self.before_s + 2 * SNAPSHOT_S + max(self.every_s, OVERVIEW_BATCH_S)
 
     def ring_factor(self, ring_s: float) -> float:

@@ -19,7 +19,7 @@ class OwnLayout:
     """Chunks of a file that rtloop wrote, with its header; `left_out` are those of `problems` that removed data."""
 
     def __init__(self, source: McapSource) -> None:
-        """Find the chunks and read the header.
+        """Find the chunks of the file `source` and read the header of the recording.
 
         Raises DamagedChunk for a file by another tool or with a damaged beginning, RecordingError for a malformed
         header or a newer version.
@@ -49,7 +49,7 @@ class OwnLayout:
     def _find_chunks(self) -> list[ChunkEntry]:
         """Return the chunks by the index of the file or, if that is missing or damaged, by a scan of the file.
 
-        The missing index and the faults that the scan finds are added to `problems`, the latter to `left_out` too.
+        The missing index and the faults that the scan finds are added to `problems`, these faults also to `left_out`.
         """
         try:
             return read_chunk_index(self._source)
@@ -61,10 +61,10 @@ class OwnLayout:
 
 
 def open_layout(source: McapSource) -> tuple[McapSource, OwnLayout]:
-    """Open the layout of a recording. Returns the file with the chunks, `source` or its converted copy, and the layout.
+    """Find the chunks of a recording. Returns the file with the chunks, `source` or its converted copy, and its layout.
 
-    If it is the copy, `source` is closed. Raises RecordingError for a file without a recording, a damaged one, and one
-    of a newer version; `source` stays open then.
+    `source` is closed if the copy is returned. Raises RecordingError for a file without a recording, a damaged one, and
+    one of a newer version; `source` stays open then.
     """
     if library_name(source) not in OWN_LIBRARIES:
         try:

@@ -96,8 +96,8 @@ class Reader:
     def restrict_begin(self, tick: int) -> None:
         """Let this file begin at `tick`, where the earlier files of the run end; `first_tick` becomes at least `tick`.
 
-        Ticks, events and snapshots that it repeats are skipped: those before `repeats_before` of the header. Any other
-        tick before `tick` is a fault, found when the ticks are read.
+        Ticks, snapshots and events of the loop that this file repeats are skipped: all before `tick` and before
+        `repeats_before` of the header. Any other tick before `tick` is a fault, found when the ticks are read.
         """
         self._end_of_repetition = min(self.header.get("repeats_before", 0), tick)
         self.first_tick = max(self.first_tick, tick)
@@ -117,7 +117,10 @@ class Reader:
 
     @cached_property
     def start_unix_ns(self) -> int:
-        """Start of the run, UNIX ns: log time minus deadline of the first tick; the header's time without ticks."""
+        """Start of the run in UNIX ns: log time minus deadline of the first undamaged tick.
+
+        Without such a tick, the time `created_unix_ns` of the header.
+        """
         for entry in self.tick_chunks:
             try:
                 content = self._layout.content(entry)
@@ -147,7 +150,7 @@ class Reader:
     def chunks_between(self, start_s: float, end_s: float) -> list[ChunkEntry] | None:
         """The chunks that may hold ticks due from `start_s` to `end_s` since the start, both included.
 
-        None stands for all of them.
+        None, which stands for all chunks, if `start_s` is at most 0 and `end_s` is infinite.
         """
         if start_s <= 0.0 and math.isinf(end_s):
             return None
@@ -157,7 +160,7 @@ class Reader:
     def blocks(
         self, names: Sequence[str] | None = None, entries: Iterable[ChunkEntry] | None = None, *, ahead: bool = True
     ) -> Iterator[Rows]:
-        """Yield arrays (n, names) float64 of the ticks, in order; all columns in recorded order without `names`.
+        """Yield arrays (n, names) float64 of the ticks, ascending; all columns in recorded order without `names`.
 
         Ticks may be missing between rows. Ticks that an earlier file of the run holds are left out. `entries` restricts
         the ticks to some of `tick_chunks`; without it, their number is compared with the recorder's. With `ahead`,
@@ -179,7 +182,7 @@ class Reader:
             self._check_count(account)
 
     def snapshots(self, before: int = -1) -> Iterator[Snapshot]:
-        """Yield the snapshots of the law in order, without snapshots that are read from another file of the run.
+        """Yield the law's snapshots by ascending tick, without snapshots that are read from another file of the run.
 
         A snapshot that contradicts its digest, or does not follow tick `before` and the snapshots so far, is left out
         and listed in `problems`; unless the reader is tolerant, it raises RecordingError.
@@ -197,9 +200,9 @@ class Reader:
     def chunks(self) -> Iterator[tuple[Rows | None, list[Message]]]:
         """Yield each chunk in the order of the file: (rows, []) for ticks, else (None, messages of the other topics).
 
-        Data that an earlier file repeats is included. Damaged chunks, malformed messages and ticks out of order are
-        left out; these and a wrong number of ticks are listed in `problems`, or raise RecordingError unless the reader
-        is tolerant.
+        Data that another file of the run holds too is included. Damaged chunks, malformed messages and ticks out of
+        order are left out; these and a wrong number of ticks are listed in `problems`, or raise RecordingError unless
+        the reader is tolerant.
         """
         account = TickAccount(self.first_tick, self.totals)
         for entry in self.entries:
@@ -230,15 +233,15 @@ class Reader:
 
     @cached_property
     def overview(self) -> Intervals:
-        """Intervals (n, columns, 3: minimum, maximum, mean) of the omitted ticks, in order.
+        """Intervals (n, columns, 3: minimum, maximum, mean) of the omitted ticks, by ascending tick.
 
-        See `rtloop.recording.file.topics.overview`. Intervals without ticks, or with ticks of another one, are left out
-        and reported in `problems`; unless the reader is tolerant, they raise RecordingError.
+        See `rtloop.recording.file.topics.overview`. Intervals without ticks, or with ticks of an earlier one, are left
+        out and reported in `problems`; unless the reader is tolerant, they raise RecordingError.
         """
         intervals = self.overview_intervals(self._messages(format.OVERVIEW))
         is_plausible = are_plausible(intervals)
         if not is_plausible.all():
-            self._report("an overview of omitted ticks covers no ticks, or ticks of another overview")
+            self._report("an overview of omitted ticks covers no ticks, or ticks of an earlier overview")
         return intervals[is_plausible]
 
     def overview_intervals(self, messages: Iterable[Message]) -> Intervals:
@@ -272,7 +275,7 @@ class Reader:
         """Return `names`. Raises RecordingError for a name that is no column."""
         unknown = [name for name in names if name not in self.columns]
         if unknown:
-            raise RecordingError(f"{self.path}: no signal {unknown[0]!r}; there are {', '.join(self.columns)}")
+            raise RecordingError(f"{self.path}: no signal {unknown[0]!r}; allowed: {', '.join(self.columns)}")
         return names
 
     def _parse(self, entry: ChunkEntry) -> Ticks | list[Message]:

@@ -58,9 +58,9 @@ class RecoveryCopy:
         self._original_final: Message | None = None
 
     def copy(self, progress: ReportTicks | None = None) -> None:
-        """Copy all readable ticks and messages, in order, but neither the header nor the event that ends the file.
+        """Copy all readable ticks and messages in the order of the file, without its header and its final event.
 
-        `progress` receives the number of ticks so far. Raises OutputError if a write fails, RecordingError if the
+        `progress` receives the number of copied ticks. Raises OutputError if a write fails, RecordingError if the
         original cannot be read.
         """
         for rows, messages in self._reader.chunks():
@@ -99,7 +99,7 @@ class RecoveryCopy:
     def _is_content(self, message: Message) -> bool:
         """Whether to copy a message: not the header and not the event that ends a file, which are written separately.
 
-        Stores the latter for `final_message`.
+        Stores the event that ends the file for `final_message`.
         """
         if message.channel == format.EVENTS and json.loads(message.payload)["kind"] in FINAL:
             self._original_final = message
@@ -115,11 +115,11 @@ def recover(
 ) -> dict[str, Any]:
     """Write a finished recording of the readable data in `path`, which stays unchanged.
 
-    `opener` opens `path`, `progress` receives the number of ticks so far. `output` is `recovered_path` if None; an
+    `opener` opens `path`, `progress` receives the number of copied ticks. `output` is by default `recovered_path`; an
     unfinished output of an earlier attempt is removed. Returns {recording, output, ticks, gaps [(first tick, count)],
-    problems, complete}: `complete` is True for a finished run without a loss. Raises RecordingError if a recorder is
-    writing `path` or it cannot be read, OutputError if the output exists, another process is writing it or it cannot be
-    written completely; an incomplete output is removed.
+    problems, complete}: `complete` is True if the file ends a finished run and shows no loss. Raises RecordingError if
+    a recorder is writing `path` or it cannot be read, OutputError if the output exists, another process is writing it
+    or it cannot be written completely; an incomplete output is removed.
     """
     path = Path(path)
     output = recovered_path(path) if output is None else Path(output)
@@ -164,7 +164,7 @@ def remove_leftover(output: Path, suffix: str) -> None:
 
 
 def is_being_written(path: Path) -> bool:
-    """Whether a recorder holds its lock on the file; False on Windows, and for a file that cannot be opened.
+    """Whether a process that writes the file holds its lock; False on Windows, and if the file cannot be opened.
 
     Raises RecordingError if the lock cannot be tested.
     """
@@ -181,7 +181,10 @@ def is_being_written(path: Path) -> bool:
     except BlockingIOError:
         return True
     except OSError as error:
-        reason = f"cannot be locked ({error.strerror}), so a recorder may be writing it"
+        reason = (
+            f"cannot be locked ({error.strerror}), so a recorder may be writing it; copy it to a local disk, and use "
+            "the copy"
+        )
         raise RecordingError(f"{path}: {reason}") from None
     finally:
         close_descriptor(fd)

@@ -14,7 +14,7 @@ from rtloop.recording.file.topics.events import ROTATED
 from rtloop.recording.file.topics.header import RUN_KEYS
 
 ReportTicks = Callable[[int], None]
-"""Progress callback that receives the number of ticks so far."""
+"""Progress callback that receives the number of ticks processed so far."""
 RecordingPaths = Path | str | Sequence[Path | str]
 """A file, a pattern such as `NAME-*.mcap`, or the files of one rotated run in any order."""
 
@@ -22,7 +22,8 @@ RecordingPaths = Path | str | Sequence[Path | str]
 def find_files(files: RecordingPaths) -> list[Path]:
     """Paths of the given files and patterns, those of a pattern sorted; whether a named file exists is not checked.
 
-    Raises RecordingError if a pattern matches no file or none is given.
+    A text with wildcards is a pattern unless a file has this name. Raises RecordingError if a pattern matches no file,
+    or `files` is empty.
     """
     items = [files] if isinstance(files, str | Path) else list(files)
     paths: list[Path] = []

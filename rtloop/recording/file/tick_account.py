@@ -22,7 +22,8 @@ class TickAccount:
     def add(self, chunk: Ticks) -> Ticks | None:
         """Count the ticks of a chunk. Returns them without those before `end_of_repetition`; None if none remains.
 
-        Raises DamagedChunk if its ticks are not after the earlier ones, or after the end that the recorder stored.
+        Raises DamagedChunk if the remaining ticks begin before the next expected tick, or reach the end of the run that
+        the recorder stored.
         """
         ticks = chunk.from_tick(self._end_of_repetition) if chunk.first < self._end_of_repetition else chunk
         if ticks is None:

@@ -37,7 +37,7 @@ class TickPacker:
     """Packer of the ticks of one recording into chunks of at most `chunk_rows` ticks."""
 
     def __init__(self, columns: Sequence[str], *, message_index: bool = False, workers: int | None = None) -> None:
-        """Pack ticks with these columns. `message_index` adds 16 bytes of index to every tick.
+        """Prepare to pack ticks with `columns`. `message_index` adds 16 bytes of index to every tick.
 
         `workers` is the number of threads that pack several chunks: by default one for each processor that this process
         may use, at most MAX_WORKERS.
@@ -48,7 +48,7 @@ class TickPacker:
         self._template = _Template(columns)
 
     def pack(self, rows: Real, start_unix_ns: int) -> Iterator[PackedChunk]:
-        """Yield rows (n, columns) float64 of ticks in order as packed chunks, all but the last of them full.
+        """Yield rows (n, columns) float64 of ascending ticks as packed chunks, all but the last of them full.
 
         Ticks are logged at `start_unix_ns` plus their deadline. `rows` must not change before the last chunk is taken.
         """

@@ -71,7 +71,7 @@ class Writer:
 
     @property
     def part(self) -> Path:
-        """The file's name from its first chunk, the header, until it is finished."""
+        """Path of the file from its first chunk, the header, until it is finished."""
         return self.file.part
 
     @contextlib.contextmanager
@@ -103,7 +103,7 @@ class Writer:
             raise
 
     def write_ticks(self, rows: Real) -> None:
-        """Write rows (n, columns) float64 of ticks in order, as chunks of at most `format.chunk_rows` ticks.
+        """Write rows (n, columns) float64 of ascending ticks, as chunks of at most `format.chunk_rows` ticks.
 
         Raises OutputError if the file was removed, the free space is too small, or a write fails; the chunks before the
         failed one stay in the file.
@@ -115,9 +115,10 @@ class Writer:
             self.ticks += chunk.counts[format.TICKS]
 
     def write_messages(self, messages: Sequence[Message]) -> None:
-        """Write messages of topics other than /ticks as one chunk, indexed by topic; nothing for an empty sequence.
+        """Write messages of topics other than /ticks as one chunk, indexed by topic; do nothing without messages.
 
-        Adds the ticks that overviews among them replace to `ticks_skipped`. Raises OutputError, with nothing written.
+        Adds the ticks that overviews among the messages replace to `ticks_skipped`. Raises OutputError, with nothing
+        written, if the file was removed, the free space is too small, or the write fails.
         """
         if messages:
             self._check_writable()
@@ -128,7 +129,7 @@ class Writer:
     def write_overview(self, messages: Sequence[Message], intervals: Intervals) -> None:
         """Write messages and intervals (n, columns, 3: minimum, maximum, mean) of omitted ticks as one chunk.
 
-        Adds the omitted ticks to `ticks_skipped`. Raises OutputError, with nothing written.
+        Adds the omitted ticks to `ticks_skipped`. Raises OutputError, with nothing written, as `write_messages` does.
         """
         overview = OverviewLayout(self._columns).make_messages(intervals, self.start_unix_ns)
         self.write_messages([*messages, *overview])
@@ -178,7 +179,7 @@ class Writer:
             self.ticks_skipped -= self._skipped_counts.pop()
 
     def _try_write_end(self, final_message: Callable[[int], Message], require_all: bool) -> bool:
-        """Write the final event, the index and the footer. Returns True, or False on a full disk with chunks to drop.
+        """Write the final event, the index and the footer. Returns True; False on a full disk if a chunk can go.
 
         Raises OutputError for any other failure, and with `require_all` for a full disk too.
         """

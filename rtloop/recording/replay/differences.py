@@ -98,7 +98,7 @@ class TrackingPerformance:
         self.trip = self.trip or first_trip(rows)
 
     def report(self) -> list[dict[str, object]]:
-        """Return a dict for each axis, in order: rms_error_um, max_abs_error_um, max_abs_drive_v and steps.
+        """Return a dict for each axis, in their order: rms_error_um, max_abs_error_um, max_abs_drive_v and steps.
 
         The errors are None if the loop was never closed. `steps` is `StepMetrics.as_dict`, or None where `step_metrics`
         has none.

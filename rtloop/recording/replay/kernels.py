@@ -30,7 +30,7 @@ class Strided(NamedTuple):
     def of(cls, rows: Real) -> Strided:
         """Return the address of `rows`, valid as long as `rows` exists, and the steps in items of eight bytes.
 
-        Raises ValueError for items that are not doubles.
+        Raises ValueError for items that are not float64, and for steps that are negative or not whole items.
         """
         if rows.dtype != np.float64 or any(step % ITEM_BYTES or step < 0 for step in rows.strides):
             raise ValueError(

@@ -1,8 +1,8 @@
 """Run another law on a recording: on the recorded inputs, or in closed loop with a simulated rig.
 
-Both start from rest, with the recorded references and commands. The first computes the outputs of the law for the
-recorded inputs; they have no effect on these. The second closes the loop. Law and rig ignore missing ticks: they
-continue with the next recorded one.
+Both start from rest, with the recorded references and commands. On the recorded inputs, the outputs of the law have no
+effect on the inputs; with the rig, the loop is closed. Law and rig ignore missing ticks: they continue with the next
+recorded tick.
 """
 
 from __future__ import annotations
@@ -47,7 +47,8 @@ def recorded_law(recording: Recording, trust: TrustedLaws = NO_TRUST) -> LawWith
         first = next(snapshots, None)
     if first is None:
         raise RecordingError(
-            f"{recording.paths[0]}: no snapshot of the law in this recording, so the law's coefficients are unknown"
+            f"{recording.paths[0]}: no snapshot of the law in this recording, so the law's coefficients are unknown; "
+            "use another recording"
         )
     return LawWithCoefficients(laws, snapshot_law(first, recording, laws).coefficients)
 
@@ -58,7 +59,7 @@ def compare_law(
     """Compare the outputs of another law with the recorded ones, on the recorded inputs.
 
     Returns {ticks, problems, signals: {name: {max, at_tick, rms}}, trip: {tick, causes} of the other law or None}:
-    `ticks` counts the compared ones; `max` and `rms` are of the absolute difference, in the signal's unit. Raises
+    `ticks` counts the compared ticks; `max` and `rms` are of the absolute difference, in the signal's unit. Raises
     RecordingError if the recording has no tick or cannot be read.
     """
     differences = SignalDifferences(recording.header["axes"])
@@ -73,11 +74,12 @@ def compare_law(
 def resimulate(
     recording: Recording, law: LawWithCoefficients, driver: Driver, progress: ReportTicks | None = None
 ) -> dict[str, object]:
-    """Run a law with the recorded reference on a simulated rig, and compare its tracking with the recorded one.
+    """Run a law with the recorded references on a simulated rig, and compare its tracking with the recorded tracking.
 
     Returns {ticks, problems, trips: {recorded, resimulated}, axes: [{name, recorded, resimulated}]} with the figures of
-    `TrackingPerformance`; a trip is {tick, causes} or None. Opens and closes the driver. Raises RecordingError if the
-    recording has no tick or cannot be read, DriverError if the driver cannot be opened.
+    `TrackingPerformance`; `ticks` counts the compared ticks, a trip is {tick, causes} or None. Opens and closes the
+    driver. Raises RecordingError if the recording has no tick or cannot be read, DriverError if the driver cannot be
+    opened.
     """
     axes, rate_hz = recording.header["axes"], recording.header["rate_hz"]
     before, after = (TrackingPerformance(axes, rate_hz) for _ in range(2))
@@ -130,7 +132,7 @@ def _execute_recording(
 
 
 def _law_at_rest(recording: Recording, law: LawWithCoefficients, mode: Mode) -> LawMemory:
-    """Memory of a law at rest, in `mode`, with the extra inputs and outputs of the recording."""
+    """Memory of the laws `law` at rest, in `mode`, with the extra inputs and outputs of the recording."""
     extras = header_extras(recording.header)
     memory = LawMemory.create_at_rest(law_layout(law.laws), bind_functions(law.laws), law.coefficients, extras)
     set_mode(memory.law, int(mode), True)

@@ -38,7 +38,7 @@ IMPORT = re.compile(r"^(from|import) rtloop\b", re.MULTILINE)
 
 
 def recorded_laws(recording: Recording, trust: TrustedLaws = NO_TRUST) -> tuple[LawReference, ...]:
-    """Return the laws of the recorded loop, in its order.
+    """Return the laws of the recorded loop, in the order of the header.
 
     Raises RecordingError for imported signals, for a law that is missing or differs from the recorded one, and if this
     version lays out the records of the laws differently; ConfigError if a law's code ends or blocks its process.
@@ -82,15 +82,15 @@ def _recorded_law(entry: Mapping[str, object], recording: Recording, trust: Trus
 def _find_law(entry: Mapping[str, object], recording: Recording, trust: TrustedLaws) -> LawReference:
     """Return the trusted law of one header entry: a shipped one by name, any other one by name and SHA-256.
 
-    Searched in this order: files that the user names, installed laws, the file that it ran from, and, if trusted, the
-    recorded text. Raises RecordingError if none of them is the recorded law, or it does not fit this version, and
-    ConfigError if a law's code ends or blocks its process.
+    The search covers, in this order, files that the user names, installed laws, the file that the law ran from, and, if
+    trusted, the recorded text. Raises RecordingError if none of these is the recorded law or the law does not fit this
+    version, ConfigError if a law's code ends or blocks its process.
     """
     name, digest, text = str(entry.get("name")), entry.get("sha256"), entry.get("text")
     location = f"{recording.paths[0]}: law {name!r}"
     if digest is None:
         if name not in BUILT_IN:
-            raise RecordingError(f"{location}: not a law of this version of rtloop; its laws: {', '.join(BUILT_IN)}")
+            raise RecordingError(f"{location}: unknown to this version of rtloop; allowed: {', '.join(BUILT_IN)}")
         return LawReference(name)
     for law in (*trust.files, *_installed_laws(name)):
         if law.kind == name and law.sha256 == digest:

@@ -38,11 +38,12 @@ LAW_COMMAND_NAMES = {kind.name.lower() for kind in (*LAW_COMMANDS, Kind.LOAD_LAW
 
 
 def replay(recording: Recording, progress: ReportTicks | None = None, trust: TrustedLaws = NO_TRUST) -> ReplayReport:
-    """Replay a recording up to the first difference, and report it; `progress` receives the number of ticks so far.
+    """Replay a recording up to the first difference, and return the report.
 
-    `trust` allows laws that are neither shipped nor installed. Raises RecordingError for a recording without a law or
-    without a tick after a snapshot, and for a law or layout that differs from the recorded one; ConfigError if a law's
-    code ends or blocks its process.
+    `progress` receives the number of compared ticks. `trust` allows laws that are neither shipped nor installed. Raises
+    RecordingError for a recording without a law, without a tick after a snapshot, or with a malformed snapshot, for a
+    law or layout that differs from the recorded one, and for a file that cannot be read; ConfigError if a law's code
+    ends or blocks its process.
     """
     laws = recorded_laws(recording, trust)
     with closing(recording.snapshots()) as snapshots:
@@ -117,10 +118,10 @@ class Replay:
         snapshots: Iterator[Snapshot],
         progress: ReportTicks | None,
     ) -> None:
-        """Prepare a replay from the first of `snapshots`, which are in order; no tick is executed yet.
+        """Prepare a replay from the first of `snapshots`, which ascend by tick; no tick is executed yet.
 
-        Without any snapshot, `run` raises. `laws` are those of the recorded loop, in its order. `progress` receives the
-        number of compared ticks. A command that is recorded twice or out of order is reported as unverified.
+        Without any snapshot, `run` raises. `laws` are the laws of the recorded loop, in its order. `progress` receives
+        the number of compared ticks. A command that is recorded twice or out of order is reported as unverified.
         """
         self._laws = laws
         self._recording, self._snapshots, self._progress = recording, snapshots, progress
@@ -205,7 +206,8 @@ class Replay:
     def _check_totals(self, expected: int) -> None:
         """Compare the replayed ticks and snapshots with the totals of the files; `expected` follows the last tick.
 
-        Missing ticks, and snapshots after the end of the run, are reported as unverified.
+        Missing ticks at the end are reported as a gap. Unverified are those of them that were recorded, snapshots after
+        the end of the run, problems that removed data, and ticks from `expected` on if the last file has no totals.
         """
         extents = self._recording.extents
         last = extents[-1].totals
@@ -247,7 +249,7 @@ class Replay:
     def _take_snapshot(self, tick: int) -> Snapshot | None:
         """Take the recorded snapshot at `tick`: start a rerun from it if none runs, else return it to be compared.
 
-        In the latter case the rerun will take a snapshot of its own state at `tick`. None if there is no snapshot at
+        If a snapshot is returned, the rerun will take one of its state at `tick` too. None if there is no snapshot at
         `tick`, or the rerun started from it. Earlier snapshots are skipped. Raises RecordingError for a malformed one.
         """
         while self._next_snapshot is not None and self._next_snapshot.tick < tick:
@@ -307,7 +309,10 @@ class Replay:
         self._record_difference(int(recorded[row, signals.TICK]), self._recording.columns[column], *values)
 
     def _compare_rate(self, recorded: Rows) -> None:
-        """Store a difference if the deadlines are RATE_TOLERANCE off the rate, over MIN_RATE_PERIODS or more."""
+        """Store a difference if the deadlines of `recorded` are off the rate by the fraction RATE_TOLERANCE or more.
+
+        Rows over less than MIN_RATE_PERIODS are not judged.
+        """
         periods = len(recorded) - 1 + recorded[1:, signals.PERIODS_MISSED].sum()
         span_ns = recorded[-1, signals.DEADLINE] - recorded[0, signals.DEADLINE]
         rate_hz = self._recording.header["rate_hz"]

@@ -1,4 +1,4 @@
-"""The compiled loop on recorded references and commands, with recorded inputs or another source for hardware."""
+"""The compiled loop on recorded references and commands, with recorded inputs or a simulated rig, not hardware."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ class RecordedInputs:
         self._playback = Playback()
 
     def pointers(self) -> Pointers:
-        """Pointers of the playback driver."""
+        """Return the addresses of the playback driver's functions and context."""
         return self._playback.pointers()
 
     def load(self, rows: Rows) -> None:
@@ -78,7 +78,7 @@ class SimulatedInputs:
     enable_input = None
 
     def __init__(self, driver: Driver, extra_channels: dict[str, str]) -> None:
-        """`driver` is a simulated rig that is not open yet.
+        """Take `driver`, a simulated rig that is not open yet.
 
         `extra_channels` {name: channel} are the recording's inputs and outputs besides sensors and drives.
         """
@@ -86,9 +86,9 @@ class SimulatedInputs:
         self.facts, self.wiring, self._driver = driver.facts, driver.wiring, driver
 
     def pointers(self) -> Pointers:
-        """Open the driver that the constructor received, and return its pointers.
+        """Open the simulated rig. Returns the addresses of its functions and context.
 
-        The owner of the driver closes it; this class does not. Raises DriverError if the driver cannot be opened.
+        The owner of the rig closes it; this class does not. Raises DriverError if the rig cannot be opened.
         """
         return self._driver.open()
 
@@ -134,7 +134,7 @@ class Rerun:
         return min(SLICE_TICKS, len(self._slots) - tick % len(self._slots))
 
     def execute(self, rows: Rows) -> Rows:
-        """Execute the consecutive ticks of `rows` (n, columns), 0 < n ≤ `max_ticks`. Returns records (m, columns).
+        """Execute the consecutive ticks of `rows` (n, columns), 0 < n ≤ `max_ticks`. Returns its records (m, columns).
 
         m < n if the loop ended. The records are a view, valid until the next call. Missing ticks before `rows` are
         skipped.
@@ -162,7 +162,7 @@ class Rerun:
         return ring.slots[(int(ring.head[0]) - 1) % len(ring.marks)].tobytes()
 
     def _load_references(self, rows: Rows, first_tick: int) -> None:
-        """Set the recorded references as a table that starts with `rows`; commands cannot change it."""
+        """Let every axis follow the recorded reference and feed of `rows`, in a table that no command can change."""
         table, generators = self._block["table"], self._assembly.generators
         for axis in range(len(self.law.axes)):
             start, count = 2 * axis * SLICE_TICKS, len(rows)

@@ -1,7 +1,7 @@
 """Replay of a whole recording in spans at once, one process each.
 
 A span runs from the law's snapshot at its first tick, and ends by comparing its state with the snapshot from which the
-next span starts, in bytes: all spans together compare what a replay in one piece compares. Only a recording that is
+next span starts, in bytes: all spans together compare the same data as a replay in one piece. Only a recording that is
 finished, complete and identical gets its answer here; any other one is replayed in one piece, which finds the first
 difference and reports it.
 """
@@ -69,7 +69,7 @@ def _replay_in_spans(
 ) -> ReplayReport | None:
     """Return the report of a complete recording that is identical; None where a replay in one piece has to judge.
 
-    `progress` receives the number of ticks so far.
+    `progress` receives the number of replayed ticks.
     """
     if not _is_plain(recording):
         return None
@@ -118,7 +118,7 @@ def _find_spans(recording: Recording, jobs: int, snapshot_ticks: Sequence[int]) 
     """Return up to `jobs` spans of about equally many chunks, at least LEAST_CHUNKS each.
 
     [] for fewer chunks, a damaged chunk, or a first tick without a snapshot. `snapshot_ticks` are the ticks of the
-    snapshots, in order, without a snapshot that follows the last tick.
+    snapshots, ascending, without a snapshot that follows the last tick.
     """
     starts: list[tuple[int, int]] = []
     with open_run(recording.paths) as readers:
@@ -208,7 +208,7 @@ def _replay_span(
 
 
 def _within(snapshots: Iterator[Snapshot], span: Span) -> Iterator[Snapshot]:
-    """Yield the snapshots of a span, both ends included."""
+    """Yield those of `snapshots` (ascending) that belong to a span, both ends included."""
     for snapshot in snapshots:
         if span.last_tick is not None and snapshot.tick > span.last_tick:
             return
@@ -217,7 +217,7 @@ def _within(snapshots: Iterator[Snapshot], span: Span) -> Iterator[Snapshot]:
 
 
 def _span_rows(readers: Sequence[Reader], span: Span) -> Iterator[Rows]:
-    """Yield blocks of rows for the ticks of a span, both ends included; `readers` are the files of the run in order."""
+    """Yield blocks of rows for the ticks of a span, both ends included; `readers` are in the order of the run."""
     chunks_before = span.chunk
     for reader in readers:
         entries = reader.tick_chunks[chunks_before:]

@@ -56,7 +56,7 @@ class ReplayReport:
         self.not_verified.append({"first_tick": first_tick, "count": count, "why": reason})
 
     def as_dict(self) -> dict[str, object]:
-        """The object of `rtloop replay --json`, with the fields of the report.
+        """Return the object that `rtloop replay --json` prints: the fields of the report.
 
         Keys: ticks, stretches, ticks_skipped, identical, first_difference, not_verified, unverified, gaps,
         snapshots_compared, problems, not_judged.
@@ -77,7 +77,7 @@ class ReplayReport:
 
 
 def unjudged_contents(header: Header) -> list[str]:
-    """Texts, one for each kind of recorded contents that no replay can judge: no output of the law depends on these.
+    """Return one text for each kind of recorded contents that no replay can judge: no output of the law depends on it.
 
     The texts are the same for every recording but for the names of its observed signals.
     """

@@ -41,7 +41,7 @@ class Band(NamedTuple):
 
     @property
     def is_line(self) -> bool:
-        """Whether both extremes are the same everywhere."""
+        """Whether the least value equals the largest one in every group of ticks."""
         return np.array_equal(self.low, self.high, equal_nan=True)
 
 
@@ -99,8 +99,9 @@ def read_bands(
     """Read the signals between two times, both included, in s since the start.
 
     Returns bands of about `points` values, by name. Every tick is a value if there are at most `points`. Omitted ticks
-    add about 2 `points` values of their overview. Values whose magnitude is MAX_DRAWN_VALUE or more count as NaN.
-    `progress` receives the number of ticks read. Raises RecordingError if no tick lies between the times.
+    add up to about 2 `points` values of their overview. Values whose magnitude is MAX_DRAWN_VALUE or more count as NaN.
+    `progress` receives the number of ticks read. Raises RecordingError if neither a tick nor an overview lies between
+    the times.
     """
     count = sum(len(rows) for rows in recording.between(["deadline_ns"], start_s, end_s))
     overview_band = _overview_band(recording, names, start_s, end_s, points)
@@ -127,9 +128,10 @@ def read_bands(
 
 
 def make_panels(recording: Recording) -> list[Panel]:
-    """Return the panels of a picture, from the top, each with a recorded signal; unpaced runs have no timing panel.
+    """Return the panels of a picture, from the top, each with at least one recorded signal.
 
-    Raises RecordingError if there is no signal to draw.
+    Paced runs also have a panel of timing, imported recordings up to MAX_OTHER_SIGNALS panels of other signals. Raises
+    RecordingError if there is no signal to draw.
     """
     axis_panels = [_panel(recording, axis, names) for axis in recording.header["axes"] for names in AXIS_PANELS]
     if recording.header["paced"]:
@@ -144,14 +146,17 @@ def make_panels(recording: Recording) -> list[Panel]:
 
 
 def _panel(recording: Recording, axis: str, names: Sequence[str]) -> Panel:
-    """Panel of the recorded ones among the signals `names` of an axis, such as error_um; its `names` may be empty."""
+    """Panel of the recorded ones among the signals `names` of an axis, such as error_um; [] as `names` without any."""
     present = [name for signal in names if (name := f"{axis}_{signal}") in recording]
     label = axis if len(names) > 1 else f"{axis} {signal_kind(names[0])}"
     return Panel(label, signal_unit(names[0]), present)
 
 
 def signal_kind(name: str) -> str:
-    """Kind of a signal, which sets its style: `position` for `x_position_um`; an unknown name unchanged."""
+    """Return the kind of a signal, which sets its style: `position` for `x_position_um`, `exec` for `exec_us`.
+
+    The kind is the word before the unit if word and unit form a signal of AXIS_PANELS or TIMING, else the whole name.
+    """
     kind = name.rpartition("_")[0].rpartition("_")[2]
     suffixes = [signal for names in (*AXIS_PANELS, TIMING) for signal in names]
     return kind if f"{kind}_{name.rpartition('_')[2]}" in suffixes else name
@@ -160,7 +165,10 @@ def signal_kind(name: str) -> str:
 def _overview_band(
     recording: Recording, names: list[str], start_s: float, end_s: float, points: int
 ) -> tuple[Real, Real, Real]:
-    """Return times (n,) in s, least and largest values (n, names) of the omitted ticks; n is about 2 `points`, or 0."""
+    """Return times (n,) in s, least and largest values (n, names) of the ticks omitted between two times.
+
+    n is 2 for each group of intervals, up to about 2 `points` altogether, and 0 if no tick was omitted.
+    """
     empty = np.empty((0, len(names)))
     if not recording.skipped:
         return np.empty(0), empty, empty
@@ -184,7 +192,7 @@ def _overview_band(
 def full_rate_spans(recording: Recording) -> list[tuple[float, float]]:
     """Spans (start, end) recorded at the full rate, in s since the start of the run; the last one may end at infinity.
 
-    Empty if no tick was omitted by intention.
+    [] if no tick was omitted by intention.
     """
     if not recording.skipped:
         return []
@@ -198,7 +206,7 @@ def full_rate_spans(recording: Recording) -> list[tuple[float, float]]:
 def event_marks(recording: Recording, start_s: float, end_s: float) -> list[Mark]:
     """Marks of the events between two times, both included, in s since the start, without events that end a file.
 
-    Each is labelled with its mode, or with its kind and the causes of a trip.
+    The label of a change of mode is the mode; any other event has its kind as label, a trip with its causes.
     """
     events = []
     for event in recording.events:
@@ -210,7 +218,7 @@ def event_marks(recording: Recording, start_s: float, end_s: float) -> list[Mark
 
 
 def recording_title(recording: Recording) -> str:
-    """Title of a picture: name, rate and clock of a run."""
+    """Title of a picture: name and rate of a run, and its kind: paced, imported or virtual time."""
     header = recording.header
     clock = "paced" if header["paced"] else "imported" if "imported" in header else "virtual time"
     return f"{header.get('name', recording.paths[0].name)}   ({header['rate_hz']:g} Hz, {clock})"

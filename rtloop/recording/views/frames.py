@@ -70,5 +70,5 @@ def _selected_signals(recording: RecordedSignals, selection: Selection) -> dict[
 
 
 def _recording_attributes(recording: RecordedSignals) -> dict[str, object]:
-    """Attributes {recording, name, rate_hz} of a DataFrame or Dataset."""
+    """Attributes of a DataFrame or Dataset: {recording (path of the first file), name, rate_hz}."""
     return {"recording": str(recording.paths[0]), **{key: recording.header[key] for key in ("name", "rate_hz")}}

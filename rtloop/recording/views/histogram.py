@@ -21,6 +21,7 @@ class TimeHistogram:
     STEPS = 1 << 12
 
     def __init__(self) -> None:
+        """Begin without any counted time."""
         self._counts = np.zeros(self.LINEAR_NS, np.int64)
         self._large: dict[int, int] = {}
         self._maximum = -math.inf
@@ -28,7 +29,7 @@ class TimeHistogram:
     def add(self, values_us: Real) -> None:
         """Count values in µs; NaN and values of NO_TIME_US or more are ignored, negative ones count as 0.
 
-        They are rounded as the class says, but not for the maximum.
+        Values are rounded to whole ns, from LINEAR_NS on down to steps of 2⁻¹² of their size; the maximum is exact.
         """
         if not len(values_us) or not values_us.max() < NO_TIME_US:
             values_us = values_us[values_us < NO_TIME_US]
@@ -65,7 +66,7 @@ class TimeHistogram:
         return [float(values[np.searchsorted(cumulative, rank)]) / NS_PER_US for rank in ranks]
 
     def class_counts(self) -> list[dict[str, float | None]]:
-        """Counts of all classes, also empty ones, as {below_us, count}; [] without values.
+        """Counts by the classes of CLASSES_US, empty ones included, as {below_us, count}; [] without values.
 
         A class holds times from the bound of the class before up to, not including, `below_us` (None for the last one).
         """

@@ -27,7 +27,7 @@ class Motion:
 
     @np.errstate(over="ignore", invalid="ignore")  # A recording may hold any double.
     def add(self, drive_v: Real, position_um: Real) -> None:
-        """Add the next ticks, drive and position (n,) each; they follow those of the previous call.
+        """Add drive and position (n,) of the next ticks, which follow the ticks of the previous call.
 
         The step between the calls counts as path of the drive.
         """

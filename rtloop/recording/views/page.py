@@ -55,7 +55,7 @@ def write_page(
 
 
 def _page_subtitle(drawing: DrawnRecording) -> str:
-    """File name, host and number of points as text."""
+    """Text of file name, processor, kernel of the operating system, and number and kind of the points."""
     recording, host = drawing.recording, drawing.recording.header.get("host", {})
     has_lines = all(band.is_line for band in drawing.bands.values())
     content = "one for every tick" if has_lines else "each with the least and largest value of its ticks"
@@ -71,7 +71,7 @@ def _panel_data(panel: Panel, bands: dict[str, Band]) -> dict[str, object]:
 
 
 def _trace_data(band: Band, name: str) -> dict[str, object]:
-    """Band as {label, colour, width, low, high} for the page; `high` is None for a line.
+    """Band as {label, colour, width, low, high} for the page; `high` is None if it equals `low` everywhere.
 
     `low` and `high` are single-precision values in base64, `width` is in pixels, `colour` one of COLOURED or "other".
     """

@@ -102,7 +102,7 @@ def _draw(figure: Figure, drawing: DrawnRecording) -> None:
 
 
 def _draw_trace(subplot: Axes, band: Band, kind: str) -> None:
-    """Draw a band as a line, or as two lines with the area between them."""
+    """Draw a band as one line if its extremes are equal everywhere, else as two lines with the area between them."""
     color = COLOURS.get(kind, OTHER_COLOUR)
     line = {"color": color, "linewidth": WIDE_LINES.get(kind, 0.8), "zorder": 1.9 if kind in WIDE_LINES else 2.0}
     subplot.plot(band.time_s, band.low, label=kind, **line)
@@ -112,7 +112,7 @@ def _draw_trace(subplot: Axes, band: Band, kind: str) -> None:
 
 
 def _mark_events(panels: list[Axes], events: list[Mark]) -> None:
-    """Draw a line at each event, and the labels of the first MAX_LABELS above the topmost panel."""
+    """Draw a line at each event in every panel, and the labels of the first MAX_LABELS events above the top panel."""
     for event in events:
         for panel in panels:
             panel.axvline(event.time_s, color="tab:red" if event.bad else "0.3", linewidth=0.7, linestyle=":")

@@ -41,12 +41,12 @@ class Selection:
         for pattern in self.signals:
             if not any(fnmatchcase(name, pattern) for name in recording.columns):
                 available = ", ".join(recording.columns)
-                raise RecordingError(f"{recording.paths[0]}: no signal {pattern!r}; there are {available}")
+                raise RecordingError(f"{recording.paths[0]}: no signal {pattern!r}; allowed: {available}")
         patterns = (*REQUIRED_SIGNALS, *self.signals)
         return tuple(name for name in recording.columns if any(fnmatchcase(name, pattern) for pattern in patterns))
 
     def read_blocks(self, recording: RecordedSignals, names: Sequence[str]) -> Generator[Rows]:
-        """Yield arrays (n, names) of the selected ticks, in order.
+        """Yield arrays (n, names) of the selected ticks, ascending.
 
         Raises RecordingError if a limited time span holds no tick.
         """

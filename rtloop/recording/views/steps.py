@@ -41,7 +41,7 @@ class StepMetrics:
 def step_metrics(
     reference_um: npt.NDArray[np.float64], position_um: npt.NDArray[np.float64], rate_hz: float
 ) -> StepMetrics | None:
-    """Metrics of the steps of a piecewise constant reference (n,) and its position (n,).
+    """Medians and worst cases over the steps of a piecewise constant reference (n,) with position (n,).
 
     None without a step of SMALLEST_DWELL_TICKS or more, or with more than MAX_STEPS changes of the reference.
     """
@@ -57,13 +57,13 @@ def step_metrics(
 def measure_steps(
     reference_um: npt.NDArray[np.float64], position_um: npt.NDArray[np.float64], rate_hz: float
 ) -> npt.NDArray[np.float64] | None:
-    """Return overshoot %, settling time ms, static error % of each step, (steps, 3), all ≥ 0.
+    """Return (steps, 3): overshoot (%), settling time (ms) and static error (%) of each step of the reference, all ≥ 0.
 
-    Settling is to ±5 % of the step's height about the level reached; that level is the mean of the last fifth. Where it
-    is further than that from the reference, the settling time is infinite and the overshoot NaN; likewise where the
-    position moves by less than SMALLEST_TRAVEL of the height, and then the static error is at least the fraction not
-    travelled. Steps of less than SMALLEST_DWELL_TICKS are left out. None without steps, or with more than MAX_STEPS
-    changes.
+    The level reached is the mean position over the last fifth of a step. Settling is to ±5 % of the step's height about
+    that level. If the level is further than this from the reference, the settling time is infinite and the overshoot
+    NaN; likewise if the position moves by less than SMALLEST_TRAVEL of the height, and then the static error is at
+    least the fraction not travelled. Steps of less than SMALLEST_DWELL_TICKS are left out. None if no step remains, or
+    with more than MAX_STEPS changes of the reference.
     """
     starts = np.flatnonzero(np.diff(reference_um) != 0) + 1
     if starts.size == 0 or starts.size > MAX_STEPS:

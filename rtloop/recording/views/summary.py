@@ -194,7 +194,10 @@ class RecordingTotals:
     """Sums, counts and histograms over the ticks of a recording."""
 
     def __init__(self, bands_um: dict[str, float | None], imported_units: dict[str, str]) -> None:
-        """`bands_um` maps each axis to its configured `settled_within_um`; `imported_units` maps signals to units."""
+        """Begin with no ticks of the axes in `bands_um`, with their `settled_within_um` (None: none is configured).
+
+        `imported_units` maps each imported signal to its unit.
+        """
         self.ticks, self.overruns, self.periods_missed = 0, 0, 0
         self.closed_ticks, self.saturated_ticks = 0, 0
         self.limited_ticks = dict.fromkeys(LIMIT_FLAGS, 0)
@@ -275,7 +278,7 @@ def _overview_span_s(readers: Sequence[Reader], totals: RecordingTotals) -> floa
 
 
 def _make_summary(readers: Sequence[Reader], totals: RecordingTotals) -> Summary:
-    """Return the summary of a run from its files, in order, and the sums over their ticks."""
+    """Return the summary of a run from `readers`, its files in order of the run, and `totals` over their ticks."""
     header, rate_hz = readers[0].header, float(readers[0].header["rate_hz"])
     events = [event for reader in readers for event in reader.events]
     ends = [reader.totals for reader in readers]
@@ -341,7 +344,7 @@ def _make_summary(readers: Sequence[Reader], totals: RecordingTotals) -> Summary
 
 
 def _bands_um(header: Header) -> dict[str, float | None]:
-    """Map each axis to `settled_within_um` of the recorded configuration; None if it states none."""
+    """Map each axis to its `settled_within_um` (µm) in the recorded configuration; None for an axis without it."""
     bands_um: dict[str, float | None] = dict.fromkeys(header["axes"])
     with suppress(tomllib.TOMLDecodeError, TypeError, AttributeError):
         for axis in tomllib.loads(header.get("configuration") or "").get("axis", ()):
@@ -352,7 +355,7 @@ def _bands_um(header: Header) -> dict[str, float | None]:
 
 
 def _sum_ticks(readers: Sequence[Reader], progress: ReportTicks | None) -> RecordingTotals:
-    """Sum up all ticks of all files, chunk by chunk; `progress` receives the number of ticks so far."""
+    """Sum up all ticks of all files, chunk by chunk; `progress` receives the number of ticks summed up."""
     header, axes = readers[0].header, readers[0].header["axes"]
     totals = RecordingTotals(_bands_um(header), header["imported"]["units"] if "imported" in header else {})
     names = [*COMMON, *(f"{axis}_{signal}" for axis in axes for signal in ("error_um", "drive_v", "position_um"))]

@@ -124,7 +124,7 @@ class ChunkFile:
 
     @property
     def end_bytes(self) -> int:
-        """Estimated size of the index in bytes."""
+        """Estimated size, in bytes, of the index that `write_end` would write."""
         return sum(len(chunk.record) for chunk in self._chunks)
 
     def is_in_place(self) -> bool:
@@ -171,7 +171,7 @@ class ChunkFile:
     def drop_last_chunk(self) -> dict[int, int]:
         """Remove the last chunk, of one or more. Returns its number of messages by channel id.
 
-        Raises OutputError if the file cannot be cut; the chunk no longer counts then, and the next write overwrites it.
+        Raises OutputError, with nothing changed, if the file cannot be cut.
         """
         chunk = self._chunks[-1]
         _, _, begin = index_record_span(chunk.record)
@@ -218,7 +218,7 @@ class ChunkFile:
             raise NotOnDisk(message, error.errno or 0) from None
 
     def close(self) -> None:
-        """Close the unfinished file, which stays; idempotent."""
+        """Close the file without finishing it; the file stays on the disk. Do nothing if it is closed already."""
         if self._fd >= 0:
             close_descriptor(self._fd)  # Errors do not matter: the data is synced.
             self._fd = -1
@@ -233,7 +233,8 @@ class ChunkFile:
     def _open(self) -> int:
         """Create and lock the file under a name that no program takes for a recording; replaces a leftover one.
 
-        Returns its descriptor. Raises OutputError if a recording of this name exists or another process has the lock.
+        Returns the file's descriptor. Raises OutputError if a finished or unfinished recording of this name exists,
+        another process has the lock, or the file cannot be created.
         """
         import fcntl  # Absent on Windows, where recordings are read and never written.
 
@@ -275,7 +276,7 @@ class ChunkFile:
         if has_final:
             raise OutputError(f"{self.path} exists already; a recording is never overwritten", errno.EEXIST)
         if has_part:
-            message = f"{self.part} is left from an unfinished run; `rtloop recover` completes it"
+            message = f"{self.part} exists already, left from an unfinished run; `rtloop recover` completes it"
             raise OutputError(message, errno.EEXIST)
 
     def _append(self, data: bytes) -> None:

@@ -156,7 +156,9 @@ def scan_chunks(source: McapSource, position: int = len(MAGIC)) -> tuple[list[Ch
             break
         next_offset = _next_chunk(source, position + 1)
         if next_offset is None:
-            problems.append(f"the file ends in the middle of a chunk: {source.size - position} bytes are left out")
+            problems.append(
+                f"the file ends in the middle of a chunk: its last {source.size - position} bytes are left out"
+            )
             break
         problems.append(f"bytes {position} to {next_offset} are damaged")
         position = next_offset

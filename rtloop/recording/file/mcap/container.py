@@ -121,8 +121,8 @@ def pack_index(channel: int, times: npt.ArrayLike, offsets: npt.ArrayLike) -> by
 def parse_chunk_head(data: bytes) -> ChunkHead:
     """Parse the beginning of a chunk record.
 
-    Raises DamagedChunk if it is cut off, its fields contradict each other, it is not zstd, or above
-    LARGEST_CHUNK_BYTES.
+    Raises DamagedChunk if `data` is cut off, its fields contradict each other, the compression is not zstd, or the
+    content has more than LARGEST_CHUNK_BYTES.
     """
     if len(data) < CHUNK_HEAD.size:
         raise DamagedChunk("cut off")
@@ -136,8 +136,8 @@ def parse_chunk_head(data: bytes) -> ChunkHead:
 def unpack_chunk(record: bytes) -> bytes:
     """Decompress a whole chunk record. Returns its content.
 
-    Raises DamagedChunk if it is cut off, its header or sizes are wrong, it cannot be decompressed, or its checksum
-    differs.
+    Raises DamagedChunk if it is cut off, its header or sizes are wrong, it has more than LARGEST_CHUNK_BYTES, it cannot
+    be decompressed, or its checksum differs.
     """
     head = parse_chunk_head(record)
     data = memoryview(record)[CHUNK_HEAD.size :]
@@ -207,7 +207,7 @@ def parse_summary(data: bytes) -> tuple[IndexedChunk, ...]:
     """
     (crc,) = struct.unpack_from("<I", data, len(data) - 4)
     if crc32(data[:-4]) != crc:
-        raise DamagedChunk("the checksum of the summary differs")
+        raise DamagedChunk("the checksum of the index at the end of the file is wrong")
     known_channels: dict[tuple[int, ...], tuple[int, ...]] = {}
     try:
         return tuple(

@@ -29,7 +29,7 @@ Item = tuple[Schema | None, Channel, Message]
 
 
 def read_messages(source: McapSource) -> Iterator[Item]:
-    """Yield (schema or None, channel, message) in the file's order.
+    """Yield (schema or None, channel, message) for every message, in the order of the file.
 
     Raises DamagedChunk if the rest is unreadable, RecordingError if the system cannot read the file.
     """
@@ -49,7 +49,7 @@ def read_messages(source: McapSource) -> Iterator[Item]:
 
 
 def library_name(source: McapSource) -> str:
-    """Name of the library that wrote the file, from the file's header; empty if the header is unreadable."""
+    """Name of the library that wrote the file, from the file's header; "" if the header is unreadable."""
     try:
         header = next(_records(source), None)
     except (*UNREADABLE, DamagedChunk):
@@ -68,7 +68,7 @@ def encoding(channel: Channel, schema: Schema | None) -> str:
 
 
 def describe_topics(counts: Counter[tuple[str, str]]) -> str:
-    """List the MAX_TOPICS most frequent topics as text; "no message" for empty `counts`.
+    """List the MAX_TOPICS most frequent topics, encoding and number of messages, as text; "no message" without any.
 
     `counts` has the number of messages by (topic, encoding).
     """
@@ -80,7 +80,7 @@ def describe_topics(counts: Counter[tuple[str, str]]) -> str:
 
 
 def _records(source: McapSource) -> Iterator[McapRecord]:
-    """Yield the records of the data section, and for a chunk its records.
+    """Yield the records of the data section; for a chunk, yield the records inside it instead.
 
     Raises DamagedChunk, or one of UNREADABLE, for damaged, oversized or unknown data.
     """
@@ -97,7 +97,8 @@ def _records(source: McapSource) -> Iterator[McapRecord]:
 def _decompress(chunk: Chunk) -> Chunk:
     """Return the chunk without compression; the stock reader would allocate as much memory as the file asks for.
 
-    Raises DamagedChunk above LARGEST_BYTES, for a wrong size, damaged data, or a compression other than zstd and lz4.
+    Raises DamagedChunk for a content above LARGEST_BYTES, a wrong size, damaged data, or a compression other than zstd
+    and lz4.
     """
     size = chunk.uncompressed_size
     if size > LARGEST_BYTES:

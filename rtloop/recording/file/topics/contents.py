@@ -40,7 +40,7 @@ def event_message(event: Event, start_unix_ns: int) -> Message:
 def may_hold_slow(entry: ChunkEntry, channel: int) -> bool:
     """Whether a chunk may hold messages of topic `channel`, which is not /ticks; True without an index.
 
-    For events, snapshots and the header, it is True for every chunk with a message of any of these topics.
+    If `channel` is events, snapshots or header, the result is True for a chunk with messages of any of these three.
     """
     if entry.index is None or channel == format.OVERVIEW:
         return may_hold(entry, channel)
@@ -50,7 +50,7 @@ def may_hold_slow(entry: ChunkEntry, channel: int) -> bool:
 def may_hold(entry: ChunkEntry, channel: int) -> bool:
     """Whether a chunk may hold messages of a channel; True without an index.
 
-    The index names the channels of a chunk; one that names none stands for ticks.
+    The index names the channels of a chunk; a chunk without named channels counts as one of ticks.
     """
     if entry.index is None:
         return True

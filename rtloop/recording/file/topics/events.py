@@ -74,9 +74,9 @@ def event_from_message(
 
 
 def trip_reason(message: np.void, axes: Sequence[str], laws: Sequence[str]) -> str | None:
-    """Describe axis, value and limit of a TRIPPED message, the failure of a law, or a lost heartbeat.
+    """Describe the trip of a TRIPPED message: axis, value and limit, the failure of a law, or a lost heartbeat.
 
-    None for another trip of the whole loop.
+    None for any other trip that has no single axis.
     """
     all_causes, value, limit, bit, number = (float(element) for element in message["values"][:5])
     axis, causes = int(message["axis"]), trip_causes(bit)
@@ -127,7 +127,10 @@ def name_problem(name: str) -> str | None:
     has_valid_characters = all(character in NAME_PUNCTUATION or category(character)[0] in "LMN" for character in name)
     if not 0 < len(name) <= MAX_NAME or not has_valid_characters or not name[0].isalnum() or name.endswith(" "):
         displayed = ascii(name[:MAX_NAME]) + "…" * (len(name) > MAX_NAME)
-        allowed = f"1 to {MAX_NAME} letters, digits, blanks and {NAME_PUNCTUATION.strip()}, a letter or digit first"
+        allowed = (
+            f"1 to {MAX_NAME} letters, digits, blanks and {NAME_PUNCTUATION.strip()}, a letter or digit first, no "
+            "blank last"
+        )
         return f"{displayed}; allowed: {allowed}"
     if name != OPERATOR and (is_member_name(Origin, name) or name.lower() == RECORDER):
         return f"{name!r} is reserved; allowed: a name that is not a number and none of {', '.join(RESERVED_NAMES)}"
@@ -179,9 +182,9 @@ def _origin_value(who: str) -> int:
 
 
 def _member_value(kinds: type[IntEnum], name: str) -> int:
-    """Number of the member `name` of the enumeration `kinds`, or the number of which `name` is the text.
+    """Number of the member `name` of the enumeration `kinds`, or the number that the text `name` states.
 
-    Raises ValueError if it is neither.
+    Raises ValueError if `name` is neither a member nor a number.
     """
     return int(kinds[name.upper()]) if name.upper() in kinds.__members__ else int(name)
 

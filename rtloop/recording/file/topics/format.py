@@ -144,7 +144,7 @@ def _text(field: int, value: bytes | str) -> bytes:
 
 
 def doubles_schema(name: str, columns: Sequence[str]) -> bytes:
-    """Serialised FileDescriptorSet of `rtloop.NAME` (proto2): column i is `optional double COLUMN = i + 1`."""
+    """Serialised FileDescriptorSet of `rtloop.NAME` (proto2): column i, from 0, is `optional double COLUMN = i + 1`."""
     fields = b"".join(
         _text(2, _text(1, column) + _number(3, number) + _number(4, 1) + _number(5, _DOUBLE))
         for number, column in enumerate(columns, start=1)

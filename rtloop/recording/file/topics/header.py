@@ -41,7 +41,7 @@ def header_payload(content: bytes) -> bytes:
             if opcode == Opcode.CHANNEL
         ]
     except (struct.error, ValueError, McapError):
-        raise DamagedChunk("the channels cannot be read") from None
+        raise DamagedChunk("the list of MCAP channels cannot be read") from None
     if [(channel.id, channel.topic) for channel in channels] not in OWN_CHANNELS:
         raise DamagedChunk("not a recording of rtloop: the file has other MCAP channels")
     return messages[0].payload

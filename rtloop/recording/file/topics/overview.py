@@ -69,7 +69,7 @@ class Overview:
     def __getitem__(self, name: str) -> Extremes:
         """Return least, largest and mean values of a signal by interval. Raises KeyError for an unknown name."""
         if name not in self._columns:
-            raise KeyError(f"no signal {name!r}; there are {', '.join(self._columns)}")
+            raise KeyError(f"no signal {name!r}; allowed: {', '.join(self._columns)}")
         return Extremes(*self._intervals[:, self._columns.index(name)].T)
 
     @property
@@ -84,7 +84,7 @@ class Overview:
 
     @property
     def time_s(self) -> Real:
-        """Deadline of each interval's first tick (n,), in s since the run's start; it jumps over missed periods."""
+        """Deadline of each interval's first tick (n,), in s since the start of the run; missed periods count too."""
         return self["deadline_ns"].least * 1e-9
 
     @property
@@ -157,7 +157,7 @@ def are_plausible(intervals: Intervals) -> npt.NDArray[np.bool_]:
 def tick_ranges(intervals: Intervals) -> list[Range]:
     """Return the ranges (first tick, count) that intervals (n, columns, 3: minimum, maximum, mean) cover.
 
-    The intervals must be in order; adjacent ones are merged.
+    The intervals must ascend by tick; adjacent ones are merged.
     """
     if not len(intervals):
         return []

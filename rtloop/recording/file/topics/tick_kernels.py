@@ -64,7 +64,7 @@ def first_fault(
     `numbers` (columns, n) has ticks in row 0, deadlines in row 1, then other whole numbers; `bounds` (columns, 2) their
     least and largest values; `log_times_ns` (2, n) two log times of each tick. Checks 0 … columns − 1: the column is
     whole and in bounds. The next two: tick and deadline are above those of the tick before. The last one: both log
-    times are equal, 0 … before `end_ns`, and after the deadline by the same time as in the first tick.
+    times are equal, from 0 to before `end_ns`, and after the deadline by the same time as in the first tick.
     Raises ValueError for other shapes, and without a tick.
     """
     columns, count = numbers.shape
@@ -109,10 +109,10 @@ def _first_fault(numbers_address, bounds_address, times_address, columns, count,
 def _take_out(
     content, count, size, starts_address, words_address, word_count, offsets_address, offset_count, out_address
 ):  # fmt: skip
-    """Copy words of `count` records, each `size` bytes long, as `RecordLayout.take_out` does.
+    """Copy words of `count` records, each `size` bytes long, to `out_address` as `RecordLayout.take_out` does.
 
-    Returns 1, or 0 at the first record with another fixed byte. The words at `words_address` are (2, word_count):
-    template and mask.
+    Returns 1, or 0 at the first record whose fixed bytes differ from the template. The words at `words_address` are
+    (2, word_count): template and mask; the offsets of these words in a record are at `starts_address`.
     """
     starts = carray(address_pointer(starts_address), word_count, np.int64)
     words = carray(address_pointer(words_address), (2, word_count), np.uint64)

@@ -70,7 +70,7 @@ class TickLayout:
         without a tick.
         """
         if len(content) % self._template.itemsize:
-            raise DamagedChunk("a block of ticks has a damaged length, which is no multiple of a tick's")
+            raise DamagedChunk("a block of ticks has a damaged length: no multiple of the length of a tick")
         fields = (*names, *self._integer_columns, *TIME_FIELDS)
         words = self._records.take_out(content, np.array([self._offsets[name] for name in fields]))
         if words is None:

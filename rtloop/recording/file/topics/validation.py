@@ -263,8 +263,8 @@ class _MessageDetails(_CheckedModel):
 def parse_header(payload: bytes) -> Header:
     """Parse the header in a message of `/configuration`.
 
-    Raises MalformedText if it is no JSON object, its format is newer, a field is missing or wrong, or a name comes
-    twice.
+    Raises MalformedText if it is no JSON object, its format is newer than FORMAT, a field is missing or wrong, or a
+    name comes twice in `axes`, `observed` or `columns`.
     """
     header = _parse_object(payload)
     number = header.get("format")
@@ -316,7 +316,7 @@ def header_extras(header: Header) -> Extras:
 
 
 def header_extra_channels(header: Header) -> dict[str, str]:
-    """Return the channel of each recorded extra input and output, by its name."""
+    """Return {name: channel of the driver} of the recorded inputs and outputs besides sensors and drives."""
     entries = header.get("extras", {})
     return {entry["name"]: entry["channel"] for kind in ("inputs", "outputs") for entry in entries.get(kind, ())}
 
@@ -367,7 +367,7 @@ def _require_command(kind: str, axis: str | None, values: list[float]) -> None:
     """
     first, *parameters = values
     if kind == "load_law" and axis is None:
-        raise MalformedText("axis: null; the command load_law needs the name of an axis")
+        raise MalformedText("event load_law: the field axis is null; allowed: the name of an axis")
     allowed_values = {"set_mode": [*Mode], "set_reference": [*Generator], "load_law": [0, 1]}.get(kind)
     if allowed_values and first not in allowed_values:
         numbers = ", ".join(f"{value:d}" for value in allowed_values)
@@ -395,7 +395,7 @@ def _command_value(value: object) -> float:
 
 
 def _parse_object(payload: bytes) -> dict[str, Any]:
-    """Parse a JSON object. Raises MalformedText for anything else."""
+    """Parse a JSON object. Raises MalformedText for any other content."""
     try:
         value = pydantic_core.from_json(payload, allow_inf_nan=False)
     except ValueError:
