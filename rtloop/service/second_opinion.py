@@ -1,7 +1,7 @@
 """Second opinion on the loop by python-control, before the service may first be armed.
 
 It is computed in a separate process once the loop runs: python-control takes more than a second to import. An
-agreement is stored in the cache folder, and the next start of the same loop computes nothing.
+agreement is stored in the cache folder, and the next start of the same loop uses it.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ class SecondOpinion:
             self._is_known.set()
 
     def require(self, activity: str) -> None:
-        """Wait for the end of `compute`. Raises Refusal, which names `activity`, with all disagreements if there are any.
+        """Wait for the end of `compute`. Raises Refusal, which names `activity`, with all disagreements, if any.
 
         Raises UnavailableError if `compute` has not ended after TIMEOUT_S.
         """

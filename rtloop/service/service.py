@@ -497,7 +497,7 @@ class Service:
         return thread
 
     def _recover_leftovers(self) -> None:
-        """Recover the unfinished recordings in the folder of recordings, such as those of a service that was killed.
+        """Recover the unfinished recordings in the folder of recordings, which services that were killed have left.
 
         Successes and failures are logged; a file that cannot be recovered stays.
         """

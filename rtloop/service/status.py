@@ -100,8 +100,8 @@ def timing(service: Service) -> dict[str, Any]:
 
 
 def newest_signals(service: Service) -> dict[str, Any]:
-    """Return {tick, mode, trip: causes, trip_reason, axes: {axis: {signal: value}}, condition: {axis: Condition}}, all
-    of the newest tick except `condition`, which is that of the last half second.
+    """Return {tick, mode, trip: causes, trip_reason, axes: {axis: {signal: value}}, condition: {axis: Condition}}: the
+    newest tick, and the condition of each axis over the last half second.
 
     `trip` is [] and `trip_reason` None without a trip. A signal that is not finite is None; an axis outside closed loop
     has no condition. Returns {} without a loop and before its first tick.

@@ -23,7 +23,7 @@ class ChangeHistory:
     """The last MAX_CHANGES changes."""
 
     def __init__(self) -> None:
-        """Begin without changes."""
+        """Begin without changes of any axis."""
         self._changes: deque[Change] = deque(maxlen=MAX_CHANGES)
 
     def add(self, change: Change) -> None:

@@ -56,7 +56,7 @@ class Player:
 
     @property
     def owns_reference(self) -> bool:
-        """Whether nobody else has set a reference of the axis since this player's last one, or since its start.
+        """Whether no other client has set a reference of the axis since this player's last one, or since its start.
 
         Waits until a reference that is being set has taken effect or was refused; a refused one does not count.
         """

@@ -62,8 +62,8 @@ def raised_cosine(start: float, end: float, count: int) -> Real:
 
 
 def ramp_ticks(live: LiveLaw) -> int:
-    """Return the duration in ticks, at least 2, of the ramp to the former references: that of the slowest axis, for
-    all axes.
+    """Return the duration in ticks, at least 2, of the ramp to the former references; the slowest axis determines it
+    for all axes.
     """
     plan, durations_s = live.prepared.plan, []
     safe_v = np.asarray(plan.coefficients)["safe_v"]

@@ -304,7 +304,7 @@ class Recovery:
         return True
 
     def remove_own_faults(self) -> None:
-        """Remove from the service's faults those of loops that ended or could not start and that the policy covers."""
+        """Remove from the service's faults each one that `accept_end` or `accept_failed_start` has accepted."""
         with self._guard:
             self._host.faults[:] = [fault for fault in self._host.faults if fault not in self._own_faults]
             self._own_faults.clear()
