@@ -211,8 +211,8 @@ class Connection:
         resonance_percent: float = 2.0,
         keep: bool = True,
     ) -> dict[str, Any]:
-        """Play one period of a scan, `samples` (µm, a tick a sample), again and again, first unchanged, then in `cycles`
-        cycles with a table that the error of the cycle before has corrected.
+        """Play one period of a scan, `samples` (µm, a tick a sample), again and again: first unchanged, then in
+        `cycles` cycles, each with a table that the error of the cycle before has corrected.
 
         Refused unless the error shrinks for every resonance within `resonance_percent` of the model's. Returns {cycles:
         [{rms_um, largest_um}, …], the error of each cycle; ended: reason; reference_um, command_um: lists of the best

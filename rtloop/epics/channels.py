@@ -90,7 +90,7 @@ class Channel(ChannelData):
             refusal = error
         except (CaprotoValueError, AttributeError, TypeError):  # No value, several, an acknowledgement of an alarm.
             allowed = ", ".join(self.variable.choices) or "a number"
-            refusal = RtloopError(f"not a value of this channel; allowed: {allowed}")
+            refusal = RtloopError(f"the written value is not a value of this channel; allowed: {allowed}")
         await self.report_write(self, "?" if user_address is None else user_address[0], refusal)
         if refusal is not None:
             raise refusal

@@ -37,7 +37,7 @@ class ChannelServer:
     """
 
     def __init__(self, connection: Connection, prefix: str, allows_control: bool, log: Callable[[str], None]) -> None:
-        """Make the channels of the loop as a whole, whose names begin with `prefix`; `refresh` reads the first status."""
+        """Make the channels of the loop as a whole, whose names begin with `prefix`; `refresh` reads a status."""
         self._connection, self._prefix, self._allows_control, self._log = connection, prefix, allows_control, log
         self.database: dict[str, Channel] = {}
         """Channels by name, which the server of caproto reads."""

@@ -71,8 +71,9 @@ def _host_errors() -> Iterator[None]:
     try:
         yield
     except OSError as error:
+        place = "" if error.filename is None else f"{error.filename}: "
         raise UnavailableError(
-            f"the operating system refuses a resource that the service needs: {error.strerror or error}"
+            f"the operating system refuses a resource that the service needs: {place}{error.strerror or error}"
         ) from error
     except RuntimeError as error:
         if THREAD_START_ERROR not in str(error):

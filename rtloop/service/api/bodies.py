@@ -67,7 +67,7 @@ class Body(BaseModel):
 
     @property
     def is_stop(self) -> bool:
-        """Whether the request brings the outputs to safe: such a request needs no lock."""
+        """Whether the request brings the outputs to safe, and so needs no lock; False unless a subclass differs."""
         return False
 
 
@@ -93,7 +93,7 @@ class ModeBody(Body):
 
     @property
     def is_stop(self) -> bool:
-        """Whether the mode is off."""
+        """Whether the mode is off, which brings the outputs to safe and needs no lock."""
         return self.mode == "off"
 
 
