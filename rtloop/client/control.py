@@ -174,8 +174,8 @@ class Client:
     def measure(self, resource: str, body: Mapping[str, object], timeout_s: float = LONGEST_MEASUREMENT_S) -> Any:
         """Post a measurement that moves `body["axis"]` and return the response.
 
-        After Ctrl-C the axis holds the value, µm, that its reference had at the call, and LoopFault is raised. If the
-        value is unknown or cannot be set, the message of the LoopFault states it. Raises also the errors of `post`.
+        After Ctrl-C the axis holds the value, µm, that its reference had at the call, and LoopFault is raised. If this
+        value is unknown or cannot be set, the LoopFault tells the user to set it. Raises also the errors of `post`.
         """
         axis = body["axis"]
         held_um = self.get("/status").get("axes", {}).get(axis, {}).get("reference_um")

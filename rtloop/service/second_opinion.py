@@ -101,8 +101,8 @@ def _faults(prepared: Prepared) -> list[str]:
 def _digest(prepared: Prepared) -> str:
     """Return a digest (24 hexadecimal digits) of the loops and of the code that computes them.
 
-    Of the loops it covers controllers, laws, delays, rate and the options of the axes, except UNCOMPARED, which do not
-    affect the compared quantities; of the code, MATHEMATICS and the version of python-control.
+    It covers the controllers, laws, delays and rate, the options of the axes except UNCOMPARED, which do not affect the
+    compared quantities, the source text of MATHEMATICS, and the version of python-control.
     """
     controllers = np.ascontiguousarray(np.asarray(prepared.plan.coefficients)["controller"])
     digest = hashlib.sha256(controllers.tobytes() + repr(prepared.configuration.laws).encode())

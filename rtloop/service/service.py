@@ -339,8 +339,8 @@ class Service:
         return 0
 
     def _run_loop(self, outputs_off: bool) -> RunResult:
-        """Run one loop from start to end and return its result. With `outputs_off`, it begins in mode off and stays
-        there, without its schedule.
+        """Run one loop from start to end and return its result. With `outputs_off` it has no schedule, begins in mode
+        off, and keeps this mode until a client or a recovery sets another one.
 
         Else a loop without a schedule depolarises and tares its axes as configured, then sets the configured mode.
         Stores the note of the hardware for `rtloop park`. Raises RtloopError, DriverError if the loop cannot start.

@@ -39,7 +39,7 @@ class Condition(Protocol):
     def find(self, values: Real, gap: bool) -> Indices:
         """Return the indices in `values` (n,), n > 0, that meet the condition, ascending; [] if none does.
 
-        `values` follow the values of the call before; with `gap`, ticks between these and those were lost.
+        `values` follow the values of the call before; with `gap`, ticks directly before `values` were lost.
         """
         ...
 
@@ -57,7 +57,7 @@ class Crossing:
     """
 
     def __init__(self) -> None:
-        """Begin without a sample before: a "fired" one meets the condition only after a "ready" one."""
+        """Begin without a sample: a "fired" sample meets the condition only after a "ready" one."""
         self._ready = False
 
     def find(self, is_ready: Mask, is_fired: Mask, gap: bool) -> Indices:

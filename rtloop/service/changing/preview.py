@@ -78,7 +78,7 @@ def running_check(prepared: Prepared, number: int) -> AxisCheck:
 def _tolerated_shift_percent(check: AxisCheck) -> list[float] | None:
     """Return [down ≤ 0, up ≥ 0]: the shifts of the plant's resonance, %, between which the loop stays stable.
 
-    The search ends at -50 % and +50 %, the result of a side on which the loop stays stable. None without a resonance.
+    An end is -50 or 50, where the search ends, if the loop stays stable up to there. None without a resonance.
     """
     resonance = None if check.plant is None else plant_changes(check.plant).get("resonance")
     if check.plant is None or resonance is None:

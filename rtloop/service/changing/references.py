@@ -92,8 +92,8 @@ class LiveReferences:
 
         Played once, the last sample is held. The second column, µm, is added to the command. Returns the tick of the
         first sample; does not wait for the others. Raises ConfigError for an unknown axis, and for samples that are
-        none, not finite, too many or beyond the limits; Refusal within `reserved`, after an unconfirmed table, and as
-        `Desk.submit`.
+        none, not finite, too many or beyond the limits; Refusal within `reserved` and while the loop may still read an
+        earlier table; else as `Desk.submit`.
         """
         if samples.size == 0 or not np.all(np.abs(samples) < USABLE_MAGNITUDE):
             raise invalid_request(
@@ -110,7 +110,8 @@ class LiveReferences:
         """Play `samples_v` (n,), V, once, a tick each, as the reference of axis `number`; the last one is held.
 
         The caller sets mode raw, in which the reference is the drive. Limits are not checked. Returns the tick of the
-        first sample. Raises ConfigError for too many samples, Refusal after an unconfirmed table, and as `Desk.submit`.
+        first sample. Raises ConfigError for too many samples, Refusal while the loop may still read an earlier table,
+        else as `Desk.submit`.
         """
         with self._service_change(number):
             return self._submit_table(number, [Generator.TABLE, 0, samples_v.size, 1.0, 0.0], samples_v)
@@ -120,7 +121,7 @@ class LiveReferences:
 
         `replaces` is the axis's entry of `client_counts` when the caller decided to play; ReferenceReplaced is raised
         if a client has set a reference since. Limits are not checked. Returns the tick of the first sample. Raises also
-        ConfigError for too many samples, Refusal after an unconfirmed table, and as `Desk.submit`.
+        ConfigError for too many samples, Refusal while the loop may still read an earlier table, else as `Desk.submit`.
         """
         count, columns = samples.shape
         with self._service_change(number, replaces):
@@ -263,9 +264,9 @@ class LiveReferences:
         """Start a generator on axis `number` and return its first tick; the staging lock must be held.
 
         Table samples go to shared memory. `values` and `samples` as `generator` returns them, `restores` as in `set`.
-        Raises ConfigError for values beyond limits.command_um (in raw mode: beyond the limits of the drive) and, except
-        in raw mode, for a constant one beyond the position interlock, and for too many samples; Refusal within
-        `reserved` and, with samples, after an unconfirmed table; else as `Desk.submit`.
+        Raises ConfigError for values beyond limits.command_um (in raw mode: beyond the limits of the drive), for a
+        constant reference beyond the position interlock (not in raw mode) and for too many samples; Refusal within
+        `reserved` and while the loop may still read an earlier table; else as `Desk.submit`.
         """
         if self._activity:
             raise Refusal(f"reference: {self._activity}; send the request again afterwards")
@@ -316,7 +317,8 @@ class LiveReferences:
         """Copy `samples` to the free one of the axis's two places in the shared table, play them, and return the tick.
 
         `values` as in `play`; `values[1]`, the index of the first sample, is set here. Raises ConfigError for too many
-        samples, Refusal after an unconfirmed table (`Staging.require_settled`), and as `Desk.submit`.
+        samples, Refusal while the loop may still read an earlier table (`Staging.require_settled`), else as
+        `Desk.submit`.
         """
         self._staging.require_settled()
         table, first_spare, axis_count = self._staging.block["table"], self._first_spare, len(self._active_places)

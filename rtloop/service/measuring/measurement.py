@@ -54,6 +54,7 @@ class MeasurementHistory:
     """Figures of the last MAX_MEASUREMENTS measurements of an axis: `LoopMeasurement.figures`, and `unix_time_s`."""
 
     def __init__(self) -> None:
+        """Begin without measurements."""
         self._figures: deque[dict[str, Any]] = deque(maxlen=MAX_MEASUREMENTS)
 
     def add(self, measurement: LoopMeasurement) -> None:
