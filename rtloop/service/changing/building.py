@@ -27,7 +27,7 @@ def prepare_limited(configuration: Configuration) -> Prepared:
 def figures_limited(configuration: Configuration, number: int, least_step_ms: float = 0.0) -> Figures:
     """Build a configuration and return `loop_figures` of axis `number`, both in the limited process.
 
-    The step response in them lasts at least `least_step_ms`. Raises as `prepare_limited`.
+    The step response of these figures lasts at least `least_step_ms`. Raises as `prepare_limited`.
     """
     return PROCESS.run(_prepare_figures, configuration, number, least_step_ms, compiles=_needs_compiler(configuration))
 
