@@ -45,7 +45,7 @@ class Connection:
     def status(self) -> dict[str, Any]:
         """The response of `/status`: among others `state`, `armed`, `faults` (sentences), `lock` (its holder, None if
         free), `recording`, `rate_hz`, `lateness_us`, and the newest signals: `tick`, `mode`, `trip` (causes) and
-        `axes`, {axis: {signal: value}}. Those from `rate_hz` on are missing without a loop.
+        `axes`, {axis: {signal: value}}. Without a loop, `recording` is {} and the keys after it are missing.
         """
         return self._client.get("/status")
 
@@ -69,9 +69,11 @@ class Connection:
         return self._client.watch()
 
     def take(self, emergency_key: str | None = None) -> dict[str, Any]:
-        """Take the lock, from another holder only with the emergency key; refused without it, or with a wrong one.
+        """Take the lock, or renew it. While another client holds it, refused without the emergency key; a wrong key is
+        always refused.
 
-        Returns the new holder: {name, since_unix_s, until_unix_s: end without a further command}, in s since 1970.
+        Returns the new holder: {name, since_unix_s: start, until_unix_s: end without a further command}, both times in
+        s since 1970.
         """
         return self._client.lock(emergency_key)
 
@@ -129,8 +131,8 @@ class Connection:
     def reference(self, axis: str, **settings: object) -> int:
         """Change the reference of an axis, as in [axis.reference]: `kind="sine", amplitude=5.0, frequency_hz=2.0`.
 
-        Keys that are left out have their defaults. Returns the first tick of the new reference. Refused beyond
-        the limits of the axis.
+        Keys that are left out have their defaults. Returns the first tick of the new reference. Refused beyond the
+        limits of the axis, and a constant reference also beyond its position interlock.
         """
         return self._command("/reference", axis=axis, reference=settings)
 
@@ -152,9 +154,10 @@ class Connection:
         return self._command("/waveform", **body, command_um=_floats(command_um))
 
     def tune(self, axis: str, section: str, **values: object) -> int:
-        """Change keys of [axis.SECTION], as in `"controller", gain=0.012`; verified first, then swapped bumplessly.
+        """Change keys of [axis.SECTION], as in `tune("x", "controller", gain=0.012)`. The service verifies the changed
+        law, then loads it bumplessly.
 
-        `section` is "controller", "limits", "interlocks", "prefilter" or "model". Returns the tick of the swap.
+        `section` is "controller", "limits", "interlocks", "prefilter" or "model". Returns the tick of the load.
         """
         return self._command("/tune", axis=axis, section=section, values=values)
 
@@ -162,24 +165,27 @@ class Connection:
         """Return {before, after}: figures of the axis's loop without and with a `tune`; changes nothing.
 
         Keys of each: crossover_hz, phase_margin_deg, gain_margin_db, modulus_margin, overshoot_percent, settling_ms,
-        static_error_percent, tolerated_shift_percent ([down ≤ 0, up ≥ 0]: the shift of the resonance within which the
-        loop is stable), step ({t_ms, y}) and problems (sentences). All but `problems` are None for an unstable loop or
-        a law that is not linear, and so is each figure that is not finite.
+        static_error_percent, tolerated_shift_percent ([down ≤ 0, up ≥ 0]: shifts of the resonance, %, between which the
+        loop is stable), step ({t_ms, y: response to a step of 1 µm, µm}) and problems (sentences). All but `problems`
+        are None for an unstable loop or a law that is not linear, and so is each figure that is not finite.
         """
         return self._client.post("/preview", {"axis": axis, "section": section, "values": values})
 
     def undo(self, axis: str) -> dict[str, Any]:
-        """Revert the last `tune` or `controller` of an axis bumplessly; the next call reverts the one before.
+        """Undo the newest `tune`, `controller` or `swap` of an axis, or of the axis that owns its shared controller,
+        bumplessly; the next call undoes the change before that. A `swap` counts as one change for each of its steps.
 
-        Returns {tick, undone: the change in words}. Refused if no change is left since the start or the last reload.
+        Returns {tick, undone: the change in words}. Refused if no change is left since the start of the loop or the
+        last reload.
         """
         return self._client.post("/undo", {"axis": axis})
 
     def controller(self, axis: str, controller: Mapping[str, object] | Path | str) -> int:
-        """Swap in another controller: an [axis.controller] as a mapping, or a configuration file that has one.
+        """Load another controller: an [axis.controller] as a mapping, or this axis's one in a configuration file.
 
-        The service verifies it, then swaps bumplessly. Returns the tick of the swap. Raises InputFileError for a file
-        that cannot be read, ConfigError for an invalid one or one without a controller for this axis.
+        The service verifies the controller, then loads it bumplessly. Returns the tick of the load. Raises
+        InputFileError for a file that cannot be read, ConfigError for an invalid one or one without a controller for
+        this axis.
         """
         section = controller if isinstance(controller, Mapping) else read_controller(Path(controller), axis)
         return self._command("/controller", axis=axis, controller=dict(section))
@@ -205,12 +211,13 @@ class Connection:
         resonance_percent: float = 2.0,
         keep: bool = True,
     ) -> dict[str, Any]:
-        """Play one period of a scan (µm, a tick a sample) again and again, and correct it by its error each cycle.
+        """Play one period of a scan, `samples` (µm, a tick a sample), again and again: first unchanged, then in
+        `cycles` cycles, each with a table that the error of the cycle before has corrected.
 
         Refused unless the error shrinks for every resonance within `resonance_percent` of the model's. Returns {cycles:
-        [{rms_um, largest_um} of the error, …], the first without correction, ended: reason, reference_um, command_um:
-        lists of the best table}. The best table keeps playing unless `keep` is False; then the axis returns to its old
-        reference. After Ctrl-C the axis holds its old reference, and LoopFault is raised.
+        [{rms_um, largest_um}, …], the error of each cycle; ended: reason; reference_um, command_um: lists of the best
+        table}. The best table keeps playing unless `keep` is False; then the axis returns to its old reference. After
+        Ctrl-C the axis holds its old reference, and LoopFault is raised.
         """
         body = {"axis": axis, "samples": _floats(samples), "cycles": cycles, "resonance_percent": resonance_percent}
         return self._client.measure("/learn", body | {"keep": keep})
@@ -231,8 +238,8 @@ class Connection:
     def swap(self, proposal: Proposal) -> int:
         """Replace the prefilter's taps of the axis of a proposal by the proposed ones, interpolated in several steps.
 
-        Returns the tick of the last step. Raises LoopFault if the taps in force changed since the proposal, RtloopError
-        if the service refuses a step; the steps before that one then stay in force.
+        Returns the tick of the last step. Raises LoopFault if the loop's taps have changed since the proposal,
+        RtloopError if the service refuses a step; the loop then keeps the taps of the step before.
         """
         from rtloop.client.retuning import swap_in
 
@@ -265,7 +272,9 @@ class Connection:
         return capture_span(self._client, seconds, trigger, at, pre_percent, timeout_s, folder)
 
     def _command(self, resource: str, **body: object) -> int:
-        """Post a command, JSON fields `body`, to `resource`. Returns its tick of effect; raises as `Client.post`."""
+        """Post a command, JSON fields `body`, to `resource`, such as "/stop". Returns the tick at which the command
+        took effect; raises as `Client.post`.
+        """
         return int(self._client.post(resource, body)["tick"])
 
 
@@ -285,7 +294,7 @@ def connect(service: str | Path | None = None, *, as_: str | None = None) -> Con
 
 
 def read_controller(config: Path, axis: str) -> dict[str, object]:
-    """Return as a dict the keys that a configuration file sets in [axis.controller] of an axis; defaults are left out.
+    """Return {key: value} of the keys that a configuration file sets in [axis.controller] of an axis, without defaults.
 
     Raises InputFileError for a file that cannot be read, ConfigError for an invalid one or one without this section.
     """

@@ -74,10 +74,14 @@ def _open_connection(path: Path) -> socket.socket:
 
 
 class UnansweredRequest(UnavailableError):
-    """No service answers at a control socket; `reason` gives the cause without the path, `remedy` the way on or ""."""
+    """No service answers at a control socket; `reason` is the cause without the path, `remedy` the user's next step, or
+    "".
+    """
 
     def __init__(self, path: Path, error: Exception) -> None:
-        """Derive reason and remedy from the `error` of the connection to `path`, of HTTP or of the WebSocket."""
+        """Set `reason` and `remedy`, and make the message, from `path`, the control socket, and `error`, which the
+        connection, HTTP or the WebSocket raised.
+        """
         self.remedy = "start the service with `rtloop serve CONFIG`"
         match error:
             case FileNotFoundError():
@@ -103,19 +107,24 @@ class Cancellation:
     """
 
     def __init__(self) -> None:
+        """Begin without a connection, not cancelled."""
         self._lock = threading.Lock()
         self._connection: socket.socket | None = None
         self._is_cancelled = False
 
     def attach(self, connection: socket.socket) -> None:
-        """Store the connection of the request; shut it down at once if `cancel` was called before. Thread-safe."""
+        """Store the connection of the request for `cancel`; shut the connection down at once if `cancel` was called
+        before. Thread-safe.
+        """
         with self._lock:
             self._connection = connection
             if self._is_cancelled:
                 _shut_down(connection)
 
     def cancel(self) -> None:
-        """Shut the connection down from any thread, now or once attached; the waiting thread gets UnansweredRequest."""
+        """Shut the attached connection down, now or once `attach` has stored it; from any thread. The thread that waits
+        in `Client.exchange` gets UnansweredRequest.
+        """
         with self._lock:
             self._is_cancelled = True
             if self._connection is not None:
@@ -132,7 +141,7 @@ class Client:
     """Sends requests to the service with the control socket `path`; commands are recorded under `name`."""
 
     def __init__(self, path: Path, name: str | None = None) -> None:
-        """Store path and name; each request opens a connection. `name` None: the service records its default name."""
+        """Store path and name; each request opens a connection. `name` None: the service records the name operator."""
         self.path, self._name = path, name
 
     def get(self, resource: str) -> Any:
@@ -142,9 +151,9 @@ class Client:
     def post(self, resource: str, body: Mapping[str, object] | None = None, timeout_s: float | None = None) -> Any:
         """Send POST with a JSON body, {} for None, and return the response: decoded JSON, or text if it is not JSON.
 
-        Without `timeout_s` it waits TIMEOUT_S for the response, BUILD_TIMEOUT_S where the service builds a law. Raises
-        UnavailableError if no service answers, HostRefusal for one that is not trusted, RtloopError with the service's
-        message if it refuses.
+        `timeout_s` None: waits up to TIMEOUT_S for the response, BUILD_TIMEOUT_S for BUILD_RESOURCES. Raises
+        UnavailableError if no service answers in this time, HostRefusal for a service that is not trusted, RtloopError
+        with the service's message if it refuses.
         """
         if timeout_s is None:
             timeout_s = BUILD_TIMEOUT_S if resource in BUILD_RESOURCES else TIMEOUT_S
@@ -155,17 +164,18 @@ class Client:
         return self._request("DELETE", resource, None)
 
     def lock(self, emergency_key: str | None = None) -> Any:
-        """Take the lock, with the emergency key also from another holder. Raises as `post`.
+        """Take the lock, or renew it; with the emergency key take it also from another holder. Raises as `post`.
 
-        Returns the holder as in `/status`: {name, since_unix_s, until_unix_s}, both times in s since 1970.
+        Returns the holder as in `/status`: {name, since_unix_s: start, until_unix_s: end without a further command},
+        both times in s since 1970.
         """
         return self.post("/lock", {} if emergency_key is None else {"emergency_key": emergency_key})
 
     def measure(self, resource: str, body: Mapping[str, object], timeout_s: float = LONGEST_MEASUREMENT_S) -> Any:
         """Post a measurement that moves `body["axis"]` and return the response.
 
-        After Ctrl-C the axis is set to the constant reference, µm, that it had at the call, and LoopFault is raised,
-        also where this fails; its message says so then. Raises the errors of `post`.
+        After Ctrl-C the axis holds the value, µm, that its reference had at the call, and LoopFault is raised. If this
+        value is unknown or cannot be set, the LoopFault tells the user to set it. Raises also the errors of `post`.
         """
         axis = body["axis"]
         held_um = self.get("/status").get("axes", {}).get(axis, {}).get("reference_um")
@@ -175,14 +185,14 @@ class Client:
             if held_um is None:
                 raise LoopFault(
                     f"the measurement was interrupted; the old reference of axis {axis} is unknown and was not "
-                    "restored; set a reference"
+                    f"restored; set a reference with `rtloop ctl setpoint {axis} VALUE`"
                 ) from None
             try:
                 self.post("/setpoint", {"axis": axis, "value": held_um})
             except RtloopError as error:
                 raise LoopFault(
                     f"the measurement was interrupted; the old reference of axis {axis}, {held_um:g} µm, could not be "
-                    f"restored; set this reference again: {error}"
+                    f"restored ({error}); set it again with `rtloop ctl setpoint {axis} {held_um:g}`"
                 ) from None
             raise LoopFault(f"the measurement was interrupted; axis {axis} holds {held_um:g} µm as before") from None
 

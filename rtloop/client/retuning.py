@@ -60,7 +60,9 @@ class MeasuredStage(NamedTuple):
 
 
 class Proposal(NamedTuple):
-    """New taps for an axis beside those in force, and a step of the measured stage with either."""
+    """New taps for an axis, the loop's present taps, `replaced`, and figures of a step of the measured stage with the
+    present (`before`) and with the new ones (`after`).
+    """
 
     axis: str
     stage: MeasuredStage
@@ -80,8 +82,8 @@ class Proposal(NamedTuple):
         """Return the proposal as plain values, as `rtloop ctl retune --json` prints it and `swap_in` takes it.
 
         Keys: resonance, percent_from_model, gain, gain_percent_from_model (fields of `stage`, the last two may be
-        None), before, after (dicts of step figures), better, settling_ms, replaces (the taps in force) and prefilter
-        (the new taps), both {taps, command_taps}.
+        None), before, after (dicts of step figures), better, settling_ms, replaces (the present taps of the loop) and
+        prefilter (the new taps), both {taps, command_taps}.
         """
         return {
             "resonance": self.stage.resonance,
@@ -98,12 +100,13 @@ class Proposal(NamedTuple):
 
 
 def propose_taps(client: Client, request: RetuneRequest) -> Proposal:
-    """Measure resonance and gain of an axis and design taps for them; the taps in force stay.
+    """Measure resonance and gain of an axis and design taps for them; the loop keeps its taps.
 
-    The loop moves for the measurement. A gain that was not measured, or not to GAIN_CERTAIN_PERCENT, is replaced by the
-    model's. Raises ConfigError for an axis or model that does not allow it, LoopFault if no resonance is found or a
-    measured value that is used is further than `bound_percent` from the model's, NoDesign if no taps meet the
-    specification, InputFileError for a specification that cannot be read, RtloopError if the service refuses.
+    The loop moves for the measurement. A gain that was not measured, or only with a standard deviation above
+    GAIN_CERTAIN_PERCENT, is replaced by the model's. Raises ConfigError for an axis or model that does not allow it,
+    LoopFault if no resonance is found or a measured value that is used is further than `bound_percent` from the
+    model's, NoDesign if no taps meet the specification, InputFileError for a specification that cannot be read,
+    RtloopError if the service refuses.
     """
     axis, subject, _ = load_subject(_running_configuration(client), request.axis, request.spec)
     stage = _measure_stage(client, request, subject)
@@ -126,11 +129,11 @@ def propose_taps(client: Client, request: RetuneRequest) -> Proposal:
 
 
 def swap_in(client: Client, axis: str, proposal: Mapping[str, Any]) -> int:
-    """Swap in the taps of `proposal` in STAGES stages, interpolated between old and new; return the last one's tick.
+    """Load the taps of `proposal` in STAGES stages, interpolated between old and new; return the last one's tick.
 
     Raises ConfigError if `axis` is unknown or `proposal` is no output of `rtloop ctl retune --json`
-    (`Proposal.for_json`), LoopFault if the taps in force differ from the ones that it replaces, RtloopError if the
-    service refuses a stage: the stages before it stay loaded.
+    (`Proposal.for_json`), LoopFault if the loop's taps are no longer the ones that the proposal replaces, RtloopError
+    if the service refuses a stage: the loop then keeps the taps of the stage before.
     """
     axes = {options.name: options for options in _running_configuration(client).axes}
     if (options := axes.get(axis)) is None:
@@ -200,7 +203,9 @@ def _require_near(quantity_text: str, percent: float, bound_percent: float) -> N
 
 def _is_better(subject: Subject, before: StepMeasures, after: StepMeasures) -> bool:
     """Return whether the new taps are better: they settle sooner by more than 1/PROOF_POINTS of a tick, or the old ones
-    exceed the specification's overshoot or the limits of the command v, and the new ones do so less or not at all.
+    exceed the specification's overshoot or limits of the command, and the new ones do so less or not at all.
+
+    `before` and `after` are the steps with the old and with the new taps.
     """
     point_ms = 1e3 * subject.controller.period_s / PROOF_POINTS
     return (
@@ -213,7 +218,8 @@ def _is_better(subject: Subject, before: StepMeasures, after: StepMeasures) -> b
 def _running_configuration(client: Client) -> Configuration:
     """Return the configuration of the service's running loop, with the changes since its start.
 
-    Raises RtloopError without a loop or service, ConfigError if the configuration is not valid here.
+    Raises RtloopError without a loop or service, ConfigError if the configuration is not valid in this process, such as
+    for another version of rtloop.
     """
     response = client.get("/configuration")
     text = write_section("", response["values"])
@@ -221,7 +227,7 @@ def _running_configuration(client: Client) -> Configuration:
 
 
 def _read_taps(values: dict[str, list[float]]) -> Taps:
-    """Return the taps in the rows `taps` and `command_taps` of `values`, as `taps_values` makes them; overshoot 0.
+    """Return Taps with the rows `taps` and `command_taps` of `values`, a result of `taps_values`, and overshoot 0.
 
     Raises KeyError, TypeError or ValueError for other values.
     """
@@ -242,9 +248,9 @@ def _taps_in_force(axis: AxisOptions) -> Taps:
 
 
 def _interpolate_taps(old: Taps, new: Taps, part: float) -> Taps:
-    """Return (1 − part)·old + part·new, with the weight `part` from 0 to 1 and the overshoot of `new`.
+    """Return the taps (1 − part)·old + part·new, with the weight `part` from 0 to 1 and the overshoot of `new`.
 
-    Shorter rows count as continued with zeros.
+    All rows are padded with zeros at the end to one length.
     """
     rows = (
         (1 - part) * old_row + part * new_row
@@ -261,7 +267,8 @@ def _pad_rows(*rows: np.ndarray) -> list[np.ndarray]:
 
 
 def _step_at_gain_bounds(stage: MeasuredStage, subject: Subject, taps: Taps) -> StepMeasures | None:
-    """Return the larger value of each figure in two steps with `taps`, the gain off by ± its standard deviation.
+    """Return the larger value of each figure of two steps with `taps`: one with the measured gain plus its standard
+    deviation, one with the gain minus it.
 
     None if the model's gain is used. Raises NoDesign if a loop with such a gain is unstable.
     """

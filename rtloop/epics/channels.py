@@ -1,4 +1,4 @@
-"""Channels of Channel Access: they show values with an alarm, and pass what a client writes to a function."""
+"""Channels of Channel Access: they show values with an alarm, and pass a client's written value to a function."""
 
 from __future__ import annotations
 
@@ -40,9 +40,9 @@ class Channel(ChannelData):
     _shown: tuple[object, ...] = ()
 
     async def show(self, value: object, mode: str | None) -> None:
-        """Show a value that the service reported in `mode`, as a MAJOR alarm if it is the variable's `alarm`.
+        """Show a value that the service reported in `mode`, with a MAJOR alarm if it is the variable's `alarm`.
 
-        None: unknown; the channel keeps the last value, with the alarm INVALID.
+        `value` None: unknown; the channel keeps the last value, with the alarm INVALID.
         """
         unit = unit_in_mode(self.variable, mode)
         if value is None:
@@ -57,7 +57,9 @@ class Channel(ChannelData):
         await self._show(value, AlarmStatus.COMM, AlarmSeverity.INVALID_ALARM, None)
 
     async def _show(self, value: Any, status: AlarmStatus, severity: AlarmSeverity, unit: str | None) -> None:
-        """Send value, alarm and unit to the subscribers unless they are shown already; None leaves value or unit."""
+        """Send value, alarm and, for a number, unit to the subscribers, unless all are shown already; `value` or `unit`
+        None keeps the shown one.
+        """
         shown = (value, status, severity, unit)
         if shown == self._shown:
             return
@@ -73,9 +75,11 @@ class Channel(ChannelData):
 
     async def auth_write(self, hostname: str, username: str, data: object, data_type: ChannelType, metadata: object, *,
                          flags: int = 0, user_address: tuple[str, int] | None = None) -> None:  # fmt: skip
-        """Pass a client's value to `writer`, and report the outcome; alarms and limits that it sends are dropped.
+        """Convert a client's value, pass it to `writer`, and report the outcome to `report_write`; alarms and limits
+        that the client sends are dropped.
 
-        Raises Forbidden for a channel that is read only, RtloopError for a refused value: the client receives its text.
+        Raises Forbidden for a channel that is read only; RtloopError, whose text the client receives, for a value that
+        does not suit the channel or that the service refuses.
         """
         if self.writer is None:
             raise Forbidden(f"{self.name} is read only")
@@ -86,21 +90,22 @@ class Channel(ChannelData):
             refusal = error
         except (CaprotoValueError, AttributeError, TypeError):  # No value, several, an acknowledgement of an alarm.
             allowed = ", ".join(self.variable.choices) or "a number"
-            refusal = RtloopError(f"not a value of this channel; allowed: {allowed}")
+            refusal = RtloopError(f"the written value is not a value of this channel; allowed: {allowed}")
         await self.report_write(self, "?" if user_address is None else user_address[0], refusal)
         if refusal is not None:
             raise refusal
 
     async def write(self, value: object, **_: object) -> None:
-        """Pass a converted value to `writer`; called by `write_from_dbr`. The value shown comes from the service alone.
+        """Pass a client's value to `writer`, without showing it: the shown value comes from the service alone.
 
-        Raises RtloopError for a refused value, CaprotoValueError for several values.
+        Called by caproto's `write_from_dbr`. No effect without a writer. Raises RtloopError for a refused value,
+        CaprotoValueError for several values.
         """
         if self.writer is not None:
             await self.writer(self, self.from_client(self.preprocess_value(value)))
 
     def from_client(self, value: Any) -> object:
-        """Return a client's value as the service's requests have it: unchanged, unless a subclass converts it."""
+        """Return a client's value in the form that `writer` expects: unchanged, unless a subclass converts it."""
         return value
 
 
@@ -135,7 +140,7 @@ class TextChannel(Channel, ChannelChar):
     """A channel with a text of at most TEXT_BYTES bytes of UTF-8, as an array of characters."""
 
     async def _show(self, value: str | None, status: AlarmStatus, severity: AlarmSeverity, unit: str | None) -> None:
-        """Show the text on one line, cut to TEXT_BYTES."""
+        """Show the text on one line, its line breaks as spaces, cut to TEXT_BYTES; else as `Channel._show`."""
         if value is not None:
             value = " ".join(value.split()).encode()[:TEXT_BYTES].decode(errors="ignore")
         await super()._show(value, status, severity, unit)

@@ -26,7 +26,7 @@ from rtloop.errors import RtloopError, UnavailableError, one_line_error
 
 PERIOD_S = 0.1
 SILENT_S = 3.0
-"""Time without an answer after which a service counts as gone; a refused connection counts at once."""
+"""Time without an answer after which a service counts as gone; after a refused connection it counts so at once."""
 NICE = 10
 
 
@@ -37,6 +37,7 @@ class ChannelServer:
     """
 
     def __init__(self, connection: Connection, prefix: str, allows_control: bool, log: Callable[[str], None]) -> None:
+        """Make the channels of the loop as a whole, whose names begin with `prefix`; `refresh` reads a status."""
         self._connection, self._prefix, self._allows_control, self._log = connection, prefix, allows_control, log
         self.database: dict[str, Channel] = {}
         """Channels by name, which the server of caproto reads."""
@@ -68,7 +69,9 @@ class ChannelServer:
             await asyncio.sleep(PERIOD_S)
 
     async def refresh(self) -> None:
-        """Read the status of the service once, and show it; without an answer all channels become INVALID."""
+        """Read the status of the service once, and show it; after an error, or SILENT_S without an answer, make all
+        channels INVALID.
+        """
         async with self._refresh_lock:
             reading = asyncio.get_running_loop().run_in_executor(self._reader, lambda: self._connection.status)
             try:
@@ -81,9 +84,9 @@ class ChannelServer:
                 await self.show_status(status)
 
     async def show_status(self, status: Status) -> None:
-        """Show a response of `/status` in all channels; an axis that is new gets its channels.
+        """Show a response of `/status` in all channels, and add the channels of an axis that has none yet.
 
-        The first response after a loss is logged.
+        The first response after a time without an answer is logged.
         """
         if self._lost_text:
             self._log("the service answers")
@@ -102,7 +105,7 @@ class ChannelServer:
             await channel.show_lost(text if channel.variable is self._message else channel.variable.lost)
 
     async def _send(self, channel: Channel, value: object) -> None:
-        """Send the request of a written value to the service: a stop at once, others after those before them.
+        """Send the request of a written value to the service: a stop at once, any other one after the earlier ones.
 
         Raises RtloopError for a refusal.
         """
@@ -114,13 +117,17 @@ class ChannelServer:
         await (self._requests.stop(request) if is_stop else self._requests.execute(request))
 
     async def _report_write(self, channel: Channel, address: str, refusal: RtloopError | None) -> None:
-        """Log the outcome of a write, show it in MESSAGE, and refresh: a finished write shows its effect."""
+        """Log the outcome of a write by the client at `address`, show its refusal in MESSAGE ("" for None), and refresh
+        all channels, so that they show its effect.
+        """
         self._refusal_text = "" if refusal is None else f"{channel.name}: {' '.join(str(refusal).split())}"
         self._log(f"written by {address}: {self._refusal_text or f'{channel.name}: done'}")
         await self.refresh()
 
     def close(self) -> None:
-        """End the threads, and release the lock if clients could take it; a refusal of the release is ignored."""
+        """Withdraw the requests that have not begun, let the threads end, and release the lock if clients may write; an
+        RtloopError of the release is ignored.
+        """
         self._requests.close()
         self._reader.shutdown(wait=False, cancel_futures=True)
         if self._allows_control:
@@ -154,7 +161,9 @@ def serve(
 async def _serve(
     connection: Connection, prefix: str, interface: str, allows_control: bool, log: Callable[[str], None]
 ) -> None:
-    """Serve until a signal cancels this task; raises as `serve`, with the exceptions of caproto."""
+    """Serve until SIGINT or SIGTERM. Raises CaprotoError or OSError if the address cannot be used or a variable EPICS_…
+    of the environment is invalid.
+    """
     channels = ChannelServer(connection, prefix, allows_control, log)
     context = Context(channels.database, [interface])
 
@@ -165,7 +174,7 @@ async def _serve(
         await channels.update()
 
     def log_broken_connection(_: object, report: dict[str, Any]) -> None:
-        """Log why caproto stopped to serve a connection, such as bytes that break the protocol."""
+        """Log why caproto has stopped serving a connection, such as bytes that break the protocol."""
         log(f"connection: {one_line_error(report['exception']) if 'exception' in report else report['message']}")
 
     loop = asyncio.get_running_loop()

@@ -21,9 +21,9 @@ STOPS = {("MODE", MODES[Mode.OFF]), ("STOP", EXECUTE)}
 class Variable(NamedTuple):
     """One channel: the prefix and `suffix` are its name.
 
-    `choices` makes it an enumeration, `is_text` a long text, neither a double. `read` returns its value in a status,
-    None where it is unknown. `request` sends a written value to the service; None: read only. The value `alarm` is a
-    MAJOR alarm. While no service answers the channel shows `lost`, or with None its last value.
+    With `choices` the channel is an enumeration, with `is_text` a long text, else a double. `read` returns its value in
+    a status, None for an unknown one. `request` sends a written value to the service; None: read only. The value
+    `alarm` is a MAJOR alarm. While no service answers, the channel shows `lost`, or with None its last value.
     """
 
     suffix: str
@@ -38,13 +38,16 @@ class Variable(NamedTuple):
 
 
 def axis_variables(axis: str) -> tuple[Variable, ...]:
-    """Return position, reference, error, drive and setpoint of an axis; its name and ":" begin their suffixes.
+    """Return the variables POSITION, REFERENCE, ERROR, DRIVE and SETPOINT of an axis; the axis's name and ":" begin
+    their suffixes. Only SETPOINT can be written.
 
-    Reference and setpoint are in V in mode raw (`unit_in_mode`).
+    Reference and setpoint are in V in mode raw (`unit_in_mode`), else in µm.
     """
 
     def signal(name: str) -> Callable[[Status], float | None]:
-        """Return a function that returns a signal of the axis, None without a loop or where it is not finite."""
+        """Return a function that returns the signal `name` of the axis from a status, None without a loop or for a
+        value that is not finite.
+        """
         return lambda status: status.get("axes", {}).get(axis, {}).get(name)
 
     def set_setpoint(loop: Connection, value: float) -> int:
@@ -70,7 +73,7 @@ def unit_in_mode(variable: Variable, mode: str | None) -> str:
 
 
 def _read_cause(status: Status) -> str:
-    """Return the cause of a trip and the latched faults as one text; "" without any."""
+    """Return the reason of a trip, or else its causes, and the latched faults as one text; "" without any."""
     reasons = [status.get("trip_reason") or ", ".join(status.get("trip", ())), *status.get("faults", ())]
     return "; ".join(dict.fromkeys(reason for reason in reasons if reason))
 
@@ -79,7 +82,7 @@ def _command(suffix: str, send: Callable[[Connection], object]) -> Variable:
     """Return the variable of a command: EXECUTE sends it, and the channel always shows IDLE."""
 
     def request(loop: Connection, value: str) -> object:
-        """Send the command. Raises RtloopError for any value but EXECUTE."""
+        """Send the command. Raises RtloopError for any value but EXECUTE, and for a refusal of the service."""
         if value != EXECUTE:
             raise RtloopError(f"the written value is {value}; allowed: {EXECUTE} (1)")
         return send(loop)

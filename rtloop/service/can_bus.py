@@ -87,9 +87,8 @@ def can_supervision(service: Service) -> Iterator[None]:
 
 
 def _require_frames(frames: Mapping[str, Frame], options: BusOptions) -> None:
-    """Raise ValueError, which names the DBC file, unless `frames`, by name, have all REPORTS and COMMANDS.
-
-    Each must have its number of signals, too.
+    """Raise ValueError, which names the DBC file, unless `frames`, by name, has each frame of REPORTS and COMMANDS with
+    as many signals as listed there.
     """
     for name, signal_names in (REPORTS | COMMANDS).items():
         allowed = f"allowed: a message {name} with the signals {', '.join(signal_names)}"
@@ -123,7 +122,7 @@ class CanSupervision:
     def send_frames(self) -> None:
         """Send Status and Heartbeat with the periods of the DBC, and Trip when a trip begins, until `end_event` is set.
 
-        A frame that cannot be sent is logged and lost.
+        A frame that cannot be sent is lost, and logged as `_log_warning` does.
         """
         due_s = dict.fromkeys(("Status", "Heartbeat"), time.monotonic())
         beat_count, is_tripped = 0, False
@@ -146,7 +145,9 @@ class CanSupervision:
                     due_s[name] = now_s + self._frames[name].cycle_s
 
     def receive_frames(self) -> None:
-        """Execute received command frames until `end_event` is set; ignore other frames, and log errors of the bus."""
+        """Execute received frames of COMMANDS until `end_event` is set; ignore other frames, and log errors of the bus
+        without ending.
+        """
         while not self.end_event.is_set():
             try:
                 message = self._bus.recv(POLL_S)
@@ -228,7 +229,7 @@ class CanSupervision:
             self._log_warning(f"cannot be written: {error}")
 
     def _log_warning(self, text: str) -> None:
-        """Log `text` behind the bus's name as a warning; within LOG_PERIOD_S of the last one it is dropped."""
+        """Log `text` as a warning that begins with the bus's label; drop it within LOG_PERIOD_S after the last one."""
         now_s = time.monotonic()
         if now_s - self._logged_s >= LOG_PERIOD_S:
             self._logged_s = now_s

@@ -36,9 +36,9 @@ THREAD_START_ERROR = "can't start new thread"
 def serve(config: Path, duration_s: float | None = None, name: str | None = None) -> int:
     """Serve a configuration until SIGTERM or SIGINT, or until a loop has run for `duration_s`. Returns the exit code.
 
-    SIGHUP reloads; the handlers replace the process's own, and log messages go to stderr. `name` is the service's name
-    in place of the file's. Raises RtloopError and DriverError; UnavailableError if the system refuses a resource, such
-    as a file, a socket or a thread.
+    SIGHUP reloads the file. The handlers of these signals replace the process's own, and log messages go to stderr.
+    `name` is the service's name in place of the file's. Raises RtloopError and DriverError; UnavailableError if the
+    system refuses a resource, such as a file, a socket or a thread.
     """
     with _host_errors():
         _log_to_stderr()
@@ -46,7 +46,9 @@ def serve(config: Path, duration_s: float | None = None, name: str | None = None
 
 
 def _serve(config: Path, duration_s: float | None, name: str | None) -> int:
-    """Do the work of `serve` once log messages go to stderr; also raises OSError and RuntimeError of the system."""
+    """Do the work of `serve`, except that log messages must go to stderr already, and that OSError and RuntimeError of
+    the system are raised as they are.
+    """
     service = Service(config, duration_s, name)
     for signal_number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(signal_number, lambda *_: service.end())
@@ -63,12 +65,15 @@ def _serve(config: Path, duration_s: float | None, name: str | None) -> int:
 
 @contextlib.contextmanager
 def _host_errors() -> Iterator[None]:
-    """Raise UnavailableError in place of OSError and of the RuntimeError for a thread that cannot be started."""
+    """Raise UnavailableError in place of an OSError of the work within, and of its RuntimeError for a thread that
+    cannot be started.
+    """
     try:
         yield
     except OSError as error:
+        place = "" if error.filename is None else f"{error.filename}: "
         raise UnavailableError(
-            f"the operating system refuses a resource that the service needs: {error.strerror or error}"
+            f"the operating system refuses a resource that the service needs: {place}{error.strerror or error}"
         ) from error
     except RuntimeError as error:
         if THREAD_START_ERROR not in str(error):
@@ -99,8 +104,8 @@ def _bind(path: Path, mode: int) -> socket.socket:
     """Return a listening socket at `path` with permissions `mode` and, if possible, the folder's group.
 
     Missing folders are made (FOLDER_MODE); the socket of a service that died is removed. Raises UnavailableError if
-    another service listens there, the path is no socket or the system refuses, HostRefusal for a folder that another
-    user owns or may change.
+    another service listens at `path`, the path is no socket or the system refuses, HostRefusal for a folder that
+    another user owns or may change.
     """
     listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
     try:
@@ -130,9 +135,9 @@ def _bind(path: Path, mode: int) -> socket.socket:
 
 
 def _remove_stale_socket(path: Path) -> None:
-    """Remove the socket of a service that has died; without a file at `path`, do nothing.
+    """Remove the socket of a service that has died from `path`; no effect without a file at this path.
 
-    Raises UnavailableError if the path is no socket or a service listens there, OSError if the system refuses.
+    Raises UnavailableError if the path is no socket or a service listens at it, OSError if the system refuses.
     """
     try:
         if not stat.S_ISSOCK(path.lstat().st_mode):

@@ -1,7 +1,7 @@
 """The desk: sends commands to the loop; the event that the loop writes for a command is its acknowledgement.
 
-Callers do not wait for each other. A command without acknowledgement in time is withdrawn: it has either taken effect
-or been refused, never both.
+Callers do not wait for each other. A command without acknowledgement in time is withdrawn, so that it cannot take
+effect after its refusal. If the loop has taken the command already, UnconfirmedCommand states that it may take effect.
 """
 
 from __future__ import annotations
@@ -105,9 +105,9 @@ class Desk:
         self._changes: OrderedDict[int, str] = OrderedDict()
 
     def change_text(self, identity: int) -> str | None:
-        """Return in words the change of a law that a command made; `identity` is the number in the command's event.
+        """Return in words the change of a law for which the command with `identity`, the number in its event, was sent.
 
-        None if the command changed no law, and after MAX_CHANGES later changes.
+        None if that command was sent for no change of a law, and after MAX_CHANGES later changes.
         """
         return self._changes.get(identity)
 
@@ -119,8 +119,8 @@ class Desk:
         `axis` is a number from 0, by default all axes; `kind` and `values` as in `Kind`, or a Note, which the loop only
         records; `change` describes a change of a law in words, for `change_text`. Raises Refusal if the requester has
         no permission (a stop and a reset need none, unless `may_always_stop` is False), or without an acknowledgement
-        in time (the command is withdrawn); RefusedByLoop if the loop refuses it; UnconfirmedCommand if the loop took it
-        and stands still; QueueFull if too many commands wait for the loop.
+        in time (the command is withdrawn); RefusedByLoop if the loop refuses the command; UnconfirmedCommand if the
+        loop took the command and stands still; QueueFull if too many commands wait for the loop.
         """
         requester = current_requester()
         command = message(cast(Kind, kind), axis=axis, origin=requester.origin, values=values)
@@ -162,11 +162,12 @@ class Desk:
             time.sleep(POLL_S)
         if withdraw(self._block, position):
             raise Refusal(
-                f"{kind.name.lower()}: the loop did not answer within {timeout_s:g} s; the command is withdrawn"
+                f"{kind.name.lower()}: the loop did not answer within {timeout_s:g} s; the command is withdrawn; "
+                "try again, and see `rtloop doctor` if the loop stands still"
             )
         raise UnconfirmedCommand(
             f"{kind.name.lower()}: the loop has taken the command and stands still; "
-            "the command takes effect if the loop goes on"
+            "the command takes effect if the loop continues"
         )
 
     def _await_tick(self, tick: int, deadline: float) -> None:

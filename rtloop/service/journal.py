@@ -43,14 +43,16 @@ class Journal(logging.Handler):
             time.sleep(0.001)
 
     def _write(self) -> None:
-        """Write queued lines for ever; a note follows lost lines, and lines for a closed pipe are dropped."""
+        """Write queued lines for ever. A note after a line states how many lines were lost since the last note; lines
+        for a closed pipe are dropped.
+        """
         while True:
             line = self._lines.get()
             self.acquire()  # `handle` holds this lock around `emit`.
             lost_count, self._lost_count = self._lost_count, 0
             self.release()
             if lost_count:
-                line = f"{line}\n({lost_count} lines of the log are lost here, since stderr was not read)"
+                line = f"{line}\n({lost_count} lines of the log are lost here, because stderr was read too slowly)"
             data = line.encode(errors="replace") + b"\n"
             try:
                 while data:

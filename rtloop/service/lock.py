@@ -1,7 +1,8 @@
 """The lock of a service: one named requester at a time sends commands, and many watch.
 
-The first command of a name takes the lock, or an explicit request; it is free after LOCK_TIMEOUT_S without a command.
-It avoids conflicts between operators and is no access control: a client of the control socket may use any name.
+The first command of a name takes a free lock, and so does the request `/lock`. The lock is free again after
+LOCK_TIMEOUT_S without a command of its holder. It avoids conflicts between operators and is no access control: a client
+of the control socket may use any name.
 """
 
 from __future__ import annotations
@@ -46,7 +47,9 @@ class Lock:
 
     @property
     def holder(self) -> dict[str, object] | None:
-        """{name, since_unix_s, until_unix_s: end without a further command}, in s since 1970; None for a free lock."""
+        """{name, since_unix_s: start, until_unix_s: end if the holder sends no further command}, times in s since 1970;
+        None for a free lock.
+        """
         with self._guard:
             holder = self._current_holder()
             if holder is None:
@@ -56,7 +59,9 @@ class Lock:
             return {"name": holder.name, "since_unix_s": round(since_s, 3), "until_unix_s": round(until_s, 3)}
 
     def take(self, name: str) -> None:
-        """Take the lock for `name`, or restart its LOCK_TIMEOUT_S. Raises Refusal while another name holds it."""
+        """Take the lock for `name`, or, if `name` holds it, restart its LOCK_TIMEOUT_S. Raises Refusal while another
+        name holds the lock.
+        """
         with self._guard:
             self._take(name)
 
@@ -92,10 +97,11 @@ class Lock:
 
     @contextmanager
     def hold(self, name: str, origin: Origin = Origin.OPERATOR) -> Iterator[None]:
-        """Take the lock, let it not expire during the work within, and send the work's commands under `name`.
+        """Take or renew the lock for `name`, keep it from expiring during the work within, and let this work send its
+        commands under `name`.
 
-        `origin` is the commands' origin in the recording. The lock stays taken afterwards, for LOCK_TIMEOUT_S without a
-        command. Raises Refusal while another name holds it; so does a command within, once another name has taken it.
+        `origin` is the commands' origin in the recording. Afterwards the lock stays taken for LOCK_TIMEOUT_S. Raises
+        Refusal while another name holds the lock; so does a command within, once another name has taken the lock.
         """
         with self._guard:
             holder = self._take(name)
@@ -141,8 +147,7 @@ class Lock:
         return self._holder
 
     def _remaining_s(self, holder: _LockHolder) -> float:
-        """Return the time until the lock is free without a further command, s; 0 or less once it has expired.
-
-        During a request of the holder it is LOCK_TIMEOUT_S.
+        """Return the time, s, after which the lock is free if its holder sends no further command; 0 or less once the
+        lock has expired, LOCK_TIMEOUT_S during a request of the holder.
         """
         return LOCK_TIMEOUT_S if holder.active_requests else LOCK_TIMEOUT_S - (self._now_s() - holder.last_command_s)

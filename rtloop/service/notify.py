@@ -43,9 +43,10 @@ class Notifier:
             self.send(WATCHDOG_USEC=round(limit_s * 1e6))
 
     def is_due(self, period_s: float, now_s: float) -> bool:
-        """Return True, and begin a new period, if `period_s` have passed since the last True; also at the first call.
+        """Return True, and begin a period of `period_s`, at the first call and once the last period has passed; else
+        return False.
 
-        For periodic notifications; `now_s` is a monotonic time.
+        `now_s` is a monotonic time; all callers share one period.
         """
         if now_s < self._next_s:
             return False

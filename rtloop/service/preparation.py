@@ -67,7 +67,8 @@ def await_ticks(supervisor: Supervisor, count: int, rate_hz: float, raw_from_tic
     """Wait until `count` more ticks were executed. Raises Refusal after a trip, and after 1 s plus TIMEOUT_FACTOR times
     the time that the ticks take at `rate_hz`.
 
-    With `raw_from_tick`, raises Refusal also if a tick after that one has another mode than raw: a client set it.
+    With `raw_from_tick`, raises Refusal also if a tick after `raw_from_tick` is not in mode raw, because another mode
+    was requested.
     """
     final_tick, limit_s = supervisor.ticks + count, 1.0 + TIMEOUT_FACTOR * count / rate_hz
     start_s = time.monotonic()
@@ -108,7 +109,7 @@ def _require_progress(supervisor: Supervisor, start_s: float, limit_s: float) ->
 
 
 def _mean_inputs_v(supervisor: Supervisor, count: int, axis_count: int) -> list[float]:
-    """Wait for `count` ticks, at most half of the ring's length, and return the mean reading (ADC) of each axis, V.
+    """Wait for `count` ticks, at most half of the ring's length, and return the mean reading of each axis in them, V.
 
     The axes are in the order of their numbers. Raises as `await_ticks`.
     """

@@ -1,7 +1,7 @@
 """Second opinion on the loop by python-control, before the service may first be armed.
 
-It is computed in a process of its own once the loop runs: python-control takes more than a second to import. An
-agreement is stored in the cache folder, and the next start of the same loop computes nothing.
+It is computed in a separate process once the loop runs: python-control takes more than a second to import. An
+agreement is stored in the cache folder, and the next start of the same loop uses it.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ class SecondOpinion:
         """Compare the loops of all axes with python-control's, unless an agreement on the same loops is stored.
 
         Sets `faults`, and stores an agreement in the cache folder. A comparison that cannot be made is logged, and
-        counts as an agreement that is not stored.
+        counts as an agreement, which is not stored. Lets `require` return in any case.
         """
         try:
             path = CACHE_FOLDER / f"loops-{_digest(prepared)}.agreed"
@@ -62,9 +62,9 @@ class SecondOpinion:
             self._is_known.set()
 
     def require(self, activity: str) -> None:
-        """Wait for the end of `compute`. Raises Refusal, which names `activity`, with all disagreements.
+        """Wait for the end of `compute`. Raises Refusal, which names `activity`, with all disagreements, if any.
 
-        Raises UnavailableError after TIMEOUT_S.
+        Raises UnavailableError if `compute` has not ended after TIMEOUT_S.
         """
         if not self._is_known.wait(TIMEOUT_S):
             raise UnavailableError(
@@ -78,7 +78,7 @@ class SecondOpinion:
 
 
 def _compare(prepared: Prepared) -> list[str]:
-    """Return `_faults` of a running plan, computed in a process that ends with this call; [] for an agreement.
+    """Return `_faults` of `prepared`, computed in a separate process that ends with this call; [] for an agreement.
 
     Raises RtloopError or DriverError if the process ends, takes too long or cannot compare.
     """
@@ -90,17 +90,19 @@ def _compare(prepared: Prepared) -> list[str]:
 
 
 def _faults(prepared: Prepared) -> list[str]:
-    """Return python-control's disagreements on the loops of a plan, a sentence each; [] for an agreement."""
+    """Return the disagreements between rtloop's and python-control's figures of the loops of `prepared`, a sentence
+    each; [] for an agreement.
+    """
     from rtloop.configuration.second_opinion import faults_on_models
 
     return faults_on_models(prepared)
 
 
 def _digest(prepared: Prepared) -> str:
-    """Return a digest (24 hexadecimal digits) of the numbers and options of the loops, and of the code that compares.
+    """Return a digest (24 hexadecimal digits) of the loops and of the code that computes them.
 
-    Options without an effect on the compared quantities, UNCOMPARED, are left out. The code is MATHEMATICS and the
-    version of python-control.
+    It covers the controllers, laws, delays and rate, the options of the axes except UNCOMPARED, which do not affect the
+    compared quantities, the source text of MATHEMATICS, and the version of python-control.
     """
     controllers = np.ascontiguousarray(np.asarray(prepared.plan.coefficients)["controller"])
     digest = hashlib.sha256(controllers.tobytes() + repr(prepared.configuration.laws).encode())

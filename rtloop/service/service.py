@@ -82,10 +82,12 @@ class Service:
     """
 
     def __init__(self, config: Path, duration_s: float | None = None, name: str | None = None) -> None:
-        """Load the configuration file; no loop runs before `run`. The outputs are armed unless service.arm is set.
+        """Load the configuration file `config`; no loop runs before `run`. The outputs are armed unless service.arm is
+        set.
 
-        `duration_s` None: until `end`. `name` None: the stem of the file's name. Raises ConfigError for an invalid file
-        and for a schedule with options that exclude one, InputFileError for a file that cannot be read.
+        `duration_s` None: the service runs until `end`. `name` None: the stem of the file's name. Raises ConfigError
+        for an invalid file and for a schedule with options that exclude one, InputFileError for a file that cannot be
+        read.
         """
         self.config, self._name = config, name
         self.configuration: Configuration = load(config, name)
@@ -133,9 +135,9 @@ class Service:
 
     @property
     def state(self) -> State:
-        """The present state, derived from record, faults and `armed`.
+        """The present state, derived from the newest record, faults, the death of the loop's process and `armed`.
 
-        Before a loop's first tick it is TRIPPED if there are faults, else STARTING.
+        Without a loop, and before its first tick, it is TRIPPED if there are faults, else STARTING.
         """
         row = self._latest_row()
         if row is None:
@@ -150,7 +152,9 @@ class Service:
 
     @property
     def _has_died(self) -> bool:
-        """Whether the present loop's process has died; parking its outputs was tried, its files may be unfinished."""
+        """Whether the present loop's process has died; its outputs are parked, if this was possible, and its files may
+        be unfinished.
+        """
         supervisor = self.supervisor  # the loop may end in another thread meanwhile
         return supervisor is not None and supervisor.error is not None
 
@@ -175,25 +179,25 @@ class Service:
         """The desk of the running loop. Raises Refusal without a loop, or before its first tick."""
         desk = self._desk
         if desk is None or self._latest_row() is None:
-            raise Refusal(f"no loop is running: the state of the service is {self.state}")
+            raise Refusal(f"no loop is running: the state of the service is {self.state}; try again when a loop runs")
         return desk
 
     def require_live(self) -> LiveLaw:
         """Return the law of the loop, for its live changes. Raises Refusal without a loop."""
         live = self.live
         if live is None:
-            raise Refusal(f"no loop is running: the state of the service is {self.state}")
+            raise Refusal(f"no loop is running: the state of the service is {self.state}; try again when a loop runs")
         return live
 
     def ctl(self, command: str) -> str:
-        """Return the command line of `rtloop ctl` for this service in backticks, with --name if the service has one.
+        """Return, in backticks, the command line of `rtloop ctl` with `command`, such as "start", for this service.
 
-        `command` is such as "start".
+        The line has --name if the service was started with a name.
         """
         return f"`rtloop ctl {command}`" if self._name is None else f"`rtloop ctl --name {self._name} {command}`"
 
     def arm(self) -> None:
-        """Allow `start` and `set_mode`; no output moves.
+        """Set `armed`, so that `start` and `set_mode` may drive the outputs; no output moves yet.
 
         The first call may wait for the second opinion. Raises Refusal while tripped, and as `SecondOpinion.require`.
         """
@@ -203,18 +207,18 @@ class Service:
         self.armed = True
 
     def start(self) -> int:
-        """Set the configured mode. Returns the tick at which it took effect; raises as `set_mode`."""
+        """Set the configured mode, loop.mode. Returns the tick at which it took effect; raises as `set_mode`."""
         return self.set_mode(self.configuration.loop.mode)
 
     def set_mode(self, mode: str) -> int:
         """Change the mode bumplessly, and return the tick at which it took effect.
 
-        `mode` is the name of a Mode in lower case, such as "closed_loop"; else KeyError. A reference in µm is
-        meaningless in volts: on entry to and exit from mode raw, the present output is held. In a loop that is tripped
-        or stops, mode off changes no output: all are safe, or ramp there. Raises Refusal while tripped or not armed
-        (mode off is allowed then, too), while the actuator is prepared (off is allowed, and the loop is not started
-        then), without a loop, where the driver refuses the writes of a ramp, and as `Desk.submit`. Any accepted mode,
-        and off, end a recovery.
+        `mode` is the name of a Mode, such as "closed_loop"; else KeyError. A reference in µm is meaningless in volts:
+        on entry to and exit from mode raw, the present output is held. In a loop that is tripped or stops, mode off
+        changes no output: all are safe, or ramp to safe. Raises Refusal for any mode but off while tripped, while not
+        armed and while the actuator is prepared; after mode off in the preparation, the configured mode is not set.
+        Raises Refusal also without a loop and for mode off if the driver refuses every write, and as `Desk.submit`. A
+        mode that is not refused for the first three reasons ends a recovery.
         """
         target_mode = Mode[mode.upper()]
         self._require_permission(target_mode)
@@ -225,7 +229,7 @@ class Service:
         return self._enter(target_mode)
 
     def _require_permission(self, mode: Mode) -> None:
-        """Raise Refusal for a mode that drives, while the service is tripped or not armed."""
+        """Raise Refusal for any mode but off while the service is tripped or not armed."""
         if mode is not Mode.OFF and self.state is State.TRIPPED:
             raise Refusal(f"mode {mode.name.lower()}: the service is tripped; use reset first ({self.ctl('reset')})")
         if mode is not Mode.OFF and not self.armed:
@@ -234,8 +238,9 @@ class Service:
     def _enter(self, mode: Mode) -> int:
         """Change the mode bumplessly, without the checks of `set_mode`. Returns the tick at which it took effect.
 
-        Mode off in a loop that is tripped or stops has no effect, and returns the tick of the loop's refusal. Raises
-        Refusal without a loop, and for mode off if the driver refuses every write; else as `Desk.submit`.
+        Mode off in a loop that is tripped or stops has no effect, and returns the tick at which the loop refused it.
+        Raises Refusal without a loop, and for mode off in such a loop if the driver refuses every write; else as
+        `Desk.submit`.
         """
         try:
             return self.desk.submit(Kind.SET_MODE, values=[float(mode), 0.0, 1.0])
@@ -263,7 +268,7 @@ class Service:
         """Clear latched trips and faults; the outputs stay off, and the service is disarmed if service.arm is set.
 
         Returns the tick at which the trip was cleared. Raises Refusal unless tripped, or without a loop, and as
-        `Desk.submit`; if the loop refuses, the faults stay, but a recovery under way has ended.
+        `Desk.submit`; after an error of the loop the faults stay, but a recovery under way has ended.
         """
         if self.state is not State.TRIPPED:
             raise Refusal(f"reset: there is no trip; the state of the service is {self.state}")
@@ -327,14 +332,18 @@ class Service:
             if self.recovery.accept_end(result.outcome, fault):
                 self._latch_and_wait(fault)
             elif not self._latch_and_allow_restart(fault):
-                raise LoopFault(f"the loop ended too often and is not started again: {'; '.join(self.faults)}")
+                raise LoopFault(
+                    "the loop ended too often (service.restarts within service.restart_window_s) and is not started "
+                    f"again: {'; '.join(self.faults)}"
+                )
         return 0
 
     def _run_loop(self, outputs_off: bool) -> RunResult:
-        """Run one loop from start to end. Returns its result. `outputs_off`: it begins in mode off, without schedule.
+        """Run one loop from start to end and return its result. With `outputs_off` it has no schedule, begins in mode
+        off, and keeps this mode until a client or a recovery sets another one.
 
-        Else a loop without schedule depolarises and tares its axes as configured and sets the mode. Stores the note of
-        the hardware for `rtloop park`. Raises RtloopError, DriverError if the loop cannot start.
+        Else a loop without a schedule depolarises and tares its axes as configured, then sets the configured mode.
+        Stores the note of the hardware for `rtloop park`. Raises RtloopError, DriverError if the loop cannot start.
         """
         with Processes(block_path(self.configuration.name)) as processes:
             prepared = prepare(self.configuration)
@@ -372,8 +381,8 @@ class Service:
     def _watch(self, supervisor: Supervisor) -> RunResult:
         """Poll the supervisor until the loop has ended, and return the result of the run.
 
-        Executes requests for end and reload, requests the end after the service's duration, follows the loop's
-        references, notifies systemd, logs changes.
+        Executes requests for end and reload, requests the end after the service's duration, follows the loop's events,
+        notifies systemd, logs changes of the state, gaps of the recording and removed recordings.
         """
         logged_state: State | None = None
         gaps, logged_removals = GapReporter(supervisor.block), 0
@@ -424,10 +433,10 @@ class Service:
     def _notify_systemd(self, supervisor: Supervisor) -> None:
         """Send systemd the messages that are due; called at every poll.
 
-        READY is sent once, after READY_TICKS; then two threads judge the loop and, later, start the limited process.
-        WATCHDOG and STATUS are sent periodically, WATCHDOG not while the ticks stand still, unless the loop has ended
-        or was ordered to end. The first ticks of a loop restore the watchdog's time, which is START_TIMEOUT_S while a
-        loop is restarted.
+        READY is sent once, after READY_TICKS; then one thread judges the loop, and another one starts the limited
+        process after BUILDER_PAUSE_S. WATCHDOG and STATUS are sent periodically, WATCHDOG not while the ticks stand
+        still, unless the loop has ended or was ordered to end. The first ticks of a loop restore the watchdog's time,
+        which is START_TIMEOUT_S while a loop is restarted.
         """
         if not self._is_ready and supervisor.ticks >= READY_TICKS:
             self._is_ready = True
@@ -488,7 +497,7 @@ class Service:
         return thread
 
     def _recover_leftovers(self) -> None:
-        """Recover the unfinished recordings in the folder of recordings, as of services that were killed.
+        """Recover the unfinished recordings in the folder of recordings, which services that were killed have left.
 
         Successes and failures are logged; a file that cannot be recovered stays.
         """
@@ -503,7 +512,7 @@ class Service:
     def _prepare_and_start(self) -> None:
         """Depolarise and tare the actuator, then set the configured references and mode; runs in its own thread.
 
-        A mode that a client requests meanwhile, such as off, takes the place of the configured one. An RtloopError is
+        A mode that a client requests meanwhile, such as off, is set in place of the configured one. An RtloopError is
         added to `faults` and logged, unless a client requested a mode or the service ends. No effect without a loop.
         """
         supervisor, live, desk = self.supervisor, self.live, self._desk
@@ -544,8 +553,8 @@ class Service:
             prepare_builder()
 
     def _judge_loop(self, prepared: Prepared) -> None:
-        """Have python-control check the loop (`second_opinion`). A disagreement stops the loop's outputs, as `stop`
-        does, and is latched in `faults`.
+        """Compute the second opinion on the loop of `prepared`, by python-control. A disagreement ramps the outputs to
+        safe, as `stop` does, is logged, and is latched in `faults`.
         """
         self.second_opinion.compute(prepared)
         if not self.second_opinion.faults:
@@ -561,7 +570,7 @@ class Service:
     def _apply_reload(self) -> None:
         """Do the work of `reload_now` and notify systemd before and after it.
 
-        An RtloopError or DriverError is logged; its text names the axes that were changed already.
+        An RtloopError or DriverError is logged, not raised; its text names the axes that were changed already.
         """
         self.notifier.send(RELOADING=1, MONOTONIC_USEC=time.monotonic_ns() // 1000)
         try:
@@ -574,7 +583,7 @@ class Service:
     def _reuse_loaded_laws(self, configuration: Configuration) -> Configuration:
         """Return `configuration` with the laws loaded at the start: compiled code cannot change in a running service.
 
-        Raises Refusal if it needs a law that was not loaded, or whose text has changed since.
+        Raises Refusal if the configuration needs a law that was not loaded, or whose text has changed since.
         """
         loaded = self.configuration.laws
         if missing_kinds := [law.kind for law in configuration.laws if law not in loaded]:
@@ -588,10 +597,10 @@ class Service:
         """Read the configuration file again and apply it to the loop, after any reload in progress.
 
         Returns {changed: ["axis.NAME", …]}, the axes that changed, [] if none or without a loop. Raises ConfigError,
-        InputFileError, DriverError, UnavailableError if it takes too long, Refusal if it needs a restart or the loop
-        refuses; see `LiveLaw.replace_all` for a refusal after some axes were changed.
+        InputFileError, DriverError, UnavailableError if the build takes too long, Refusal if a change needs a restart
+        or the loop refuses; see `LiveLaw.replace_all` for a refusal after some axes were changed.
         """
-        with self._reload_lock:  # One at a time: the file that was read last stays in force.
+        with self._reload_lock:  # One at a time: the file that was read last is the one that the loop has.
             configuration = self._reuse_loaded_laws(load(self.config, self._name))
             prepared: Prepared = prepare_limited(configuration)
             live = self.live
@@ -604,7 +613,7 @@ class Service:
 def _is_driver_error(error: Exception) -> bool:
     """Return whether `error`, with which a loop did not start, counts as a driver that could not be opened.
 
-    True for a DriverError, and for any error with the exit code of UnavailableError: the loop's process reports its
-    driver's errors so.
+    True for a DriverError, and for any error with the exit code of UnavailableError, with which the loop's process
+    reports the errors of its driver.
     """
     return isinstance(error, DriverError) or getattr(error, "exit_code", None) == UnavailableError.exit_code

@@ -50,7 +50,7 @@ def status(service: Service) -> dict[str, object]:
 
 
 def _reason_without_signals(service: Service) -> str:
-    """Return why a status has no tick and no axes."""
+    """Return, in words, why a status has no newest signals: the first loop, or the next one, has no tick yet."""
     if service.results:
         return "the last loop has ended, and the next loop has not executed a tick yet"
     return "the loop has not executed a tick yet"
@@ -75,10 +75,11 @@ def running_configuration(service: Service) -> dict[str, object]:
 
 
 def timing(service: Service) -> dict[str, Any]:
-    """Return {rate_hz, lateness_us: {p50, p99, max}, overruns, periods_missed} over the last WINDOW_TICKS.
+    """Return {rate_hz, lateness_us: {p50, p99, max}, overruns, periods_missed} over the newest ticks, at most
+    WINDOW_TICKS.
 
-    `overruns` counts the ticks that ended after the next deadline, `periods_missed` the periods without a tick. Returns
-    {} without a loop and before the second tick.
+    `overruns` counts the ticks that ended after the next tick was due, `periods_missed` the periods without a tick.
+    Returns {} without a loop and before the second tick.
     """
     rows = None if service.supervisor is None else service.supervisor.newest(WINDOW_TICKS)
     if rows is None or len(rows) < 2:
@@ -99,10 +100,11 @@ def timing(service: Service) -> dict[str, Any]:
 
 
 def newest_signals(service: Service) -> dict[str, Any]:
-    """Return {tick, mode, trip: causes, trip_reason, axes: {axis: {signal: value}}, condition: {axis: Condition}}.
+    """Return {tick, mode, trip: causes, trip_reason, axes: {axis: {signal: value}}, condition: {axis: Condition}}: the
+    newest tick, and the condition of each axis over the last half second.
 
     `trip` is [] and `trip_reason` None without a trip. A signal that is not finite is None; an axis outside closed loop
-    has no condition. {} without a loop and before its first tick.
+    has no condition. Returns {} without a loop and before its first tick.
     """
     supervisor = service.supervisor
     row = None if supervisor is None else supervisor.latest()

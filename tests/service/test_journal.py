@@ -47,7 +47,7 @@ def test_a_full_pipe_holds_nobody_up_and_what_was_lost_is_counted(pipe):
     written = [int(number) for number in re.findall(r"^line (\d)$", output, re.MULTILINE)]
     lost = [
         int(lines)
-        for lines in re.findall(r"^\((\d+) lines of the log are lost here, since stderr", output, re.MULTILINE)
+        for lines in re.findall(r"^\((\d+) lines of the log are lost here, because stderr", output, re.MULTILINE)
     ]
     assert written == sorted(set(written))
     assert lost

@@ -88,7 +88,7 @@ def test_what_one_axis_refused_is_not_noted_and_comes_with_the_next_reload(live)
 def test_a_part_that_needs_a_restart_is_named_as_in_the_file(live, old: str, new: str, place: str):
     assert old in TEXT
     changed = prepare(parse(TEXT.replace(old, new, 1), "lab", DEPLOY, "lab.toml"), paced=False)
-    with pytest.raises(Refusal, match=rf"^{place}: changed in the file; restart the service$"):
+    with pytest.raises(Refusal, match=rf"^{place}: changed in the configuration file; restart the service to apply"):
         live.replace_all(changed)
 
 

@@ -1,9 +1,9 @@
 """Trigger conditions: they find the ticks at which a signal meets them, in batches of any length.
 
-A condition receives batches (n,) of its signal in order and returns the indices of the ticks that meet it, ascending.
-It stores the end of one batch for the next. After lost ticks it reports only a change that the first tick behind them
-still shows: it may miss a trigger, but never invents one. NaN meets no condition. The first tick of a run meets none,
-because the value before it is unknown.
+A condition receives batches (n,) of its signal, oldest first, and returns the indices of the ticks that meet it,
+ascending. It stores the end of one batch for the next. After lost ticks it reports only a change that the first tick
+after them still shows: it may miss a trigger, but never invents one. NaN meets no condition. The first tick of a run
+meets no condition on a change, because the value before it is unknown.
 """
 
 from __future__ import annotations
@@ -39,14 +39,14 @@ class Condition(Protocol):
     def find(self, values: Real, gap: bool) -> Indices:
         """Return the indices in `values` (n,), n > 0, that meet the condition, ascending; [] if none does.
 
-        `values` follow the values of the call before. `gap`: ticks between the two were lost.
+        `values` follow the values of the call before; with `gap`, ticks directly before `values` were lost.
         """
         ...
 
     def is_exact(self, index: int, gap: bool) -> bool:
         """Return whether the change at `index` of a batch happened at that very tick.
 
-        False only for index 0 with `gap`: the change may have happened in the ticks that were lost before the batch.
+        False only for index 0 with `gap`, as in `find`: the change may have happened in the lost ticks before it.
         """
         return not (gap and index == 0)
 
@@ -57,14 +57,14 @@ class Crossing:
     """
 
     def __init__(self) -> None:
-        """Begin as after a sample that was neither "ready" nor "fired"."""
+        """Begin without a sample: a "fired" sample meets the condition only after a "ready" one."""
         self._ready = False
 
     def find(self, is_ready: Mask, is_fired: Mask, gap: bool) -> Indices:
         """Return the indices at which `is_fired` is True for the first time after `is_ready` was True, ascending.
 
-        Both masks are (n,) and never True together; the detector continues from the batch before. With `gap`, ticks
-        before this batch were lost: the state before them counts only if `is_fired` holds at index 0.
+        Both masks are (n,), n > 0, and never True together; the detector continues from the batch before. With `gap`,
+        ticks between the two batches were lost: the state before them counts only if `is_fired` holds at index 0.
         """
         indices = np.flatnonzero(is_ready | is_fired)
         if gap and not is_fired[0]:
@@ -94,9 +94,10 @@ class Edge(Condition):
         self._falling = Crossing() if slope != Slope.RISING else None
 
     def find(self, values: Real, gap: bool) -> Indices:
-        """Return the indices, ascending, in `values` (n,) at which the level is reached in the chosen slope.
+        """Return the indices, ascending, in `values` (n,) of the ticks at which the source reaches the level in the
+        direction of the slope, after it was more than the hysteresis away on the other side.
 
-        `gap`: ticks before `values` were lost.
+        With `gap`, ticks directly before `values` were lost.
         """
         level, hysteresis, indices = self._level, self._hysteresis, []
         if self._rising is not None:
@@ -122,9 +123,9 @@ class Window(Condition):
         self._exit_crossing = Crossing()
 
     def find(self, values: Real, gap: bool) -> Indices:
-        """Return the indices, ascending, in `values` (n,) of the first tick outside the band after a tick inside.
+        """Return the indices, ascending, in `values` (n,) of each first tick outside the band after a tick inside.
 
-        `gap`: ticks before `values` were lost.
+        With `gap`, ticks directly before `values` were lost.
         """
         is_outside = (values < self._low) | (values > self._high)
         return self._exit_crossing.find(~is_outside & ~np.isnan(values), is_outside, gap)
@@ -137,9 +138,9 @@ class ChangeCondition(Condition):
     """Last sample of the batch before, (1,); None before the first."""
 
     def _previous_values(self, values: npt.NDArray, gap: bool = False) -> npt.NDArray:
-        """Return the sample before each one of a batch, (n,), and store the last one for the next batch.
+        """Return the sample before each sample of `values`, (n,), and store the last of `values` for the next call.
 
-        The first of all samples, and after a `gap` the first of the batch, counts as its own predecessor.
+        The first of all samples, and with `gap` the first of `values`, counts as its own predecessor.
         """
         first = values[:1] if self._last is None or gap else self._last
         self._last = values[-1:].copy()
@@ -154,7 +155,7 @@ class Tripped(ChangeCondition):
     def find(self, values: Real, gap: bool) -> Indices:
         """Return the indices of ticks whose flags in `values` have a trip cause that the tick before did not have.
 
-        `gap` is not used: after lost ticks the last read tick counts as the one before.
+        `gap` has no effect: after lost ticks the last tick that was read counts as the tick before.
         """
         causes = values.astype(np.int64) & TRIP_MASK
         return np.flatnonzero(causes & ~self._previous_values(causes))
@@ -166,7 +167,10 @@ class ModeChanged(ChangeCondition):
     source = COMMON_SIGNALS[MODE].name
 
     def find(self, values: Real, gap: bool) -> Indices:
-        """Return the indices in `values` of the first tick in each new mode; `gap` is not used, as in `Tripped`."""
+        """Return the indices in `values` of the ticks whose mode differs from the mode of the tick before.
+
+        `gap` has no effect: after lost ticks the last tick that was read counts as the tick before.
+        """
         return np.flatnonzero(values != self._previous_values(values))
 
 
@@ -176,7 +180,7 @@ class Late(Condition):
     source = COMMON_SIGNALS[PERIODS_MISSED].name
 
     def find(self, values: Real, gap: bool) -> Indices:
-        """Return the indices of the ticks with missed periods in `values`; `gap` is not used."""
+        """Return the indices in `values`, the missed periods of each tick, that are above 0; `gap` has no effect."""
         return np.flatnonzero(values > 0)
 
     def is_exact(self, index: int, gap: bool) -> bool:
@@ -198,8 +202,8 @@ class Stepped(ChangeCondition):
     def find(self, values: Real, gap: bool) -> Indices:
         """Return the indices in `values` (n,) that differ from the value before by more than the threshold.
 
-        The value before the first is the last of the batch before. With `gap`, ticks were lost in between: then index 0
-        is none, because many small changes may have added up.
+        The value before the first one is the last value of the call before. With `gap`, ticks between the two were
+        lost: then index 0 is left out, because many small changes may have added up.
         """
         previous_values = self._previous_values(values, gap)
         with np.errstate(invalid="ignore", over="ignore"):  # The difference of two infinities is NaN, which is no step.
@@ -218,8 +222,8 @@ class CommandCondition(Condition):
     def find(self, values: Real, gap: bool) -> Indices:
         """Return the indices of the command ticks among the ascending tick numbers `values`.
 
-        They and earlier command ticks are removed from the queue; with `gap`, index 0 stands for the earlier ones, as
-        their ticks were lost.
+        Command ticks up to the last of `values` are removed from the queue. With `gap`, ticks before `values` were
+        lost: index 0 then stands for the command ticks before `values`, which are else dropped.
         """
         indices: list[int] = []
         while self._ticks and self._ticks[0] <= values[-1]:

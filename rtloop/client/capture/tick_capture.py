@@ -75,7 +75,8 @@ def capture_ticks(client: Client, file: Path, first: int, end: int, folder: Path
     The new file is NAME.capture-FIRST.mcap beside the run's recording, or in `folder`, with -2, -3, … before its ending
     if the name is taken. Returns the report of `cut`: among others `output`, the new path as text, and `gaps`, [(first
     tick, count)] of the missing ticks. Raises RecordingError for ticks that the run does not have, OutputError if the
-    file cannot be written, UnavailableError if the ticks are not recorded in time or the recording was interrupted.
+    file cannot be written, UnavailableError if the ticks are not written GRACE_S after they were due, or the recording
+    was interrupted.
     """
     _await_written(client, file, end)
     attempt = 1
@@ -118,9 +119,9 @@ def _await_written(client: Client, file: Path, end: int) -> None:
 def _files_with_ticks(file: Path, first: int, end: int) -> list[Path]:
     """Return the files of the run with the recording `file` that hold the ticks `first` … `end` − 1, in their order.
 
-    The file before them is included, because a replay may need it. Files that begin at `end` or later are left out: the
-    recorder may rename them meanwhile. For a `first` before the run these are all files up to `end`; [file] if the run
-    has no file. Raises RecordingError for a file that cannot be read.
+    The file before these files is included, because a replay may need it. Files that begin at `end` or later are left
+    out, because the recorder may rename them meanwhile. If no file begins at `first` or earlier, all files that begin
+    before `end` are returned; [file] if the run has no file. Raises RecordingError for a file that cannot be read.
     """
     paths = {*run_files(file, ".mcap"), *run_files(file, ".mcap.part")}
     files = sorted(paths, key=lambda path: (path.name.removesuffix(".part") != file.name, path.name))
@@ -166,7 +167,7 @@ def _replay_verdict(path: Path) -> str:
 
 
 def main() -> int:
-    """Save the ticks FIRST … END − 1 of a run as a recording of their own, and check it by a replay of the law.
+    """Save the ticks FIRST … END − 1 of a run as a separate recording, and check it by a replay of the law.
 
     The module describes the command line, and the JSON line that is printed. Returns 1 after {error}, else 0, also if
     the replay differs.

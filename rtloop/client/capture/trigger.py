@@ -75,7 +75,7 @@ class Settings:
 
     @cached_property
     def pre_ticks(self) -> int:
-        """Ticks of a sweep before its trigger: `pre_percent` of the other ticks, rounded."""
+        """Ticks of a sweep before its trigger: `pre_percent` of `ticks` − 1, rounded."""
         return round((self.ticks - 1) * self.pre_percent / 100)
 
 
@@ -83,7 +83,9 @@ class Trigger:
     """Finds sweeps in stretches of ticks, fed in order; `make_condition` returns a new condition for each run."""
 
     def __init__(self, settings: Settings, make_condition: Callable[[], Condition]) -> None:
-        """Begin armed and without an open sweep; call `make_condition` now and for each run that `feed` meets."""
+        """Begin armed and without an open sweep. `make_condition` is called now, and again at the first ticks of each
+        run in `feed`.
+        """
         self._settings, self._make_condition = settings, make_condition
         self._condition = make_condition()
         self._is_armed, self._is_forced = True, False
@@ -97,7 +99,9 @@ class Trigger:
         self._is_armed = True
 
     def force(self) -> None:
-        """Trigger a sweep at the next tick, or at the end of the open sweep, in any mode, whether armed or not."""
+        """Trigger a sweep at the next tick that `feed` gets or, with an open sweep, at the first tick after it, in any
+        mode, whether armed or not.
+        """
         self._is_forced = True
 
     def close(self) -> Sweep | None:
@@ -108,8 +112,9 @@ class Trigger:
     def feed(self, stretch: Stretch) -> list[Sweep]:
         """Process the next ticks and return the sweeps that end in them, oldest first; [] if there are none.
 
-        A sweep that begins in them and ends later is stored in `open_sweep`. The first ticks of a new run discard the
-        open sweep; call `close` before to get it. Raises ValueError if the stretch lacks the condition's signal.
+        A sweep that is triggered in them and ends later is stored in `open_sweep`. The first ticks of a new run discard
+        the open sweep; call `close` before them to get it. Raises ValueError if the stretch lacks the condition's
+        signal.
         """
         values = stretch[self._condition.source]
         if len(stretch) == 0:
@@ -132,8 +137,8 @@ class Trigger:
     def _open_sweep(self, stretch: Stretch, indices: list[int], lost_ticks: int) -> bool:
         """Set `open_sweep` to the next sweep whose trigger lies in the stretch; returns False if there is none.
 
-        `indices` of the stretch, ascending, meet the condition; `lost_ticks` is the number of ticks lost before it. A
-        trigger, force or auto sweep ends the arming and the force.
+        The ticks at `indices` of the stretch, ascending, meet the condition; `lost_ticks` is the number of ticks lost
+        directly before the stretch. A sweep of any cause ends the effect of `arm` and of `force`.
         """
         settings, tick, cause = self._settings, stretch.end, None
         if settings.mode is not Mode.SINGLE or self._is_armed:

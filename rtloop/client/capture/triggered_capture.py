@@ -1,4 +1,4 @@
-"""Captures of a running loop from Python: the span from now on, about a tick, or about the next trigger."""
+"""Captures of a running loop from Python: of a span that begins now, lies about a tick, or about the next trigger."""
 
 from __future__ import annotations
 
@@ -29,12 +29,13 @@ def capture_span(
     timeout_s: float,
     folder: Path | str | None,
 ) -> Recording:
-    """Save a span of the running loop as a recording and return it, as `Connection.capture` describes it.
+    """Save a span of `seconds` of the running loop as a recording and return it, as `Connection.capture` does.
 
-    `center_tick` is its argument `at`. The call returns once the span's last tick is written. Raises ValueError for
-    both `condition` and `center_tick`, for values out of range and an unknown signal; RtloopError for a tick or trigger
-    later than `timeout_s`; RecordingError for ticks that are not in the run; OutputError if the file cannot be written;
-    UnavailableError if the run is not recorded, or the loop is started again meanwhile.
+    `pre_percent` of the span lies before the first tick that meets `condition`, or before `center_tick`; without both,
+    the span begins now. The call returns once the span's last tick is written. Raises ValueError if both are given, for
+    values out of range and an unknown signal; RtloopError for a tick or trigger later than `timeout_s`; RecordingError
+    for ticks that are not in the run; OutputError if the file cannot be written; UnavailableError if the run is not
+    recorded, or the loop is started again meanwhile.
     """
     _require(
         condition is None or center_tick is None, "capture: both a trigger and `at` are given; allowed: one of them"
@@ -59,10 +60,12 @@ def capture_span(
 def _await_trigger(
     configuration: Mapping[str, Any], begin: int, settings: Settings, condition: Condition, timeout_s: float
 ) -> int:
-    """Wait for the first tick from `begin` on that meets the condition; return the first tick of the span about it.
+    """Wait for the first tick from `begin` on that meets the condition; return the first tick of the span about it,
+    which has the length and position that `settings` state.
 
-    The span of `settings` may begin before `begin`, even below 0. `configuration` is the response of `/configuration`.
-    Raises ValueError for an unknown signal, RtloopError after `timeout_s`, UnavailableError if the loop starts again.
+    The result may be a tick before `begin`, or below 0. `configuration` is the response of `/configuration`. Raises
+    ValueError for an unknown signal, RtloopError without a trigger within `timeout_s`, UnavailableError if the loop
+    is started again.
     """
     names = [column["name"] for column in configuration["columns"]]
     _require(condition.source in names, f"trigger source: {condition.source!r}; allowed: {', '.join(names)}")

@@ -59,7 +59,7 @@ def open_mapping(path: Path) -> BlockMapping | None:
 
 
 def is_current(mapping: BlockMapping, path: Path) -> bool:
-    """Return whether the block at `path` is the mapped one; True also while no file is there.
+    """Return whether the block in the file `path` is the mapped one; True also while no such file exists.
 
     No other file gets the inode of a mapped file.
     """
@@ -70,5 +70,5 @@ def is_current(mapping: BlockMapping, path: Path) -> bool:
 
 
 def _identity(status: os.stat_result) -> tuple[int, int]:
-    """Return the numbers of device and inode in a file's status."""
+    """Return (device number, inode number) of a file's status, which together identify the file."""
     return status.st_dev, status.st_ino

@@ -44,10 +44,10 @@ class Reader:
     def read(self) -> Stretch | None:
         """Return a copy of the next ticks, at most MAX_TICKS, without waiting; None if there are none.
 
-        Ticks that were overwritten before are skipped, and counted in the stretch's `lost` and in `lost_ticks`. Once
-        the mapped block has no more ticks and another one lies at the path, a new run begins. Raises HostRefusal for a
-        block that another user may have written, UnavailableError for one that cannot be opened or has another number
-        of signals than `read_columns` returns, and the errors of `read_columns`.
+        Ticks that were overwritten before they could be read are skipped, and counted in the stretch's `lost` and in
+        `lost_ticks`. Once the mapped block has no more ticks and another block lies at the path, a new run begins.
+        Raises HostRefusal for a block that another user may have written, UnavailableError for one that cannot be
+        opened or has another number of signals than `read_columns` returns, and the errors of `read_columns`.
         """
         stretch = self._read_mapped()
         if stretch is not None or (self._mapping is not None and is_current(self._mapping, self._path)):
@@ -69,9 +69,11 @@ class Reader:
         return messages[:copied_count]
 
     def _switch_block(self) -> bool:
-        """Map the block that lies at the path now and begin a run; returns False, without a change, if there is none.
+        """Map the block that lies at the path now, begin a run and return True; without a block, return False and
+        keep the present run.
 
-        The first run begins with the oldest ticks in the ring, a later one with tick 0. Raises as `read`.
+        The first run begins with the oldest ticks in the ring that the loop does not overwrite at once, a later run
+        with tick 0. Raises as `read`.
         """
         mapping = open_mapping(self._path)
         if mapping is None:

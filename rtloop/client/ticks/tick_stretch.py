@@ -37,12 +37,12 @@ class Stretch:
 
     @property
     def end(self) -> int:
-        """Number of the tick after the last one."""
+        """Number of the tick after the last tick of the stretch."""
         return self.first + len(self.rows)
 
     def periods(self, rate_hz: float) -> Real:
-        """Return the number of the period in which each tick was due, from the start of the run: whole numbers as
-        floats (n,). A missed period has no tick: the numbers skip it.
+        """Return the number of the period in which each tick was due, counted from 0 at the start of the run, for a
+        loop at `rate_hz`: whole numbers as floats (n,). A missed period has no tick, so its number is skipped.
         """
         return np.rint(self[DEADLINE_NS] * (rate_hz / 1e9))
 
@@ -56,7 +56,8 @@ class Batch:
         self._stretches: list[Stretch] = []
 
     def add(self, stretch: Stretch) -> Stretch | None:
-        """Add a stretch of the same run; remove and return all ticks once they are BATCH_S times the rate, else None.
+        """Add a stretch of the same run. Once BATCH_S of ticks or more are collected, remove and return them as `take`
+        does; else return None.
 
         The caller calls `take` before it adds a stretch of another run.
         """
@@ -66,7 +67,8 @@ class Batch:
     def take(self) -> Stretch | None:
         """Remove and return all collected ticks as one stretch; None without ticks.
 
-        Lost ticks between them are left out and counted in `lost`: `end` and the numbers of its ticks are then wrong.
+        If ticks were lost between the collected stretches, `lost` counts them, and `end` and the numbers of the later
+        ticks are too low.
         """
         stretches, self._stretches = self._stretches, []
         if not stretches:

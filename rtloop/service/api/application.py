@@ -42,7 +42,8 @@ def application(service: Service) -> Starlette:
     async def stream(socket: WebSocket) -> AsyncIterator[bool]:
         """Accept a WebSocket and yield True; with MAX_STREAMS open, close it and yield False.
 
-        The end of the connection ends the work within, without an error.
+        The end of the connection, or bytes in place of a text, ends the work within without an error. At the end the
+        WebSocket no longer counts towards MAX_STREAMS.
         """
         nonlocal streams
         if streams >= MAX_STREAMS:
@@ -59,8 +60,8 @@ def application(service: Service) -> Starlette:
             streams -= 1
 
     async def watch(socket: WebSocket) -> None:
-        """Send state, faults, lock holder, measurement, recovery and newest signals as JSON text, WATCH_HZ times a
-        second, until the client disconnects.
+        """Send state, faults, lock holder, progress of a measurement, recovery and newest signals as JSON text,
+        WATCH_HZ times a second, until the client disconnects.
         """
         async with stream(socket) as accepted:
             while accepted:
@@ -82,7 +83,10 @@ def application(service: Service) -> Starlette:
                 await socket.send_text(bytes(response.body).decode())
 
     async def answer(request: Request) -> Response:
-        """Return the response to an HTTP request of REQUESTS: its result, or an error as {error: message}."""
+        """Return the response to an HTTP request of REQUESTS: the result of its action, or {error: message}.
+
+        An empty response if the client disconnects before the end of its body.
+        """
         method = "GET" if request.method == "HEAD" else request.method
         try:
             data = await _read_body(request)
@@ -107,8 +111,8 @@ def application(service: Service) -> Starlette:
 
 
 async def _read_body(request: Request) -> bytes:
-    """Return the request's whole body. Raises ValueError, without reading the rest, beyond MAX_BODY_BYTES, and
-    ClientDisconnect if the client disconnects before its end.
+    """Return the request's whole body. Raises ValueError for more than MAX_BODY_BYTES, without reading the rest, and
+    ClientDisconnect if the client disconnects before the end of the body.
     """
     data = b""
     async for part in request.stream():
@@ -119,8 +123,8 @@ async def _read_body(request: Request) -> bytes:
 
 
 def _client_watch(lane: Lane | None, connection: HTTPConnection) -> AbstractAsyncContextManager[None]:
-    """Return the context in which the action of a request runs. The action of a measurement over HTTP learns there, by
-    `is_client_waiting`, that its client has disconnected; for any other request the context has no effect.
+    """Return the context in which the action of a request runs. The context of a measurement over HTTP lets
+    `is_client_waiting` return whether the client is still connected; any other context has no effect.
     """
     if lane is Lane.MEASUREMENT and isinstance(connection, Request):
         return watch_client(connection)
@@ -130,8 +134,8 @@ def _client_watch(lane: Lane | None, connection: HTTPConnection) -> AbstractAsyn
 def _parse_body(request: ApiRequest, connection: HTTPConnection, data: bytes | str) -> Body | None:
     """Return the validated body, or the query of a GET request; None for a request without a body.
 
-    Unknown names in a query are ignored; an empty optional body counts as {}. Raises ValidationError for unknown fields
-    of a body, missing and invalid values.
+    Unknown names in a query are ignored; an empty optional body counts as {}. Raises ValidationError for a body that is
+    not JSON, for unknown fields of a body, and for missing or invalid values.
     """
     if request.body is None:
         return None
@@ -144,8 +148,8 @@ def _parse_body(request: ApiRequest, connection: HTTPConnection, data: bytes | s
 async def _answer_request(
     service: Service, lanes: Lanes, connection: HTTPConnection, request: ApiRequest, data: bytes | str
 ) -> Response:
-    """Validate a request and run its action for its requester; `data` is the body as received. Returns the response,
-    also for an error.
+    """Validate a request and run its action for its requester; `data` is the body as received. Returns the response:
+    the action's result, {error: message} for an error, and 503 for a request that the end of the service refuses.
 
     Raises exceptions that `error_response` does not know.
     """

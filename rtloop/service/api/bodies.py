@@ -17,12 +17,12 @@ from rtloop.service.measuring.measurement import ResponseRequest
 
 MAX_BODY_BYTES = 4 << 20
 MAX_VALUES, MAX_DEPTH, MAX_CHARACTERS = 10_000, 6, 4096
-"""Bounds on settings: number of values, depth of nested tables and lists, length of a text."""
+"""Bounds on settings: number of keys and values, depth of nested tables and lists, characters of a key or text."""
 
 
 def _require_bounded(settings: dict[str, object]) -> dict[str, object]:
     """Return `settings` itself. Raises ValueError for more than MAX_VALUES keys and values, for nesting deeper than
-    MAX_DEPTH, texts longer than MAX_CHARACTERS and integers beyond ±LARGEST_INTEGER.
+    MAX_DEPTH, keys and texts longer than MAX_CHARACTERS and integers beyond ±LARGEST_INTEGER.
     """
     for count, (depth, value) in enumerate(_walk_values(settings, 1), start=1):
         if count > MAX_VALUES:
@@ -67,7 +67,7 @@ class Body(BaseModel):
 
     @property
     def is_stop(self) -> bool:
-        """Whether the request brings the outputs to safe: such a request needs no lock."""
+        """Whether the request brings the outputs to safe, and so needs no lock; False unless a subclass differs."""
         return False
 
 
@@ -78,7 +78,9 @@ class IdentityQuery(Body):
 
 
 class LockBody(Body):
-    """The emergency key, which takes the lock from its holder; without it, only a free lock is taken or renewed."""
+    """The emergency key, which takes the lock from its holder. Without the key the request takes a free lock, or renews
+    the requester's own.
+    """
 
     emergency_key: Annotated[str, Field(max_length=1000)] | None = None
 
@@ -91,7 +93,7 @@ class ModeBody(Body):
 
     @property
     def is_stop(self) -> bool:
-        """Whether the mode is off."""
+        """Whether the mode is off, which brings the outputs to safe and needs no lock."""
         return self.mode == "off"
 
 
@@ -163,7 +165,7 @@ class LearnBody(Body):
 
     @property
     def learn_request(self) -> LearnRequest:
-        """The options of the body, without the axis, as the request for `learn`."""
+        """The samples and options of the body, without the axis, as the request for `learn`."""
         return LearnRequest(np.array(self.samples), self.cycles, self.resonance_percent, self.keep)
 
 

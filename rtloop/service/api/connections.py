@@ -1,8 +1,8 @@
 """Limits on the number of connections and on their idle time, so that silent clients cannot block others.
 
-A connection is idle until a complete request has arrived. An idle connection is closed after IDLE_S. With
-MAX_CONNECTIONS open, a new one replaces the oldest idle one. Requests are answered or refused quickly
-(`rtloop.service.api.lanes`), so almost all connections are idle.
+A connection is idle while it waits for its client, to send a complete request or to read a response. An idle connection
+is closed after IDLE_S. With MAX_CONNECTIONS open, a new one replaces the oldest idle one. Requests are answered or
+refused quickly (`rtloop.service.api.lanes`), so almost all connections are idle.
 """
 
 from __future__ import annotations
@@ -32,7 +32,9 @@ class BoundedConnection(H11Protocol):
     _timer: asyncio.TimerHandle | None = None
 
     def connection_made(self, transport: asyncio.Transport) -> None:
-        """Count the connection and wait for a request; with too many, abort the oldest idle one, or else this one."""
+        """Count the connection and start its idle time. Beyond `max_connections`, close the oldest idle connection at
+        once, or this one if none is idle.
+        """
         super().connection_made(transport)
         self._open_connections[self] = None
         if len(self._open_connections) > self.max_connections:
@@ -68,28 +70,28 @@ class BoundedConnection(H11Protocol):
         self.transport.abort()
 
     def _await_request(self) -> None:
-        """Start the idle time: after IDLE_S the connection is closed unless it works on a request."""
+        """Start the idle time: after IDLE_S the connection is closed, unless the service works on its request."""
         if self._timer is not None:
             self._timer.cancel()
         self._timer = self.loop.call_later(IDLE_S, self._drop_idle)
 
     def _drop_idle(self) -> None:
-        """Abort the connection if it is idle, else restart its idle time."""
+        """Close the connection at once if it is idle, else restart its idle time."""
         if self.is_idle:
             self.drop()
         else:
             self._await_request()
 
     def _release_place(self) -> None:
-        """Stop counting the connection, and stop its timer."""
+        """Stop counting the connection, and stop the timer of its idle time."""
         self._open_connections.pop(self, None)
         if self._timer is not None:
             self._timer.cancel()
 
 
 def server_settings(application: Starlette) -> uvicorn.Config:
-    """Return uvicorn's configuration that serves `application` over BoundedConnections, on a socket that is open
-    already.
+    """Return uvicorn's configuration that serves `application` over BoundedConnections; the caller gives uvicorn's
+    server its listening socket.
     """
     return uvicorn.Config(
         application,

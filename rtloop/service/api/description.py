@@ -7,16 +7,18 @@ from collections.abc import Mapping, Sequence
 from rtloop.configuration.file import type_adapter
 from rtloop.configuration.reference_options import ReferenceOptions
 from rtloop.recording.file.topics.events import MAX_NAME, OPERATOR, RESERVED_NAMES
+from rtloop.service.api.bodies import MAX_BODY_BYTES
 from rtloop.service.api.requests import REQUESTS, ApiRequest, Sender
 from rtloop.service.changing.live import TUNABLE_SECTIONS
 from rtloop.version import __version__
 
 ERRORS = {
-    409: "the state, the lock holder or the loop does not allow the request; nothing has changed",
-    413: "the body is too large",
+    409: "the state, the lock holder or the loop does not allow the request; the message states the reason, and any "
+    "axes that have changed already",
+    413: f"the body is longer than {MAX_BODY_BYTES} bytes",
     422: "the request is malformed, or a value is not allowed",
-    503: "too many requests wait, or the request takes too long",
-    504: "the loop has taken the command and stands still: the command takes effect if the loop continues",
+    503: "too many requests wait, the request takes too long, or the service is ending; send the request again later",
+    504: "the loop has taken the command and stands still; the command takes effect if the loop continues",
 }
 ERROR_SCHEMA = {"type": "object", "properties": {"error": {"type": "string"}}, "required": ["error"]}
 _RESERVED = "|".join(
@@ -54,7 +56,7 @@ def openapi(axes: Sequence[str]) -> dict[str, object]:
 def _operation(request: ApiRequest, fields: Mapping[str, object]) -> dict[str, object]:
     """Return the OpenAPI operation of one request: parameters, body and responses.
 
-    `fields` are schemas, by name, that replace those of the body's fields.
+    `fields` are schemas by name; each replaces the schema of the body's field of this name, if there is one.
     """
     answers: dict[str, object] = {"200": {"description": "done", "content": {request.media_type: {}}}}
     for code in request.errors:

@@ -21,7 +21,7 @@ class TooManyRequests(Exception):
 
 
 class Lane(Enum):
-    """Kind of request: (number of threads, largest number of requests that run or wait)."""
+    """Kind of request; the value is (number of threads, largest number of requests that run or wait)."""
 
     SAFETY = (4, 10_000)
     """Stop and reset; only the number of connections limits them."""
@@ -36,18 +36,21 @@ class Lanes:
     """Threads for the requests of each lane."""
 
     def __init__(self) -> None:
+        """Begin with no request in any lane."""
         self._limiters = {lane: CapacityLimiter(lane.value[0]) for lane in Lane}
         self._pending_counts = dict.fromkeys(Lane, 0)
 
     async def run(self, lane: Lane, action: Callable[[*Ts], T], *arguments: *Ts) -> T:
         """Run `action` in a thread of the lane, once one is free, and return its result.
 
-        Raises TooManyRequests if the lane's largest number of requests run or wait, and the exceptions of the action.
+        Raises TooManyRequests, without a wait, if the lane's largest number of requests run or wait already, and the
+        exceptions of the action.
         """
         limit = lane.value[1]
         if self._pending_counts[lane] >= limit:
             raise TooManyRequests(
-                f"the service has {count_text(limit, 'request')} of this kind to answer already; {RETRY_TEXT}"
+                f"the service works on {count_text(limit, 'request')} of the kind {lane.name.lower()} already, and "
+                f"accepts no more at a time; {RETRY_TEXT}"
             )
         self._pending_counts[lane] += 1
         try:

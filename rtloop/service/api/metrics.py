@@ -31,9 +31,9 @@ def metrics_text(service: Service) -> str:
 
 
 def _family(kind: Family, name: str, text: str, samples: Samples, labels: Sequence[str] = ()) -> Metric:
-    """Return the metric `name` of class `kind` with the help `text`, without samples whose value is None.
+    """Return the metric `name` of class `kind` with the help `text` and all `samples` whose value is not None.
 
-    `labels` are the names of the label values in each sample.
+    `labels` are the names of the label values that precede the value in each sample.
     """
     family = kind(name, text, labels=labels)
     for *label_values, value in samples:
@@ -46,6 +46,7 @@ class ServiceCollector(Collector):
     """Collector of the present state of a service and of its last measurements."""
 
     def __init__(self, service: Service) -> None:
+        """Collect from `service` at each `collect`."""
         self._service = service
 
     def collect(self) -> Iterator[Metric]:
@@ -55,7 +56,7 @@ class ServiceCollector(Collector):
 
     def _state(self) -> Iterator[tuple[str, str, tuple[str, ...], Samples]]:
         """Yield (name, help, names of labels, samples) for state, loop, recording, timing, drive limits, trip,
-        conditions and newest signals; without a loop, only some of these have samples.
+        conditions and newest signals. Without a loop, only state, ticks and restarts have samples.
         """
         service, supervisor, state = self._service, self._service.supervisor, self._service.state
         yield (
@@ -71,22 +72,25 @@ class ServiceCollector(Collector):
             recording, quota = recording_state(supervisor.block), supervisor.recorder.quota
             yield "rtloop_recording", "1 while ticks are recorded, else 0", (), [(recording["reason"] is None,)]
             lost_ticks = recording["ticks_lost"]
-            yield "rtloop_ticks_not_recorded", "Ticks of the present loop without a record", (), [(lost_ticks,)]
+            yield "rtloop_ticks_not_recorded", "Ticks of the present loop that are in no file", (), [(lost_ticks,)]
             if quota is not None:
-                yield "rtloop_recordings_bytes", "Size of this configuration's recordings", (), [(quota.total_bytes,)]
+                text = "Size of all recordings of this configuration, bytes"
+                yield "rtloop_recordings_bytes", text, (), [(quota.total_bytes,)]
                 yield (
                     "rtloop_recordings_removed",
-                    "Recording files removed because of keep_gib or min_free_mib",
+                    "Recording files removed because of recording.keep_gib or recording.min_free_mib",
                     (),
                     [(quota.removed_files,)],
                 )
         if timings := timing(service):
             newest = f", over the newest {WINDOW_TICKS} ticks at most"
             yield "rtloop_rate_hz", f"Ticks per second{newest}", (), [(timings["rate_hz"],)]
-            yield "rtloop_overruns", f"Ticks that ended after the next deadline{newest}", (), [(timings["overruns"],)]
+            text = f"Ticks that ended after the next tick was due{newest}"
+            yield "rtloop_overruns", text, (), [(timings["overruns"],)]
             yield "rtloop_periods_missed", f"Periods without a tick{newest}", (), [(timings["periods_missed"],)]
             lateness = [(name, value_us / US_PER_S) for name, value_us in timings["lateness_us"].items()]
-            yield "rtloop_lateness_seconds", f"Lateness: p50, p99, max{newest}", ("statistic",), lateness
+            text = f"Lateness of ticks, s: median (p50), 99 % quantile (p99) and largest (max){newest}"
+            yield "rtloop_lateness_seconds", text, ("statistic",), lateness
         if (live := service.live) is not None:
             plan, ends = live.prepared.plan, {"lowest": "drive_min_v", "highest": "drive_max_v"}
             limits = [(axis, end, float(coefficients[key])) for end, key in ends.items()
@@ -110,7 +114,7 @@ class ServiceCollector(Collector):
     def _measurements(self) -> Iterator[tuple[str, str, tuple[str, ...], Samples]]:
         """Yield (name, help, names of labels, samples) for the last measurement of each axis; nothing before the first.
 
-        The metrics are its time, margins, resonance and gain, the last three with standard deviations.
+        The metrics are time, margins, resonance and gain of the measurement, the last three with standard deviations.
         """
         newest = {axis: results.newest for axis, results in self._service.measurements.items()}
         if not newest:
@@ -135,22 +139,25 @@ class ServiceCollector(Collector):
                 resonances,
             )
             gains = [(axis, figures["gain"][key]) for axis, figures in newest.items() if figures["gain"]]
-            yield f"rtloop_gain{suffix}", f"Gain at rest, position per command{note}", ("axis",), gains
+            yield f"rtloop_gain{suffix}", f"Static gain, µm of position per µm of command{note}", ("axis",), gains
 
 
 class QualityCollector(Collector):
     """Collector of the sums of Quality, for rates over any interval, and of the last minute's largest values."""
 
     def __init__(self, quality: Quality) -> None:
+        """Collect from the sums of `quality` at each `collect`."""
         self._quality = quality
 
     def collect(self) -> Iterator[Metric]:
-        """Yield the metrics, all from sums of one moment, also while no loop runs."""
+        """Yield the metrics of `_loop_metrics` and `_axis_metrics`, all of one moment, also while no loop runs."""
         with self._quality.lock:
             yield from [*self._loop_metrics(), *self._axis_metrics()]
 
     def _loop_metrics(self) -> Iterator[Metric]:
-        """Yield the sums over all ticks as counters, and the lateness (s) as a histogram."""
+        """Yield counters of ticks, overruns, missed periods, limited ticks and trips, and a histogram of the lateness
+        (s), over all loops since the start of the service.
+        """
         sums = self._quality
         for name, text, labels, samples in (
             (
@@ -165,15 +172,20 @@ class QualityCollector(Collector):
                 (),
                 [(sums.unread_ticks,)],
             ),
-            ("rtloop_tick_overruns", "Ticks that ended after the next deadline", (), [(sums.overruns,)]),
+            ("rtloop_tick_overruns", "Ticks that ended after the next tick was due", (), [(sums.overruns,)]),
             ("rtloop_tick_periods_missed", "Periods without a tick", (), [(sums.periods_missed,)]),
-            ("rtloop_ticks_limited", "Ticks at a limit", ("limit",), sums.limited_ticks.items()),
+            (
+                "rtloop_ticks_limited",
+                "Ticks in which a limit changed the command, the drive or its slew rate",
+                ("limit",),
+                sums.limited_ticks.items(),
+            ),
             ("rtloop_trips", "Trips by cause", ("cause",), sums.trips.items()),
         ):
             yield _family(CounterMetricFamily, name, text, samples, labels)
         bounds = (*(bound_us / US_PER_S for bound_us in LATENESS_US), math.inf)
         buckets = list(zip(map(floatToGoString, bounds), sums.lateness.cumsum().tolist(), strict=True))
-        lateness = HistogramMetricFamily("rtloop_tick_lateness_seconds", "Lateness of ticks")
+        lateness = HistogramMetricFamily("rtloop_tick_lateness_seconds", "Lateness of ticks, s")
         lateness.add_metric([], buckets, sums.lateness_sum_us / US_PER_S)
         yield lateness
 

@@ -20,7 +20,7 @@ from rtloop.service.service import Service
 
 
 def requester_name(connection: HTTPConnection) -> str:
-    """Return the name in `?as=NAME`, OPERATOR without one. Raises ConfigError for an invalid name."""
+    """Return the name in `?as=NAME`, OPERATOR without one. Raises ConfigError for an invalid name and for several."""
     try:
         text = connection.scope.get("query_string", b"").decode("ascii")
         query = parse_qs(text, keep_blank_values=True, errors="strict")
@@ -37,11 +37,11 @@ def requester_name(connection: HTTPConnection) -> str:
 def authorise(
     service: Service, connection: HTTPConnection, request: ApiRequest, body: Body | None
 ) -> AbstractContextManager[None]:
-    """Return a context in which the action of a request runs under its requester's name, with the lock if
-    `request.sender` needs it.
+    """Return a context in which the action of a request runs under its requester's name, as `request.sender` states.
 
-    A stop needs neither a lock nor a valid name. The call raises ConfigError for an invalid name; entering the context
-    raises Refusal while another name holds the lock.
+    The context of LOCK_HOLDER takes or renews the lock; entering it raises Refusal while another name holds the lock.
+    The context of ANYONE has no name. A stop needs no lock; without a valid name it runs as UNNAMED_REQUESTER. The call
+    raises ConfigError for an invalid name that the request needs.
     """
     if request.sender is Sender.STOPPER or (body is not None and body.is_stop):
         try:
@@ -69,7 +69,7 @@ async def watch_client(request: Request) -> AsyncIterator[None]:
 
 @asynccontextmanager
 async def call_at_disconnect(request: Request, action: Callable[[], object]) -> AsyncIterator[None]:
-    """Call `action` if a request's connection ends before the work within does.
+    """Call `action` if the connection of a request ends before the work within ends.
 
     The request's body must have been read.
     """

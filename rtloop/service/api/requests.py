@@ -48,10 +48,10 @@ SMALL_BYTES = 1 << 16
 
 
 class Sender(Enum):
-    """Who may send a request, and whether its name is needed."""
+    """Clients that may send a request, and whether it needs a valid name."""
 
-    ANYONE = "anyone; no name is read"
-    NAMED = "any valid name"
+    ANYONE = "anyone; a name has no effect"
+    NAMED = "any client with a valid name, or without a name"
     LOCK_HOLDER = "the lock holder; the request takes a free lock"
     STOPPER = "anyone; an invalid name is ignored"
 
@@ -104,7 +104,10 @@ def _tick(action: Callable[[Service, B], int]) -> Callable[[Service, B], dict[st
 
 
 def _require_running(service: Service, activity: str) -> tuple[Supervisor, LiveLaw]:
-    """Return supervisor and law of the loop. Raises Refusal, which names `activity`, unless the state is "running"."""
+    """Return supervisor and law of the loop.
+
+    Raises Refusal without a loop and, with `activity` in its message, in any state but "running".
+    """
     live, supervisor = service.require_live(), service.supervisor
     if supervisor is None or service.state is not State.RUNNING:
         remedy = service.ctl("start")
@@ -126,9 +129,10 @@ def _arm(service: Service, _: None) -> dict[str, object]:
 def _set_reference(service: Service, body: ReferenceBody) -> int:
     """Start the reference of the body on its axis, and return the tick at which it took effect.
 
-    A table's file is read here, only from the configuration's folder: the client may lack the service's permissions.
+    A table's file is read here, and must be in or below the configuration's folder, because a client must not read
+    other files with the service's permissions.
     Raises Refusal without a loop, ConfigError for a table that is invalid or cannot be read, and as
-    `LiveReferences.set`.
+    `LiveReferences.set` or, for a table, `LiveReferences.set_waveform`.
     """
     live = service.require_live()
     if body.reference.get("kind") != "table":
@@ -174,10 +178,9 @@ def _measure_response(service: Service, body: ResponseBody) -> dict[str, object]
 
 
 def _learn(service: Service, body: LearnBody) -> dict[str, object]:
-    """Learn the table for one period of the reference. Returns `LearnResult.for_json` after all cycles.
+    """Learn the table for one period of the reference as `learn` does. Returns `LearnResult.for_json` after all cycles.
 
-    With `keep` the best table plays on, else the loop returns to its setpoint. Raises Refusal unless the loop runs, and
-    as `learn`.
+    The progress is in `/status` meanwhile. Raises Refusal unless the loop runs, and as `learn`.
     """
     running_loop, current_measurement = _require_running(service, "learn"), service.current_measurement
     with current_measurement.begin("learn", body.axis, body.cycles):
@@ -247,14 +250,15 @@ REQUESTS = (
                sender=Sender.STOPPER, **_SAFETY),
     ApiRequest("POST", "/reset", "Clear latched trips; the outputs stay off.", _tick(lambda s, _: s.reset()),
                **_SAFETY),
-    ApiRequest("POST", "/reload", "Read the configuration again and apply its changes.",
+    ApiRequest("POST", "/reload", "Read the configuration file again and apply its changes to the running loop.",
                lambda s, _: s.reload_now(), page_bytes=None, **_BUILD),
     ApiRequest("POST", "/mode", "Change the mode bumplessly.", _tick(lambda s, body: s.set_mode(body.mode)), ModeBody),
     ApiRequest("POST", "/reference", "Change the reference of an axis.", _tick(_set_reference), ReferenceBody),
-    ApiRequest("POST", "/setpoint", "Hold the reference of an axis at a value.", _tick(_set_setpoint), SetpointBody),
-    ApiRequest("POST", "/waveform", "Play samples on an axis.", _tick(_play_waveform), WaveformBody,
+    ApiRequest("POST", "/setpoint", "Hold the reference of an axis at a value, in µm (V in mode raw).",
+               _tick(_set_setpoint), SetpointBody),
+    ApiRequest("POST", "/waveform", "Play samples as the reference of an axis.", _tick(_play_waveform), WaveformBody,
                page_bytes=MAX_BODY_BYTES),
-    ApiRequest("POST", "/response", "Measure the response of the closed loop about its setpoint.", _measure_response,
+    ApiRequest("POST", "/response", "Measure the closed loop of an axis about its setpoint.", _measure_response,
                ResponseBody, Lane.MEASUREMENT),
     ApiRequest("POST", "/learn", "Play one period of a reference repeatedly and learn a table with less error; the "
                "table continues to play unless `keep` is false.",
@@ -275,4 +279,6 @@ REQUESTS = (
                body_optional=True, **_LOCK),
     ApiRequest("DELETE", "/lock", "Release the lock.", _release_lock, **_LOCK),
 )  # fmt: skip
-"""All requests. The response to a command is `tick`, at which it took effect. `/openapi.json` describes this table."""
+"""All requests. The response to a command that the loop executes has the `tick` at which the command took effect.
+`/openapi.json` describes this table.
+"""

@@ -1,8 +1,8 @@
 """References that the running loop really has, from its records and events.
 
-The loop alone decides on them: a mode change into or out of raw replaces a reference by a constant in the other unit, a
-schedule sets references, and a command that the loop did not confirm may take effect later. The rules stand in
-`rtloop.engine.commands`; the events are followed from the first one on.
+The loop alone decides on its references: a mode change into or out of raw replaces a reference by a constant in the
+other unit, a schedule sets references, and a command that the loop did not confirm may take effect later. The rules
+stand in `rtloop.engine.commands`; the events are followed from the first one on.
 """
 
 from __future__ import annotations
@@ -40,14 +40,14 @@ class Trip(NamedTuple):
     number: int
     """1 for the first trip; further causes of a latched trip are the same trip."""
     mode: Mode | None
-    """Mode that it ended; None if unknown."""
+    """Mode that the trip ended; None if unknown."""
     tick: int
     first_causes: int
     """Causes in the tick of the trip, as bits of Flag; TRIP_DRIVER also for a failed write."""
     causes: int
-    """These, and those that followed."""
+    """First causes, and the causes that followed while the trip was latched."""
     is_stopped: bool
-    """Whether a client has stopped the loop since."""
+    """Whether a client has requested mode off since the trip."""
 
 
 NO_TRIP = Trip(0, Mode.OFF, 0, 0, 0, False)
@@ -57,7 +57,7 @@ class ActiveReferences:
     """References of the axes in the loop of `staging`, which began with `plan`. Thread-safe."""
 
     def __init__(self, plan: Plan, staging: Staging) -> None:
-        """Begin with mode and references of `plan`; no event is read before `follow` or `newest`.
+        """Begin with the mode and references of `plan`; no event is read before a call of `follow` or `newest`.
 
         `staging` gives access to the loop's events and its newest record.
         """
@@ -80,8 +80,8 @@ class ActiveReferences:
     def follow(self) -> None:
         """Read the loop's new events, and apply them to references, mode and trip.
 
-        If some were overwritten before they were read, the mode is unknown until its next event, and each reference
-        until it is set again after that.
+        If events were overwritten before they were read, the mode is unknown until the next event that changes it, and
+        each reference is unknown until an event sets it while the mode is known.
         """
         ring = self._staging.block.ring("events")
         with self._lock:
@@ -102,10 +102,10 @@ class ActiveReferences:
             return self._trip
 
     def values(self, number: int) -> tuple[tuple[float, ...], bool] | None:
-        """Return ([kind, *parameters] of the generator of axis `number`, whether it is in V); None if it is unknown.
+        """Return ((kind, *parameters) of the generator of axis `number`, whether it is in V); None if it is unknown.
 
-        Unknown is also a constant that only the records show, until the loop has executed its first tick. Does not wait
-        for the loop, and uses the events that were read.
+        After a mode change into or out of raw, only the records show the new constant: it is unknown until the loop has
+        executed the tick of the change. Uses the events that `follow` has read, and does not wait for the loop.
         """
         record = self._staging.newest_record
         with self._lock:
@@ -121,8 +121,8 @@ class ActiveReferences:
     def newest(self, number: int) -> ActiveReference:
         """Return the reference of axis `number` in the newest tick that the loop executed; `kind` None: unknown.
 
-        First waits until the loop has executed the tick in which this axis's last change takes effect. Raises Refusal
-        if it has not after ANSWER_TIMEOUT_S and some periods.
+        First waits until the loop has executed the first tick of this reference. Raises Refusal if the loop has not
+        done so after ANSWER_TIMEOUT_S and ANSWER_PERIODS periods.
         """
         deadline_s = time.monotonic() + ANSWER_TIMEOUT_S + ANSWER_PERIODS * self._period_s
         while True:
@@ -161,7 +161,10 @@ class ActiveReferences:
             self._mode = Mode.OFF
 
     def _record_trip(self, tick: int, causes: int) -> None:
-        """Record a trip at `tick`, or further causes of the latched one, as bits of Flag; the lock must be held."""
+        """Record a trip at `tick`, or, while a trip is latched, its further causes; the lock must be held.
+
+        `causes` are bits of Flag. The mode is off afterwards.
+        """
         if not self._is_latched:
             self._trip = Trip(self._trip.number + 1, self._mode, tick, causes, causes, False)
         first = self._trip.first_causes | (causes if tick == self._trip.tick else 0)

@@ -1,7 +1,7 @@
 """Building and analysing a changed configuration in the limited process, which is killed if it takes too long.
 
-The process starts some seconds after the loop, so that it does not delay the loop's start, or with the first change;
-it ends with the service.
+The limited process starts some seconds after the loop, so that the loop's start is not delayed, or with the first
+change if that comes sooner; it ends with the service.
 """
 
 from __future__ import annotations
@@ -25,9 +25,9 @@ def prepare_limited(configuration: Configuration) -> Prepared:
 
 
 def figures_limited(configuration: Configuration, number: int, least_step_ms: float = 0.0) -> Figures:
-    """Return `loop_figures` of axis `number`, computed in the limited process; its step lasts at least `least_step_ms`.
+    """Build a configuration and return `loop_figures` of axis `number`, both in the limited process.
 
-    Raises as `prepare_limited`.
+    The step response of these figures lasts at least `least_step_ms`. Raises as `prepare_limited`.
     """
     return PROCESS.run(_prepare_figures, configuration, number, least_step_ms, compiles=_needs_compiler(configuration))
 

@@ -23,6 +23,7 @@ class ChangeHistory:
     """The last MAX_CHANGES changes."""
 
     def __init__(self) -> None:
+        """Begin without changes of any axis."""
         self._changes: deque[Change] = deque(maxlen=MAX_CHANGES)
 
     def add(self, change: Change) -> None:
@@ -30,11 +31,11 @@ class ChangeHistory:
         self._changes.append(change)
 
     def newest(self, axis_numbers: Collection[int]) -> Change | None:
-        """Return the newest change of any of the axes `axis_numbers`, None without one; it stays in the history."""
+        """Return the newest change of any of the axes `axis_numbers`, which stays in the history; None without one."""
         return next((change for change in reversed(self._changes) if change.number in axis_numbers), None)
 
     def remove(self, change: Change | None = None) -> None:
-        """Remove `change`, which must be an object of the history, after its undo; None removes all changes."""
+        """Remove `change`, which must be an object that the history holds; None removes all changes."""
         if change is None:
             self._changes.clear()
         else:

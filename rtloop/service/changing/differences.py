@@ -11,9 +11,9 @@ MAX_WRITTEN = 3
 
 
 def differences(before: AxisOptions, after: AxisOptions) -> str:
-    """Return the keys that differ, each with its values before and after, as one text; "" for equal options.
+    """Return the keys that differ, each as `_section_differences` writes it, as one text; "" for equal options.
 
-    At most MAX_WRITTEN keys are written out; the text ends with the number of the others.
+    At most MAX_WRITTEN keys are written out; for more, the text ends with the number of the others.
     """
     tables = before.model_dump(mode="json"), after.model_dump(mode="json")
     texts = [
@@ -26,8 +26,9 @@ def differences(before: AxisOptions, after: AxisOptions) -> str:
 def _section_differences(section: str, before: object, after: object) -> Iterator[str]:
     """Yield a text for each key that differs between two values of `section`, such as "limits.drive_v 10 → 9".
 
-    If a value is no table, yield one text, without a key; nothing for equal values. For lists and tables the text is "…
-    changed", without values. Of laws of different kinds, only the kinds are given.
+    A key whose value is a list or table gets "SECTION.KEY changed". Yield one text, "SECTION BEFORE → AFTER", if one of
+    the two values of the section is no table, and with the two kinds alone if their kinds differ. Yield nothing for
+    equal values.
     """
     if before == after:
         return
@@ -45,7 +46,7 @@ def _section_differences(section: str, before: object, after: object) -> Iterato
 
 
 def _format_value(value: object) -> str:
-    """Return a value as a short text: six digits of a number, "none" for None, "a table" for a dict."""
+    """Return a value as a short text: six digits of a number, "none" for None, "a table" for a dict, else its str."""
     if isinstance(value, float | int) and not isinstance(value, bool):
         return f"{value:.6g}"
     return "none" if value is None else "a table" if isinstance(value, dict) else str(value)

@@ -51,7 +51,10 @@ class LiveLaw:
     """
 
     def __init__(self, prepared: Prepared, block: SharedBlock, desk: Desk, offsets_v: dict[int, float]) -> None:
-        """Begin with `prepared`, which the loop of `block` runs. `offsets_v` is not copied: `tare` adds to it."""
+        """Begin with `prepared`, which the loop of `block` runs; `desk` sends to this loop.
+
+        `offsets_v` are the readings at position 0 of tared axes, by number; `tare` changes this dict itself.
+        """
         self.prepared = prepared
         self.offsets_v = offsets_v
         self._staging = Staging(block, desk)
@@ -75,7 +78,9 @@ class LiveLaw:
         return axis_number(self.prepared, name)
 
     def change_text(self, identity: int) -> str | None:
-        """Return the change that a command made, in words, by the `identity` of its event; None if unknown."""
+        """Return in words the change of the law that the command with `identity`, the number in its event, made; None
+        if it is unknown.
+        """
         return self._staging.desk.change_text(identity)
 
     def tune(self, axis: str, section: str, changes: Mapping[str, object]) -> int:
@@ -116,7 +121,8 @@ class LiveLaw:
             return {"before": before, "after": after}
 
     def undo(self, axis: str) -> tuple[int, str]:
-        """Undo the last change of an axis, or of the controller that it shares: load the options from before it.
+        """Undo the newest change of an axis, or of the axis that owns its shared controller: load the options that this
+        axis had before the change.
 
         The reference stays; the change leaves the history, except after an error. Returns the tick of the load, and the
         undone change in words. Raises ConfigError for an unknown axis, Refusal if there is no change, and as `tune`.
@@ -146,10 +152,10 @@ class LiveLaw:
         return tick
 
     def _axis_with_keys(self, axis: str, section: str, changes: Mapping[str, object]) -> tuple[int, AxisOptions]:
-        """Return number and options of the axis that owns the section, with the changes, for `_apply_change`.
+        """Return number and options, with the changes, of the axis that owns the section: for "controller" the axis
+        whose controller `axis` uses, else `axis` itself.
 
-        For the section "controller" that is the axis whose controller `axis` uses, else `axis` itself. Raises
-        ConfigError for an unknown axis, a section that is not in TUNABLE_SECTIONS and invalid values.
+        Raises ConfigError for an unknown axis, a section that is not in TUNABLE_SECTIONS and invalid values.
         """
         number = self.axis_number(axis)
         if section not in TUNABLE_SECTIONS:
@@ -167,7 +173,8 @@ class LiveLaw:
     ) -> tuple[int, AxisOptions]:
         """Return number and options of the axis that owns the controller of axis `number`, with another controller.
 
-        `keep_other_keys`: `controller` has only the changed keys, else all. Raises ConfigError for invalid values.
+        With `keep_other_keys`, `controller` has only the keys that change; else it has all keys. Raises ConfigError for
+        invalid values.
         """
         configuration = self.prepared.configuration
         owner = configuration.owners[number]
@@ -179,8 +186,8 @@ class LiveLaw:
         """Make `offset_v` the reading at position 0 of axis `number`, now and after later changes.
 
         Returns the tick at which the offset took effect. Raises Refusal if the loop refuses, or an earlier change is
-        unconfirmed; the earlier offset then stays. Raises UnconfirmedCommand if the loop does not answer; it may
-        still load the new offset, so that later changes carry the new offset.
+        unconfirmed; the earlier offset then stays. Raises UnconfirmedCommand if the loop took the command and stands
+        still: it may still load the new offset, so later changes carry it. Raises QueueFull as `Desk.submit`.
         """
         with self._staging.lock:
             axis, earlier_v = self.prepared.configuration.axes[number], self.offsets_v.get(number)
@@ -199,22 +206,29 @@ class LiveLaw:
     def replace_all(self, prepared: Prepared) -> list[str]:
         """Load the options and references of another configuration, axis by axis, where they differ from the present.
 
-        `prepared` is then the new one; the undo history is cleared if an axis changed. Returns the changed axes as
-        ["axis.NAME", …], [] if none changed. Raises Refusal if the new one needs a restart, ConfigError for a reference
-        that is invalid or beyond the limits, and as `Desk.submit`. An RtloopError after the first change of an
-        axis becomes a Refusal that names the axes changed already: these stay changed, and the history stays.
+        Afterwards `self.prepared` is `prepared`; the undo history is cleared if an axis changed. Returns the changed
+        axes as ["axis.NAME", …], [] if none changed. Raises Refusal if the other configuration needs a restart,
+        ConfigError for a reference that is invalid or beyond the limits, and as `Desk.submit`. An RtloopError after the
+        first change of an axis becomes a Refusal that names the axes changed already: these stay changed, and the
+        history stays.
         """
         with self._build_lock, self._staging.lock:
             old, new = self.prepared.configuration, prepared.configuration
             fixed_parts = [place for part, place in FIXED_PARTS.items() if getattr(old, part) != getattr(new, part)]
             if fixed_parts or prepared.plan.axes != self.prepared.plan.axes:
-                raise Refusal(f"{', '.join(fixed_parts) or 'axes'}: changed in the file; restart the service")
+                raise Refusal(
+                    f"{', '.join(fixed_parts) or 'axes'}: changed in the configuration file; restart the service to "
+                    "apply the change"
+                )
             if old.owners != new.owners:
                 raise Refusal(CONTROLLER_AXES_CHANGED)
             pairs = list(enumerate(zip(old.axes, new.axes, strict=True)))
             for _, (before, after) in pairs:
                 if before.feedforward != after.feedforward:
-                    raise Refusal(f"axis.{after.name}.feedforward: changed in the file; restart the service")
+                    raise Refusal(
+                        f"axis.{after.name}.feedforward: changed in the configuration file; restart the service to "
+                        "apply the change"
+                    )
             references = {n: self.references.generator(after.reference) for n, (before, after) in pairs
                           if before.reference != after.reference}  # fmt: skip
             changed_axes: list[str] = []
@@ -242,10 +256,10 @@ class LiveLaw:
             return list(dict.fromkeys(changed_axes))
 
     def _record_axis(self, number: int, prepared: Prepared, axis: AxisOptions) -> None:
-        """Record in `self.prepared` that the loop has loaded axis `number`, and the axes that share its controller.
+        """Record in `self.prepared` that the loop has loaded axis `number` and the axes that share its controller.
 
-        `prepared` has the coefficients that were loaded, `axis` are the options of axis `number`; the other axes keep
-        their references.
+        `prepared` has the coefficients that were loaded and the options of these axes; `axis` are the options of axis
+        `number` in their place. The other axes keep their references.
         """
         coefficients, checks = np.asarray(self.prepared.plan.coefficients).copy(), list(self.prepared.checks)
         configuration = self.prepared.configuration
@@ -260,8 +274,9 @@ class LiveLaw:
     def _validated_axis(self, raw: Mapping[str, object]) -> AxisOptions:
         """Return the options of an axis from `raw`, the keys of its section [[axis]], with the name.
 
-        They are checked against the laws that the loop has loaded. A user's laws are tried in the limited process
-        first. Raises ConfigError for invalid values, and for a law whose code ends that process or does not return.
+        The options are checked against the laws that the loop has loaded; a user's laws are tried in the limited
+        process first. Raises ConfigError for invalid values and for a law whose code ends that process or does not
+        return, and as `try_limited`.
         """
         configuration = self.prepared.configuration
         library = Library(configuration.folder, configuration.laws)
@@ -305,9 +320,10 @@ class LiveLaw:
         """Copy the coefficients that `prepared` has for axis `number` to shared memory, let the loop load them, and
         record `axis`, its options, as loaded. Returns the tick of the load.
 
-        `change` describes the change; None: the keys of `axis` that differ. Axes that share a controller are loaded
-        together, by the number of the first, if the first one changes. The staging lock must be held. Raises Refusal,
-        which changes nothing, and UnconfirmedCommand: `axis` is then recorded, since the loop may still load it.
+        `change` describes the change; None: the keys of `axis` that differ. Axes that share a controller are loaded in
+        one command with the number of the first of them, unless `number` is another one and the first keeps its
+        coefficients. The staging lock must be held. Raises as `Staging.require_settled` and `Desk.submit`: nothing
+        changes, except for UnconfirmedCommand, when `axis` is recorded, since the loop may still load it.
         """
         new_coefficients, current_coefficients = (
             np.asarray(prepared.plan.coefficients),
@@ -336,7 +352,7 @@ class LiveLaw:
 
 
 def _replace_axis(configuration: Configuration, number: int, axis: AxisOptions) -> Configuration:
-    """Return a copy of the configuration with other options of axis `number`."""
+    """Return a copy of the configuration in which `axis` are the options of axis `number`."""
     axes = list(configuration.axes)
     axes[number] = axis
     return replace(configuration, axes=tuple(axes))

@@ -68,18 +68,17 @@ def loop_figures(prepared: Prepared, number: int, least_step_ms: float = 0.0) ->
 
 
 def running_check(prepared: Prepared, number: int) -> AxisCheck:
-    """Return the check of axis `number`, from 0, on the simulated rig if the axis contradicts it or is unstable on it.
-
-    Else, and for other drivers, return the check on the axis's model.
+    """Return the check of the loop of axis `number`, from 0: on the simulated rig, if the axis's keys contradict the
+    rig or the loop is unstable on the rig; else, and without a simulated rig, on the axis's model.
     """
     check = prepared.checks[number]
     return compare_with_rig(prepared.configuration, prepared.configuration.axes[number], check).on_rig or check
 
 
 def _tolerated_shift_percent(check: AxisCheck) -> list[float] | None:
-    """Return [down, up]: the shift of the plant's resonance, % (down negative), within which the loop is stable.
+    """Return [down ≤ 0, up ≥ 0]: the shifts of the plant's resonance, %, between which the loop stays stable.
 
-    The search ends at ∓50 %, which is returned for a side without a limit. None without a resonance.
+    An end is -50 or 50, where the search ends, if the loop stays stable up to there. None without a resonance.
     """
     resonance = None if check.plant is None else plant_changes(check.plant).get("resonance")
     if check.plant is None or resonance is None:
@@ -89,15 +88,15 @@ def _tolerated_shift_percent(check: AxisCheck) -> list[float] | None:
 
 
 def step_duration_ms(figures: Figures) -> float:
-    """Return the last time of the simulated step response in `figures`, ms after the step; 0 without a response."""
+    """Return the duration, ms, of the step response in `figures` of `loop_figures`; 0 without a response."""
     return figures["step"]["t_ms"][-1] if figures["step"] else 0.0
 
 
 def lengthen_step(figures: Figures, check: AxisCheck, end_ms: float) -> Figures:
-    """Return a copy of `figures`, of `loop_figures`, whose step lasts until `end_ms`.
+    """Return a copy of `figures`, a result of `loop_figures`, whose step response lasts at least `end_ms`.
 
-    Returns `figures` itself without a step or with one that is long enough. `check` is the check of the axis, from
-    which the step is computed again.
+    The response is computed again from `check`, the `running_check` of the axis. Returns `figures` itself without a
+    step response, or with one that is long enough.
     """
     if check.running is None or not 0 < step_duration_ms(figures) < end_ms:
         return figures

@@ -56,7 +56,9 @@ class LiveReferences:
     """
 
     def __init__(self, prepared: Callable[[], Prepared], staging: Staging) -> None:
-        """Begin with the references of the plan; `prepared` returns the running configuration, also a changed one."""
+        """Begin with the references of the plan. `prepared` returns the running configuration, also after a change;
+        `staging` gives access to the loop.
+        """
         self._prepared, self._staging = prepared, staging
         plan = prepared().plan
         self._first_spare = plan.table.size
@@ -72,9 +74,10 @@ class LiveReferences:
     def set(self, axis: str, reference: Mapping[str, object], *, restores: bool = False) -> int:
         """Start a generator, {kind, …} as in [axis.reference], on the axis of this name. Returns its first tick.
 
-        Its values are in µm, in raw mode in V. `restores`: the reference was active before, so a position interlock
-        that was narrowed since does not refuse it. Raises ConfigError for an unknown axis, invalid keys, a table that
-        cannot be read and values beyond the limits; Refusal within `reserved`, and as `Desk.submit`.
+        Its values are in µm, in raw mode in V. `restores`: the reference was active before, so a constant one is not
+        refused beyond the position interlock, which may have been narrowed since. Raises ConfigError for an unknown
+        axis, invalid keys, a table that cannot be read and values beyond the limits; Refusal within `reserved`, and as
+        `Desk.submit`.
         """
         try:
             options = type_adapter(ReferenceOptions).validate_python(dict(reference))
@@ -89,7 +92,8 @@ class LiveReferences:
 
         Played once, the last sample is held. The second column, µm, is added to the command. Returns the tick of the
         first sample; does not wait for the others. Raises ConfigError for an unknown axis, and for samples that are
-        none, not finite, too many or beyond the limits; Refusal within `reserved`, and as `Desk.submit`.
+        none, not finite, too many or beyond the limits; Refusal within `reserved` and while the loop may still read an
+        earlier table; else as `Desk.submit`.
         """
         if samples.size == 0 or not np.all(np.abs(samples) < USABLE_MAGNITUDE):
             raise invalid_request(
@@ -103,10 +107,11 @@ class LiveReferences:
             return self.play(axis_number(self._prepared(), axis), values, table.samples)
 
     def play_raw(self, number: int, samples_v: Real) -> int:
-        """Start drives `samples_v` (n,), V, once, a tick each, as reference of axis `number`; the caller sets mode raw.
+        """Play `samples_v` (n,), V, once, a tick each, as the reference of axis `number`; the last one is held.
 
-        Limits are not checked. Returns the tick of the first sample. Raises Refusal, UnconfirmedCommand; ConfigError
-        for too many samples.
+        The caller sets mode raw, in which the reference is the drive. Limits are not checked. Returns the tick of the
+        first sample. Raises ConfigError for too many samples, Refusal while the loop may still read an earlier table,
+        else as `Desk.submit`.
         """
         with self._service_change(number):
             return self._submit_table(number, [Generator.TABLE, 0, samples_v.size, 1.0, 0.0], samples_v)
@@ -115,8 +120,8 @@ class LiveReferences:
         """Play samples (n, 1 or 2) once on axis `number`, `hold_ticks` ticks each, as `set_waveform` does.
 
         `replaces` is the axis's entry of `client_counts` when the caller decided to play; ReferenceReplaced is raised
-        if a client has set a reference since. Limits are not checked. Returns the tick of the first sample. Raises
-        Refusal, UnconfirmedCommand as `Desk.submit`; ConfigError for too many samples.
+        if a client has set a reference since. Limits are not checked. Returns the tick of the first sample. Raises also
+        ConfigError for too many samples, Refusal while the loop may still read an earlier table, else as `Desk.submit`.
         """
         count, columns = samples.shape
         with self._service_change(number, replaces):
@@ -124,7 +129,8 @@ class LiveReferences:
             return self._submit_table(number, values, samples.T.ravel())
 
     def setting(self, number: int) -> Setting | None:
-        """Return the reference of axis `number` for `restart`, with a copy of its samples; None if it is unknown.
+        """Return the reference of axis `number` for `restart`, with a copy of the samples of a client's table; None if
+        the reference is unknown.
 
         Does not wait for the loop.
         """
@@ -140,7 +146,8 @@ class LiveReferences:
     def restart(self, number: int, setting: Setting, replaces: int) -> int:
         """Start a reference again, from its beginning, without a check of limits. Returns its first tick.
 
-        The loop must have the same configured tables. `replaces` and errors as in `play_once`.
+        The loop must have the configured tables that it had when `setting` was stored. `replaces` and errors as in
+        `play_once`.
         """
         with self._service_change(number, replaces):
             values = list(setting.values)
@@ -150,7 +157,7 @@ class LiveReferences:
 
     @contextmanager
     def reserved(self, activity: str) -> Iterator[None]:
-        """Refuse the references of clients during the work within: the loop would take their µm for V.
+        """Refuse the references of clients during the work within, in which the loop would take their µm for V.
 
         `activity` is the reason in the refusal, in words. References of the service itself are accepted.
         """
@@ -163,10 +170,11 @@ class LiveReferences:
 
     @contextmanager
     def _service_change(self, number: int, replaces: int | None = None) -> Iterator[None]:
-        """Hold the staging lock in the block, and count the references set on axis `number` there as the service's own.
+        """Hold the staging lock during the work within, and count the references that this work sets on axis `number`
+        as the service's own.
 
-        `replaces` is an earlier entry of `client_counts`; if it is given and the count has changed since, a client has
-        set a reference, and ReferenceReplaced is raised before the block.
+        Raises ReferenceReplaced, before the work, if the axis's entry of `client_counts` is no longer `replaces`: a
+        client has set a reference since. None: without this check.
         """
         with self._staging.lock:
             if replaces is not None and self.client_counts[number] != replaces:
@@ -183,13 +191,18 @@ class LiveReferences:
         return self._active_references.trip
 
     def set_count(self, number: int) -> int:
-        """Return how many references were set on axis `number` so far; waits for the end of a change under way."""
+        """Return how many references clients and service have set on axis `number` since the loop's start.
+
+        Waits for the end of a change under way. References that the loop refused do not count.
+        """
         with self._staging.lock:
             return self._set_counts[number]
 
     @property
     def client_counts(self) -> tuple[int, ...]:
-        """Number of references that clients set on each axis; a change that is under way may not be counted yet."""
+        """Number of references that clients have set on each axis since the loop's start; one that is being set may not
+        be counted yet.
+        """
         return tuple(count - own for count, own in zip(self._set_counts, self._own_counts, strict=True))
 
     def follow(self) -> None:
@@ -197,18 +210,19 @@ class LiveReferences:
         self._active_references.follow()
 
     def restore_configured(self, number: int) -> int:
-        """Start the configured reference of axis `number`, without a check of limits.
+        """Start the configured reference of axis `number`, without a check of limits. Returns its first tick.
 
-        Returns the tick at which it took effect; raises as `Desk.submit`.
+        Raises as `Desk.submit`.
         """
         generator = self._prepared().plan.generators[number]
         with self._staging.lock:
             return self._submit(number, [float(generator["kind"]), *generator["parameters"].tolist()])
 
     def constant_reference_um(self, number: int) -> float:
-        """Return the constant reference that the loop has for axis `number`, µm; waits for a change under way.
+        """Return the value, µm, of the constant reference that the loop has for axis `number`.
 
-        Raises Refusal if it is not constant, is in V, is unknown, or the loop stands still.
+        Waits for a change under way. Raises Refusal if the reference is not constant, is in V or is unknown, and if the
+        loop stands still.
         """
         reference, name = self._active_references.newest(number), self._prepared().plan.axes[number]
         setpoint = f"`rtloop ctl setpoint {name} VALUE`"
@@ -250,8 +264,9 @@ class LiveReferences:
         """Start a generator on axis `number` and return its first tick; the staging lock must be held.
 
         Table samples go to shared memory. `values` and `samples` as `generator` returns them, `restores` as in `set`.
-        Raises ConfigError beyond limits.command_um (raw mode: beyond the drive's limits), for a setpoint beyond the
-        position interlock and for too many samples; Refusal within `reserved`; Refusal, UnconfirmedCommand.
+        Raises ConfigError for values beyond limits.command_um (in raw mode: beyond the limits of the drive), for a
+        constant reference beyond the position interlock (not in raw mode) and for too many samples; Refusal within
+        `reserved` and while the loop may still read an earlier table; else as `Desk.submit`.
         """
         if self._activity:
             raise Refusal(f"reference: {self._activity}; send the request again afterwards")
@@ -276,8 +291,8 @@ class LiveReferences:
     def _submit(self, number: int, values: list[float], *, table: bool = False) -> int:
         """Start a generator on axis `number` and count it, unless it is refused. Returns its first tick.
 
-        `values` are [kind, *parameters]. The staging lock must be held. `table`: the samples are in the free place of
-        the axis in shared memory, which must not change until the loop has read it. Raises as `Desk.submit`.
+        `values` are [kind, *parameters]. The staging lock must be held. With `table`, the samples are in the free one
+        of the axis's two places in shared memory, which then is the place in use. Raises as `Desk.submit`.
         """
         try:
             if table:
@@ -291,8 +306,8 @@ class LiveReferences:
         return tick
 
     def _record_set(self, number: int, table: bool) -> None:
-        """Count a reference of axis `number`; with `table`, its place in shared memory is in use from now on, and the
-        other one is free.
+        """Count a reference of axis `number`; with `table`, exchange the axis's free place in shared memory and the
+        place in use.
         """
         self._set_counts[number] += 1
         if table:
@@ -302,7 +317,8 @@ class LiveReferences:
         """Copy `samples` to the free one of the axis's two places in the shared table, play them, and return the tick.
 
         `values` as in `play`; `values[1]`, the index of the first sample, is set here. Raises ConfigError for too many
-        samples, Refusal, UnconfirmedCommand.
+        samples, Refusal while the loop may still read an earlier table (`Staging.require_settled`), else as
+        `Desk.submit`.
         """
         self._staging.require_settled()
         table, first_spare, axis_count = self._staging.block["table"], self._first_spare, len(self._active_places)
@@ -316,7 +332,8 @@ class LiveReferences:
 
 
 def _setpoint_fault(values: Sequence[float], position_limit_um: float) -> str | None:
-    """Return the fault of a constant reference beyond ±`position_limit_um`; None within it and for other generators.
+    """Return the fault, in words, of a constant reference beyond ±`position_limit_um`; None for a smaller one and for
+    generators of another kind.
 
     `values` are [kind, *parameters] of the generator.
     """

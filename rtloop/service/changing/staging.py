@@ -24,17 +24,18 @@ class Staging:
         self._unsettled_tick: int | None = None
 
     def require_settled(self) -> None:
-        """Raise Refusal until the loop has executed two ticks after an UnconfirmedCommand of `submit`: until then, the
-        loop may still read the data staged for it.
+        """Raise Refusal if the loop has executed less than two ticks since the last UnconfirmedCommand of `submit`: it
+        may still read the data that were staged for that command.
         """
         if self._unsettled_tick is not None and int(self.block["ticks_head"][0]) <= self._unsettled_tick + 1:
             raise Refusal("the loop stands still and has not finished an earlier change; try again when the loop runs")
         self._unsettled_tick = None
 
     def submit(self, kind: Kind, number: int, values: list[float], change: str | None = None) -> int:
-        """Announce the data staged for axis `number`. Returns the tick at which the loop has loaded them.
+        """Send the command `kind`, with `values`, for the data that are staged for axis `number`. Returns the tick at
+        which the loop has loaded the data.
 
-        Raises Refusal, and UnconfirmedCommand if the loop may still read the data. `change` as in `Desk.submit`.
+        `change` and errors as in `Desk.submit`. After an UnconfirmedCommand, `require_settled` refuses for two ticks.
         """
         try:
             return self.desk.submit(kind, axis=number, values=values, change=change)

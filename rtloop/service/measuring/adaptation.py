@@ -54,22 +54,26 @@ def _run_at_low_priority(command: Sequence[str]) -> subprocess.CompletedProcess[
 
 
 class RetuneSchedule:
-    """Schedule of the axes: due `every_s` after the loop was first seen running, then after each attempt.
+    """Schedule of the axes with [axis.adapt]: an axis is due `every_s` after the loop was first seen running, then
+    `every_s` after each attempt.
 
     `socket` is the path of the service's control socket. `run_command` runs a command until it ends and returns its
     exit code, stdout and stderr; it may raise OSError or TimeoutExpired.
     """
 
     def __init__(self, service: Service, socket: Path, run_command: CommandRunner = _run_at_low_priority) -> None:
-        """Prepare the schedule; `run_command` runs a command line until it ends. No axis is due before its interval."""
+        """Prepare the schedule; no axis is due before its first interval has passed.
+
+        `run_command` runs a command line until it ends, as `_run_at_low_priority` does.
+        """
         self._service, self._socket, self._run = service, socket, run_command
         self._interval_start_s: dict[str, float] = {}
 
     def retune_due_axes(self, now_s: float) -> None:
         """Retune the axes that are due at the monotonic time `now_s`, one after another, and wait for each.
 
-        An interval begins at the first call with a running loop, and at each attempt. A call without a running loop
-        restarts all intervals.
+        The interval of an axis begins at the first call in the state "running", and at each attempt. A call in any
+        other state ends all intervals; they begin again at the next call in the state "running".
         """
         if self._service.state is not State.RUNNING:
             self._interval_start_s.clear()

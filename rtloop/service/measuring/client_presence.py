@@ -19,7 +19,7 @@ class ClientDisconnected(Refusal):
 def bind_client(is_waiting: Callable[[], bool]) -> AbstractContextManager[None]:
     """Return a context manager that makes `is_waiting` the answer of `is_client_waiting` for the work within.
 
-    `is_waiting` returns whether the client is still connected. It also counts in threads that copy the context.
+    `is_waiting` returns whether the client is still connected. Threads that copy the context get this answer, too.
     """
     return set_in_context(_is_waiting, is_waiting)
 

@@ -28,8 +28,8 @@ class Condition(StrEnum):
 def axis_condition(rows: Real, axis: int, limits: LimitsOptions) -> Condition | None:
     """Return the condition of axis number `axis` over the records `rows` (n, columns); None without closed-loop ticks.
 
-    SATURATED if the law exceeds a limit of command or drive in more than half of them, else NOT_SETTLED if |error|
-    exceeds `settled_within_um` (None: never) in more than half, else CONTROLLED. Ticks in other modes do not count. The
+    SATURATED if the law demands a command or drive beyond its limits in more than half of the closed-loop ticks, else
+    NOT_SETTLED if |error| exceeds `settled_within_um` (None: never) in more than half of them, else CONTROLLED. The
     slew limit does not count: it delays the drive and does not bound it.
     """
     closed_rows = rows[rows[:, signals.MODE] == Mode.CLOSED_LOOP]

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 class Progress(NamedTuple):
     """Progress of a measurement: `activity` (response, learn) and axis; for learning also the rms error of each
-    finished cycle, µm, and the number of cycles.
+    finished cycle, µm, beginning with the one without learning, and the number of cycles that follow that one.
     """
 
     activity: str
@@ -22,13 +22,14 @@ class CurrentMeasurement:
     """The current measurement of a service; there is at most one at a time."""
 
     def __init__(self) -> None:
+        """Begin without a measurement."""
         self._progress: Progress | None = None
 
     def for_json(self) -> dict[str, object] | None:
         """Return the progress as {activity, axis, rms_um, cycles}; None without a measurement.
 
-        Of a learning, `rms_um` has the rms error of each finished cycle, in µm, and `cycles` is the number of cycles
-        that it will have; otherwise they are () and None.
+        In a learning, `rms_um` has the rms error of each finished cycle, in µm, first of the cycle without learning;
+        `cycles` is the requested number of cycles that follow that one. Else `rms_um` is () and `cycles` None.
         """
         progress = self._progress
         return None if progress is None else progress._asdict()
@@ -40,7 +41,10 @@ class CurrentMeasurement:
 
     @contextmanager
     def begin(self, activity: str, axis: str, cycles: int | None = None) -> Iterator[None]:
-        """Report a measurement during the work within; `cycles` is the number of cycles of a learning."""
+        """Let `for_json` report a measurement of `axis` during the work within.
+
+        `activity` is "response" or "learn"; `cycles` is the requested number of cycles of a learning, else None.
+        """
         self._progress = Progress(activity, axis, cycles=cycles)
         try:
             yield

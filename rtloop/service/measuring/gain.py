@@ -11,8 +11,9 @@ from rtloop.service.measuring.player import Player
 def measure_gain(player: Player, limits: LimitsOptions, span_um: float) -> StaticGain:
     """Move the axis over setpoints up to `span_um` from the present one, towards the middle of the range, and back.
 
-    Returns the static gain, µm of position per µm of command, with its standard deviation. Raises ValueError if the
-    loop does not follow the setpoints, and the exceptions of `Player.play_and_read`; then, too, the axis moves back.
+    Returns the static gain, µm of position per µm of command, with its standard deviation. Raises ValueError if a step
+    does not move command and position in the same direction, and the exceptions of `Player.play_and_read`, after which
+    the axis moves back, too, unless another client has set a reference.
     """
     middle_um = 0.0 if limits.lowest_v < 0 else limits.command_um / 2
     to_um = player.hold_um + (-span_um if player.hold_um > middle_um else span_um)

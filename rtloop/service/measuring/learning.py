@@ -77,16 +77,16 @@ def learn(
     request: LearnRequest,
     add_cycle: Callable[[float], None] = lambda _: None,
 ) -> LearnResult:
-    """Play a period on an axis at a setpoint, cycle after cycle, each with a table that the error of the one before
-    has corrected. Returns all cycles and the best table, after all of them.
+    """Play a period on an axis at a setpoint, cycle after cycle, each with a table that the error of the cycle before
+    has corrected. Returns all cycles, the best table and the reason for the end, after the last cycle.
 
     At the end the loop plays the best table if `keep` is true, else it returns to its setpoint. `add_cycle` receives
     the rms error of each cycle, µm, at its end.
 
     Raises ConfigError for an invalid request and for a loop in which learning would not converge, Refusal if the state
-    does not allow the learning or it was aborted. After an abort the loop plays the best table if `keep` is true, or
-    returns to its setpoint, unless it tripped or another reference was set. Raises ClientDisconnected if the client
-    disconnects before the end; the loop then returns to its setpoint.
+    does not allow the learning or the learning was aborted. After an abort the reference becomes the best table if
+    `keep` is true and a cycle was judged, else the setpoint, unless a client has set another one. Raises
+    ClientDisconnected if the client disconnects before the end; the loop then returns to its setpoint.
     """
     number = live.axis_number(axis)
     rate_hz = live.prepared.configuration.loop.rate_hz
@@ -94,7 +94,8 @@ def learn(
     settle_periods, judged_periods = cycle_periods(ticks, rate_hz)
     if (duration_s := (request.cycles + 1) * (settle_periods + judged_periods) * ticks / rate_hz) > MAX_DURATION_S:
         raise _invalid_request(
-            f"{request.cycles} cycles take {duration_s:.0f} s; allowed: at most {MAX_DURATION_S:g} s"
+            f"{request.cycles} cycles, and one without learning before them, take {duration_s:.0f} s; allowed: at most "
+            f"{MAX_DURATION_S:g} s; use fewer cycles"
         )
     gains = _learning_gains(live, number, request)
     player = Player(supervisor, live, number, "learn")
@@ -129,19 +130,23 @@ class _Trials:
     """Tables that were played, and the errors of each; `add_cycle` receives the rms error of each, µm."""
 
     def __init__(self, add_cycle: Callable[[float], None]) -> None:
+        """Begin without a table; `add_cycle` receives the rms error of each table, µm, when it is added."""
         self._add_cycle = add_cycle
         self.cycles: list[Cycle] = []
         self.tables: list[Real] = []
 
     def add(self, table: Real, error_um: Real) -> None:
-        """Add a table (n, 2: reference, command, µm) and its error (n,), µm; report its rms error."""
+        """Add a table (n, 2: reference, command, µm) and its error (n,), µm; pass the rms error to `add_cycle`."""
         self.tables.append(table)
         self.cycles.append(Cycle(rms(error_um), float(np.abs(error_um).max())))
         self._add_cycle(self.cycles[-1].rms_um)
 
     @property
     def best_cycle(self) -> int:
-        """Number of the cycle with the smallest rms error; 0 is the one without learning."""
+        """Number of the cycle with the smallest rms error; 0 is the cycle without learning.
+
+        Raises ValueError before the first `add`.
+        """
         return min(range(len(self.cycles)), key=lambda cycle: self.cycles[cycle].rms_um)
 
     @property
@@ -163,8 +168,8 @@ def _run_cycles(
 ) -> str:
     """Play, judge and improve the table, cycle after cycle, and add each to `trials`. Returns the reason for the end.
 
-    Of each table, `judged_periods` are judged after `settle_periods` for settling. Ends early once the rms error
-    exceeds MAX_ERROR_GROWTH times the smallest. Raises as `_mean_error_um`.
+    Each table plays for `settle_periods`, which are not judged, then for `judged_periods`. Ends early once the rms
+    error exceeds MAX_ERROR_GROWTH times the smallest of all cycles. Raises as `_mean_error_um`.
     """
     table = unlearned_table(request.reference_um)
     for cycle in range(request.cycles + 1):
@@ -177,10 +182,11 @@ def _run_cycles(
 
 
 def _learning_gains(live: LiveLaw, number: int, request: LearnRequest) -> LearningGains:
-    """Return gains with which learning converges for the axis's model and resonances within `resonance_percent` of it.
+    """Return gains with which learning converges for the model of axis `number`, also with its resonance shifted within
+    ±`resonance_percent`.
 
-    Raises ConfigError for an axis without model, with a shared controller, or without a linear one, and without such
-    gains.
+    Raises ConfigError for an axis without a model, with a shared controller or without a linear controller, and if
+    there are no such gains.
     """
     configuration = live.prepared.configuration
     options, rate_hz = configuration.axes[number], configuration.loop.rate_hz
@@ -204,12 +210,12 @@ def _learning_gains(live: LiveLaw, number: int, request: LearnRequest) -> Learni
 
 
 def _mean_error_um(player: Player, reference_um: Real, table: Real, settle_periods: int, judged_periods: int) -> Real:
-    """Play `table`, one period (n, 2: reference, command, µm), for all periods; return the mean error (n,), µm.
+    """Play `table`, one period (n, 2: reference, command, µm), `settle_periods` + `judged_periods` times; return the
+    mean error (n,), µm, of the last `judged_periods`.
 
-    The error is `reference_um` (n,), the desired position, minus the measured one, averaged over the last
-    `judged_periods`; `settle_periods` go before. The periods are sent as one waveform without repeat, whose last value
-    is held afterwards, so that the next table continues from there at any time. Raises as `Player.play` and
-    `Player.read`, and Refusal if another reference or command was played meanwhile.
+    The error is `reference_um` (n,), the desired position, minus the measured one. All periods are sent as one waveform
+    without repeat, whose last value is held afterwards, so that the next table continues from this value at any time.
+    Raises as `Player.play` and `Player.read`, and Refusal if another reference or command was played meanwhile.
     """
     ticks, repeated_table = reference_um.size, np.tile(table, (settle_periods + judged_periods, 1))
     rows = player.read(player.play(repeated_table), len(repeated_table))[settle_periods * ticks :]
@@ -224,10 +230,12 @@ def _mean_error_um(player: Player, reference_um: Real, table: Real, settle_perio
 
 
 def _glide_samples(from_um: float, to_um: float, ticks: int) -> Real:
-    """Return a half cosine (ticks, 1) from `from_um`, which is left out, to `to_um`."""
+    """Return a half cosine (ticks, 1), µm, from `from_um`, which is left out, to `to_um`, which is the last sample."""
     return (from_um + (to_um - from_um) * (1 - np.cos(np.pi * np.arange(1, ticks + 1) / ticks)) / 2)[:, np.newaxis]
 
 
 def _invalid_request(message: str) -> ConfigError:
-    """Return the error for a request that is invalid, or that the loop's configuration does not allow."""
+    """Return, without raising it, the error for a request that is invalid or that the loop's configuration does not
+    allow; its only fault is `message` behind "learn: ".
+    """
     return ConfigError("request", [f"learn: {message}"])

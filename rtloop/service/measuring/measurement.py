@@ -54,10 +54,11 @@ class MeasurementHistory:
     """Figures of the last MAX_MEASUREMENTS measurements of an axis: `LoopMeasurement.figures`, and `unix_time_s`."""
 
     def __init__(self) -> None:
+        """Begin without measurements."""
         self._figures: deque[dict[str, Any]] = deque(maxlen=MAX_MEASUREMENTS)
 
     def add(self, measurement: LoopMeasurement) -> None:
-        """Add the figures of a measurement, with the present time."""
+        """Add the figures of a measurement, with the present time; beyond MAX_MEASUREMENTS remove the oldest ones."""
         self._figures.append({"unix_time_s": round(time.time(), 3)} | measurement.figures())
 
     @property
@@ -66,8 +67,8 @@ class MeasurementHistory:
         return self._figures[-1]
 
     def for_json(self) -> Mapping[str, object]:
-        """Return the newest figures, and `resonance_trend`: [[time (s since 1970), Hz, its standard deviation], …] of
-        the stored measurements that found a resonance, oldest first. There must be a measurement.
+        """Return the keys of `newest`, and `resonance_trend`: [[time (s since 1970), resonance (Hz), its standard
+        deviation (Hz)], …] of the stored measurements that found a resonance, oldest first. One must be stored.
         """
         resonances = [
             (figures["unix_time_s"], figures["resonance"]) for figures in self._figures if figures["resonance"]
@@ -183,7 +184,9 @@ class _ExcitationRun:
     """Player of multisines about the setpoint, within a stated range of the position; `driver` is the driver's kind."""
 
     def __init__(self, player: Player, driver: str) -> None:
-        """Play by `player`, in a loop with this driver kind; the position is unlimited before `limit_motion`."""
+        """Play by `player`, in a loop whose driver is of the kind `driver`; any position is allowed before
+        `limit_motion`.
+        """
         self._player, self._driver = player, driver
         self._lowest_um, self._highest_um = -np.inf, np.inf
 
@@ -204,9 +207,9 @@ class _ExcitationRun:
     def play_largest(self, lines: LineGrid, amplitude_um: float, periods: int) -> dict[str, Real]:
         """Play multisines, the last for `periods` periods, and return the signals of the last, as `play` does.
 
-        Each attempt is shaped by the response to the one before, so that the position's motion approaches
-        `amplitude_um`. Raises Refusal, also for too much motion in the first attempt, or in MAX_TRIES of the later
-        ones, which are repeated with less amplitude until then.
+        Each multisine is shaped by the response to the one before, so that the position's motion approaches
+        `amplitude_um`. One that moves the position too much is repeated with less amplitude, except the first. Raises
+        Refusal as `play`, for too much motion only in the first multisine or in MAX_TRIES of the later ones.
         """
         period = excitation.first_period(lines, amplitude_um)
         amplitude_ratios, remaining_tries = [*excitation.AMPLITUDE_RATIOS], MAX_TRIES
@@ -228,10 +231,11 @@ class _ExcitationRun:
         return loop_signals
 
     def play(self, period: Real, periods: int) -> dict[str, Real]:
-        """Play one period for settling, then `periods` periods and a fade. Returns {name: (ticks,)} of all their ticks.
+        """Play `period` (samples,), µm, about the setpoint once for settling, then `periods` times, and a fade. Returns
+        {name: (ticks,)} of all these ticks.
 
-        The names are those of SIGNALS and, except with the driver TICK_DRIVEN, `periods_missed`. Raises as
-        `Player.play_and_read`, and _ExcessiveMotion.
+        The names are the keys of SIGNALS and, except with the driver TICK_DRIVEN, `periods_missed`. Raises as
+        `Player.play_and_read`, and _ExcessiveMotion if the position leaves the range of `limit_motion`.
         """
         player = self._player
         samples = excitation_sequence(period, periods, player.hold_um, round(FADE_S * player.rate_hz))

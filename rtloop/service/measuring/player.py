@@ -51,12 +51,12 @@ class Player:
 
     @property
     def next_tick(self) -> int:
-        """Number of the next tick."""
+        """Number of the tick that the loop executes next."""
         return self._supervisor.ticks
 
     @property
     def owns_reference(self) -> bool:
-        """Whether no other client has set a reference of the axis since this player's last one.
+        """Whether no other client has set a reference of the axis since this player's last one, or since its start.
 
         Waits until a reference that is being set has taken effect or was refused; a refused one does not count.
         """
@@ -65,8 +65,8 @@ class Player:
     def play(self, samples: Real, *, repeat: bool = False) -> int:
         """Play samples (n, 1 or 2), µm, one per tick: reference, addition to the command. Returns the first one's tick.
 
-        They play once, and the last is held; with `repeat`, endlessly. Does not wait for them. Raises as
-        `LiveReferences.set_waveform`, and Refusal if another client has set a reference.
+        The samples play once, and the last one is held; with `repeat` they play endlessly. Does not wait for their end.
+        Raises as `LiveReferences.set_waveform`, and Refusal if another client has set a reference.
         """
         self._require_ownership()
         with self._count_own_reference():
@@ -97,9 +97,9 @@ class Player:
 
     @contextmanager
     def return_to_hold(self) -> Iterator[None]:
-        """Hold the setpoint again after the work within, unless another client has set a reference.
+        """Hold the setpoint again after the work within, also if it fails, unless another client has set a reference.
 
-        A failure of this is ignored.
+        An RtloopError of this return is ignored.
         """
         try:
             yield
@@ -109,7 +109,7 @@ class Player:
                     self.hold(self.hold_um)
 
     def play_and_read(self, samples: Real, check_position: Callable[[Real], None] = lambda _: None) -> Real:
-        """Play references (ticks,), wait for their ticks, and return their records (ticks, columns).
+        """Play references (ticks,), µm, once, wait for their ticks, and return the records of these (ticks, columns).
 
         `check_position` as in `read`. Raises as `play` and `read`, and Refusal if the records have another reference.
         """
@@ -130,8 +130,9 @@ class Player:
         """Wait for `count` ticks from tick `first` on and return their records (count, columns).
 
         `check_position` receives the positions (n,), µm, of new records and may raise Refusal. Raises Refusal for a
-        tick that cannot be used (tripped, not in closed loop, clipped), after lost ticks, for another reference, and
-        READ_MARGIN_S after the ticks were due; ClientDisconnected. The reference that plays is not changed.
+        tick that cannot be used (tripped, not in closed loop, clipped), if ticks were overwritten before they were
+        read, once another client has set a reference, and READ_MARGIN_S after the last tick was due. Raises
+        ClientDisconnected once the client has disconnected. The reference that plays is not changed.
         """
         ring = self._supervisor.block.ring("ticks")
         rows = np.empty((count, ring.slots.shape[1]))

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 LOOK_PERIOD_S = 0.5
 MAX_TICKS = 1 << 14
 PEAK_LOOKS = 120
-"""Number of updates (one minute) over which the largest values are taken."""
+"""Number of updates, one minute, whose largest values are stored."""
 LATENESS_US = (1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0, 200.0, 500.0, 1e3, 2e3, 5e3, 1e4, 1e5)
 """Upper bounds of the buckets of the lateness."""
 LIMIT_FLAGS = {"command": Flag.COMMAND_LIMITED, "drive": Flag.DRIVE_LIMITED, "slew": Flag.SLEW_LIMITED}
@@ -53,9 +53,11 @@ class AxisSums:
     """Condition at the newest update; None outside closed loop."""
 
     def add(self, error_um: Real, drive_v: Real, is_closed_loop: npt.NDArray[np.bool_]) -> None:
-        """Add ticks: the error (µm) of those in closed loop, and the drive (V) of all.
+        """Add n ticks to the sums, the error (µm) of the ticks in closed loop and the drive (V) of all, and their
+        largest values to `peaks`.
 
-        All arrays are (n,); `is_closed_loop` marks the ticks in closed loop. Values that are not finite are skipped.
+        All arrays are (n,); `is_closed_loop` marks the ticks in closed loop. Values that are not finite are skipped;
+        without a finite drive `peaks` stays.
         """
         errors = error_um[is_closed_loop & np.isfinite(error_um)]
         drives = drive_v[np.isfinite(drive_v)]
@@ -89,10 +91,11 @@ class Quality:
         self._last_trip_flags = 0
 
     def update(self, supervisor: Supervisor | None, limits: Sequence[LimitsOptions] = ()) -> None:
-        """Add the ticks since the last call; set the condition of each axis, by its `limits`, over the last of them.
+        """Add the ticks since the last call, and set the condition of each axis, by its `limits`, over the newest of
+        them, at most MAX_TICKS; without new ticks the conditions stay.
 
-        `limits` are in the order of axes. Another `supervisor` is another loop, whose ticks are added from its first.
-        None, without a loop, clears the conditions, and so does a loop before its first tick.
+        `limits` are in the order of axes. Another `supervisor` is another loop, whose ticks are added from its first
+        one. None, without a loop, clears the conditions, and so does a loop before its first tick.
         """
         if supervisor is None or not supervisor.ticks:
             for sums in self.axes.values():

@@ -35,7 +35,7 @@ BUMP_FACTOR = 10.0
 MAX_SAMPLES = 10_000
 """Most samples of a cosine; a longer one holds each sample for some ticks."""
 HELD_COLUMNS = {Mode.RAW: signals.DRIVE, Mode.FEEDFORWARD: signals.COMMAND, Mode.CLOSED_LOOP: signals.POSITION}
-"""Signal that a mode holds as its reference without moving the drive."""
+"""Signal whose newest value, as a constant reference, lets a mode begin without moving the drive."""
 RECORD_TIMEOUT_S = 1.0
 POLL_S = 0.002
 
@@ -62,7 +62,9 @@ def raised_cosine(start: float, end: float, count: int) -> Real:
 
 
 def ramp_ticks(live: LiveLaw) -> int:
-    """Return the duration in ticks, at least 2, of the ramp to the former references, for the slowest axis."""
+    """Return the duration in ticks, at least 2, of the ramp to the former references; the slowest axis determines it
+    for all axes.
+    """
     plan, durations_s = live.prepared.plan, []
     safe_v = np.asarray(plan.coefficients)["safe_v"]
     for number, axis in enumerate(live.prepared.configuration.axes):
@@ -121,10 +123,10 @@ def _restart(former: FormerState, number: int, loop: RunningLoop) -> tuple[float
 
 
 def _hold_present(former: FormerState, number: int, loop: RunningLoop) -> float:
-    """Hold the reference of axis `number` at the value with which entering the former mode does not move the drive.
+    """Set a constant reference of axis `number` with which entering the former mode does not move the drive, and
+    return its value, µm or in raw mode V.
 
-    That is the newest value of the signal in HELD_COLUMNS. Returns it, µm or in raw mode V. Raises as
-    `LiveReferences.restart`.
+    The value is the newest one of the mode's signal in HELD_COLUMNS. Raises as `LiveReferences.restart`.
     """
     value = float(loop.supervisor.newest(1)[-1, signals.axis_column(number, HELD_COLUMNS[former.mode])])
     hold = Setting((float(Generator.HOLD), value), former.mode is Mode.RAW)
@@ -133,9 +135,9 @@ def _hold_present(former: FormerState, number: int, loop: RunningLoop) -> float:
 
 
 def _await_record(supervisor: Supervisor, tick: int) -> Real:
-    """Return the record (columns,) of `tick`, executed just now or next; waits for it.
+    """Wait for the record of `tick`, a tick that the loop has just executed or executes soon, and return it (columns,).
 
-    Raises Refusal after RECORD_TIMEOUT_S.
+    Raises Refusal after RECORD_TIMEOUT_S without this record.
     """
     deadline_s = time.monotonic() + RECORD_TIMEOUT_S
     while time.monotonic() < deadline_s:

@@ -47,7 +47,8 @@ class FormerState:
         return None if has_table or not uses_table else StepReason.CHANGED
 
     def renewed(self, live: LiveLaw) -> FormerState:
-        """Return this state with the references that clients have set since, in the loop of `live`; itself if none.
+        """Return this state for the loop of `live`, this one or a later one, with the references that clients have set
+        since; the state itself if clients have set none in the same loop.
 
         Does not wait.
         """
@@ -64,7 +65,10 @@ class FormerState:
 
 
 def record_former_state(mode: Mode, live: LiveLaw) -> FormerState:
-    """Return the present references and options of the axes, with `mode`. Does not wait."""
+    """Return the state of the loop of `live`: `mode`, with the present references and options of the axes.
+
+    A reference that is unknown is None. Does not wait.
+    """
     counts = live.references.client_counts
     settings = tuple(live.references.setting(number) for number in range(len(counts)))
     table = np.asarray(live.prepared.plan.table)

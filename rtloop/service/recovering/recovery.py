@@ -54,7 +54,7 @@ class RecoveryState(StrEnum):
 
 
 class Host(Protocol):
-    """The service, as far as a recovery uses it."""
+    """The attributes of the service that a recovery uses."""
 
     configuration: Configuration
     supervisor: Supervisor | None
@@ -64,7 +64,7 @@ class Host(Protocol):
 
     @property
     def desk(self) -> Desk:
-        """The desk of the running loop. Raises Refusal without one."""
+        """The desk of the running loop. Raises Refusal without a running loop."""
         ...
 
     @property
@@ -113,10 +113,12 @@ class Recovery:
         self._steps: deque[Step] = deque(maxlen=64)
 
     def observe(self) -> None:
-        """Begin a recovery after a new trip in the loop's events; end one under way that is no longer allowed.
+        """Begin a recovery after a new trip in the loop's events, as `_begin` does; latch a recovery under way, so that
+        the service does not return before `reset`, if it is no longer allowed.
 
-        It ends when [service.recover] is removed, and before the return for any reason of `_obstacle`. A reference that
-        a client sets meanwhile becomes one to return to. Call this often, each time after `LiveReferences.follow`.
+        It is no longer allowed once [service.recover] is removed and, until its return begins, for any reason of
+        `_obstacle`. A reference that a client sets until then becomes one to return to. Call this often, each time
+        after `LiveReferences.follow`.
         """
         with self._guard:
             options, live = self._options, self._host.live
@@ -140,10 +142,12 @@ class Recovery:
                     self._former = self._former.renewed(live)
 
     def _begin(self, trip: Trip, live: LiveLaw, options: RecoverOptions) -> None:
-        """Begin a recovery after a new trip, also in the middle of another one; the guard must be held.
+        """Begin a recovery after a new trip; the guard must be held. A trip during a recovery begins another one, which
+        counts once more, with the same former state.
 
         Latches instead (no return before `reset`) for a reason of `_obstacle`, for an unknown mode, and if no recovery
-        is left within the hour. A trip in mode off has no effect: there is no mode to return to.
+        is left within the hour. No effect while latched, and for a trip in mode off without a recovery under way: there
+        is no mode to return to.
         """
         is_under_way = self._former is not None
         if self._state is RecoveryState.LATCHED or (trip.mode is Mode.OFF and not is_under_way):
@@ -182,9 +186,10 @@ class Recovery:
     def confirm(self, supervisor: Supervisor, live: LiveLaw) -> Return | None:
         """Judge the newest readings if a confirmation is due; unsound ones set the count of confirmations to 0.
 
-        Once all required ones have succeeded in succession, the recovery is RETURNING, and the result is a Return: the
-        state to return to, options and serial number. None before and after that, for another loop, and if an obstacle
-        is found at the end: the recovery latches (no return before `reset`).
+        Once the required number of confirmations has succeeded in a row, the state becomes RETURNING, and the result is
+        a Return: the state to return to, options and serial number. None otherwise: before, in any state but WAITING
+        and CONFIRMING, if `live` is not the loop that `observe` has seen last, and for an obstacle at the end, which
+        latches the recovery (no return before `reset`).
         """
         with self._guard:
             options, former = self._options, self._former
@@ -208,7 +213,7 @@ class Recovery:
             return Return(former, options, self._serial)
 
     def is_current(self, serial: int) -> bool:
-        """Return whether the recovery `serial` is under way, with no trip since it began."""
+        """Return whether the recovery `serial` is still under way; another trip ends it, too."""
         return self._serial == serial
 
     def report(self, serial: int, step: RecoveryStep) -> None:
@@ -221,8 +226,8 @@ class Recovery:
         """End the return `serial`: it succeeded (None), a client took over (CLIENT), or it failed and latches until
         `reset` (any other reason).
 
-        Returns True; False, without effect, if it has ended already, if that loop is gone, or if another trip is in the
-        loop's events: `observe` handles it.
+        Returns True; False, without effect, if the return has ended already, if its loop is gone, or if another trip is
+        in the loop's events, which `observe` handles.
         """
         with self._guard:
             live = self._host.live
@@ -253,7 +258,9 @@ class Recovery:
                 self._end(RecoveryStep.ENDED, StepReason.CLIENT, state)
 
     def clear(self) -> None:
-        """Be ready for the next trip, after a reset; the recoveries of the last hour still count."""
+        """Enter the state READY after a reset, and end a recovery under way; the recoveries of the last hour still
+        count.
+        """
         with self._guard:
             self.end()
             self._state, self._reason, self._causes, self._failures = RecoveryState.READY, StepReason.NONE, 0, 0
@@ -262,8 +269,8 @@ class Recovery:
     def accept_end(self, outcome: str, fault: str) -> bool:
         """Return whether the policy covers a loop that ended without a request, with the `outcome` of its RunResult.
 
-        If True, the return will remove `fault`, the text that the service latches for it, from the service's faults. If
-        False, the recovery latches until `reset`; without a policy it stays as it was.
+        If True, the return will remove `fault`, the text that the service latches for this end, from the service's
+        faults. If False, the recovery latches until `reset`, except without a policy, when its state does not change.
         """
         with self._guard:
             options = self._options
@@ -278,9 +285,9 @@ class Recovery:
     def accept_failed_start(self, fault: str) -> bool:
         """Return whether the policy covers a loop whose driver could not be opened.
 
-        If True, the return will remove `fault`, the text that the service latches for it, from the service's faults.
-        False, without effect, if the policy lacks the cause "driver", and before a first loop has run: that one must
-        start.
+        If True, the return will remove `fault`, the text that the service latches for this failure, from the service's
+        faults. False, without effect, without a policy, if it lacks the cause "driver", and before a first loop has
+        run: the first loop must start.
         """
         with self._guard:
             options = self._options
@@ -289,16 +296,15 @@ class Recovery:
             return self._accept(fault)
 
     def _accept(self, fault: str) -> bool:
-        """Count a loop that ended or could not start, and store `fault`, the text that the service latches for it.
-
-        The return will remove `fault` from the service's faults. Returns True.
+        """Count a loop that ended or could not start, and store `fault`, the text that the service latches for this
+        failure, so that the return removes `fault` from the service's faults. Returns True.
         """
         self._own_faults.add(fault)
         self._failures += 1
         return True
 
     def remove_own_faults(self) -> None:
-        """Remove the faults of ended loops that the policy covers from the service's faults."""
+        """Remove from the service's faults each one that `accept_end` or `accept_failed_start` has accepted."""
         with self._guard:
             self._host.faults[:] = [fault for fault in self._host.faults if fault not in self._own_faults]
             self._own_faults.clear()
@@ -306,7 +312,7 @@ class Recovery:
     @property
     def pause_s(self) -> float:
         """Pause before the next start of a loop, s: `wait_s`, doubled with each further failure, at most
-        LONGEST_PAUSE_S, which it is without [service.recover].
+        LONGEST_PAUSE_S; LONGEST_PAUSE_S without [service.recover].
         """
         wait_s = LONGEST_PAUSE_S if self._options is None else self._options.wait_s
         return min(wait_s * 2.0 ** min(max(self._failures - 1, 0), 10), LONGEST_PAUSE_S)
@@ -326,8 +332,9 @@ class Recovery:
     def for_json(self) -> dict[str, object] | None:
         """Return {state, left, confirmed, confirmations, causes, reason} for `/status`; None without [service.recover].
 
-        `left` is the number of recoveries left within the hour; `confirmed` of the `confirmations` that are required
-        have succeeded, one after another; `causes` are the trip's; `reason` is the last reason in words, or None.
+        `left` is the number of recoveries left within the hour; `confirmed` is the number of confirmations that have
+        succeeded in a row, `confirmations` the required number; `causes` are the names of the trip's causes; `reason`
+        is the last reason in words, None without one.
         """
         with self._guard:
             options = self._options

@@ -20,7 +20,11 @@ RAIL_SHARE = 1e-3
 
 
 def unsound_reason(rows: Real, prepared: Prepared) -> StepReason | None:
-    """Return why the readings in `rows` (n, columns), n > 0, are not sound; None if those of every tick are."""
+    """Return why the records `rows` (n, columns), n > 0, are not sound; None if every tick is sound.
+
+    In this order: ticks missing, a fault of the driver, outputs that are not safe, then for each axis the age of the
+    sample, reading, position and lateness, and the enable input if there is one.
+    """
     flags = rows[:, signals.FLAGS].astype(np.int64)
     if np.any(np.diff(rows[:, signals.TICK]) != 1):
         return StepReason.NO_TICKS
@@ -49,7 +53,9 @@ def _drives_beside_safe(rows: Real, prepared: Prepared) -> bool:
 
 
 def _axis_reason(rows: Real, number: int, limits: InterlockOptions, channel: Channel) -> StepReason | None:
-    """Return why the readings of axis `number` are not sound, None if they are; NaN satisfies no condition."""
+    """Return why the readings of axis `number` are not sound: age, reading, position or, with `late_ticks`, lateness.
+    None if all are within their limits; NaN is not.
+    """
     adc_v = rows[:, signals.axis_column(number, signals.ADC)]
     position_um = rows[:, signals.axis_column(number, signals.POSITION)]
     margin_v = RAIL_SHARE * (channel.maximum_v - channel.minimum_v)

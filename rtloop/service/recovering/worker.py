@@ -30,10 +30,12 @@ class RecoveryWorker:
     """Worker of a recovery; `step` waits for the loop, for seconds during a return."""
 
     def __init__(self, host: Host, recovery: Recovery) -> None:
+        """Work for `recovery` in the loops of the service `host`, at each call of `step`."""
         self._host, self._recovery = host, recovery
 
     def step(self) -> None:
-        """Send the recovery's new steps to the loop, judge its readings, and return to the former state if confirmed.
+        """Send the recovery's new steps to the loop, judge the loop's readings if a confirmation is due, and return to
+        the former state once all confirmations have succeeded.
 
         A return takes seconds. No effect without a loop; an RtloopError is logged.
         """
@@ -49,7 +51,7 @@ class RecoveryWorker:
             log.warning("recovery: %s", error)
 
     def _running_loop(self) -> RunningLoop | None:
-        """Return the loop that executes ticks; None without one."""
+        """Return the running loop, once it has executed a tick; None without one, and for a loop that has ended."""
         supervisor, live = self._host.supervisor, self._host.live
         if supervisor is None or live is None or supervisor.ended:
             return None
@@ -71,9 +73,10 @@ class RecoveryWorker:
                 self._recovery.forget_step(step)
 
     def _return(self, loop: RunningLoop, confirmed: Return) -> None:
-        """Return to the former state of `confirmed`, wait one more `confirmation_s` for a trip, and end the recovery.
+        """Return to the former state of `confirmed`, wait `confirmation_s` to see whether the loop trips again, and end
+        the recovery.
 
-        A failure before ends it by `_fail`.
+        An RtloopError of the return ends it by `_fail`.
         """
         recovery, serial = self._recovery, confirmed.serial
         sine = self._host.configuration.service.depolarise if confirmed.options.depolarise else None
@@ -110,10 +113,11 @@ class RecoveryWorker:
         self._report_steps(loop)
 
     def _fail(self, error: RtloopError, loop: RunningLoop, serial: int) -> None:
-        """End the return `serial`, which `error` ended: latch it, log the error as a fault, and set mode off.
+        """End the return `serial`, which failed with `error`: latch the recovery, log the error, add it to the
+        service's faults, and set mode off.
 
-        If a client took over, the recovery ends without these; after another trip, `Recovery.observe` handles it.
-        Raises as `Desk.submit`.
+        If the error is ReferenceReplaced, a client took over, and the recovery only ends. No effect if the recovery has
+        ended already, or after another trip, which `Recovery.observe` handles. Raises as `Desk.submit`.
         """
         is_client = isinstance(error, ReferenceReplaced)
         if not self._recovery.finish(serial, StepReason.CLIENT if is_client else StepReason.REFUSED) or is_client:
