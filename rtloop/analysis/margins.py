@@ -84,10 +84,10 @@ def gain_crossovers(loop: OpenLoop) -> list[float]:
 
 
 def _gain_margin(loop: OpenLoop, hz: Real, response: Complex) -> tuple[float, float]:
-    """Return the smallest gain factor > 1 that makes the loop unstable, and its frequency in Hz; inf, NaN without one.
+    """Return the smallest gain factor > 1 that brings L to −1, and the frequency in Hz; inf, NaN without one.
 
-    `response` (k,) is L at the loop's grid `hz` (k,). L is real, negative and above −1 there: inside the grid, or at
-    its ends, where L(z = ±1) is real.
+    `response` (k,) is L at the loop's grid `hz` (k,). At the frequency, L is real, negative and above −1: inside the
+    grid, at 0 Hz, or at half the sampling rate.
     """
     real_axis_frequencies = [
         zero_between(lambda f: loop.open(f).imag, *ends) for ends in _sign_changes(hz, np.imag(response))

@@ -51,7 +51,7 @@ class Residual:
     def printed_bound_um(self) -> float:
         """The right side of eq (3) in µm, |Σ ζ w| over thresholds ζ and weights w of `operator`.
 
-        It bounds the residual |Ω| only where the weights behind the first have one sign.
+        It bounds the residual |Ω| for ρ = `gain`, but only where all weights after the first have one sign.
         """
         return float(abs(self.operator.thresholds @ self.operator.weights))
 

@@ -108,7 +108,7 @@ def cascade(zeros: Complex, poles: Complex, gain: float) -> System:
 
 
 def _section(zeros: Complex, poles: Complex) -> System:
-    """Return a section with one or two poles, at most as many zeros, and gain 1 as leading coefficient.
+    """Return a section with one or two poles and at most as many zeros; the leading coefficients are 1.
 
     The numerator is expanded about the poles, not about 0.
     """
@@ -212,6 +212,6 @@ def imaginary_axis_points(roots: Complex) -> Complex:
 def unit_circle_points() -> Complex:
     """Return 401 points just outside |z| = 1, from 1e-6 to 0.9 of half the sampling rate, in a constant ratio.
 
-    At z = −1, zeros dominate.
+    They end before z = −1, where zeros dominate.
     """
     return np.exp((0.01 + 1j) * np.pi * np.geomspace(1e-6, 0.9, 401))

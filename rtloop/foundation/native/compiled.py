@@ -148,6 +148,7 @@ def intrinsic(function: Callable[..., object], uncompiled: Callable[..., object]
 
         @wraps(function)
         def typing_function(_: object, *arguments: Type) -> object:
+            """Call `function` with the module `native.compiler` in place of numba's typing context."""
             return function(compiler, *arguments)
 
         return compiler.types.Function(compiler.make_intrinsic_template(symbol, typing_function, function.__name__))

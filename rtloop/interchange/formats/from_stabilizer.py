@@ -73,8 +73,8 @@ def _frames(path: Path, data: np.ndarray, samples: int) -> np.ndarray:
 
     `samples` is the number of samples of each channel in a batch.
 
-    The length is the shortest one with which every frame begins with the first one's header but for the sequence.
-    Raises UnreadableData without such a length.
+    The frames have the shortest length at which each begins with the magic number, format and sample count of the
+    first. Raises UnreadableData without such a length.
     """
     step = 2 * len(CHANNELS) * samples
     for length in range(HEADER.itemsize + step, min(len(data), LARGEST_FRAME) + 1, step):
