@@ -41,7 +41,8 @@ def add_residual_hysteresis(model: PlayModel, percent: float, drive_v: float) ->
     lowest_percent, highest_percent = residual_percent(0.0), residual_percent(LARGEST_SHARE)
     if not lowest_percent < percent < highest_percent:
         raise ValueError(
-            f"residual_percent: {percent:g} %; allowed: above {lowest_percent:.3g} % and below {highest_percent:.3g} %"
+            f"residual_percent: {percent:g} %; allowed: 0, or above {lowest_percent:.3g} % and below "
+            f"{highest_percent:.3g} %"
         )
     share = root_scalar(lambda share: residual_percent(share) - percent, bracket=(0.0, LARGEST_SHARE), xtol=1e-6).root
     return _add_play(model, share, drive_v)

@@ -113,7 +113,7 @@ def list_columns(path: Path, table: Table, selection: ColumnSelection) -> Mappin
     """Return the content of a file, with unit and extremes of each column.
 
     Keys: file, rows, time, time_column, rate_hz, notes, columns, about, in_other_files; `columns` are {name, unit,
-    grows_evenly, least, largest}, `time_column` is the name of the table's own column of times, None without one;
+    grows_evenly, least, largest}, `time_column` is the name of the column of times found, None without one;
     `time` is a text on the source of the times. Only `time` and `rate_hz` of `selection` are used. If they give no
     usable times, `time` and `rate_hz` are None, and `notes` says why.
     """

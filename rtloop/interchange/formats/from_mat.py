@@ -84,9 +84,14 @@ def _require_bounded_size(path: Path, order: str) -> None:
             file.seek(position)
             kind, length = np.frombuffer(file.read(8).ljust(8, b"\0"), f"{order}u4").tolist()
             if kind not in (MATRIX, COMPRESSED):
-                raise UnreadableData(f"{path}: damaged: no element of a MAT file at byte {position}")
+                raise UnreadableData(
+                    f"{path}: damaged: no element of a MAT file at byte {position}; copy or save the file again"
+                )
             if position + 8 + length > size:
-                raise UnreadableData(f"{path}: cut off: the element at byte {position} ends beyond the end of the file")
+                raise UnreadableData(
+                    f"{path}: cut off: the element at byte {position} ends beyond the end of the file; copy or save "
+                    "the file again"
+                )
             total += length if kind == MATRIX else _decompressed_size(path, file, length, MAX_BYTES - total)
             if total > MAX_BYTES:
                 raise UnreadableData(

@@ -125,7 +125,7 @@ def select_table(
             if in_other_files
             else ""
         )
-        raise UnreadableData(f"{path}: contains no column of numbers{hint}")
+        raise UnreadableData(f"{path}: contains no column with two or more numbers{hint}")
     if group is not None and group not in tables:
         raise UnreadableData(f"{path}: no group {group!r}; there are {', '.join(map(repr, tables))}")
     name = (
