@@ -76,7 +76,7 @@ def loop_margins(loop: OpenLoop) -> Margins:
 def gain_crossovers(loop: OpenLoop) -> list[float]:
     """Return the frequencies in Hz at which |L| of the open loop is 1, rising; [] without one.
 
-    They lie between points of the grid and are refined there.
+    Each is refined between the two points of the grid that enclose it.
     """
     hz = loop.frequencies
     changes = _sign_changes(hz, np.abs(loop.open(hz)) - 1)

@@ -138,7 +138,7 @@ def plants_around(plant: Transfer, percent: float, count: int = 5) -> list[tuple
     """Return (name, plant) of the plant itself and of plants whose resonance is shifted within ±`percent`.
 
     The names are "the model", then such as "resonance +2 %". The shifts are `count` evenly spaced ones, ends included,
-    without a shift of 0. Without a resonance, and for 0 percent, the plant itself is alone.
+    without a shift of 0. The list has the plant itself alone if it has no resonance, or `percent` is 0.
     """
     plants = [("the model", plant)]
     if percent and np.any(plant.poles.imag > 0):

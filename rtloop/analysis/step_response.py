@@ -23,7 +23,8 @@ SAMPLE_COUNT = 1 << 16
 class StepResponse(NamedTuple):
     """Response to a unit step of the reference at 0 s: `time_s`, `position` x, `command` v, each (k,).
 
-    In discrete time there are `POINTS` of each period, over which the command stands still.
+    In discrete time each period has `POINTS` entries, or one where only the samples are known; the command is constant
+    over a period.
     """
 
     time_s: Real

@@ -106,7 +106,7 @@ def residual_operator(actuator: PlayModel, inverse: PlayModel, command_um: float
 
 
 def compensated_output(actuator: PlayModel, inverse: PlayModel, commands_um: npt.ArrayLike) -> Real:
-    """Return the actuator's output y (samples,) in µm behind the inverse, for commands v (samples,) in µm.
+    """Return the output y (samples,) in µm of the actuator that the inverse drives, for commands v (samples,) in µm.
 
     Both models are simulated from rest, without limits.
     """

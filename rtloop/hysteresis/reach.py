@@ -44,7 +44,7 @@ def reachable_range(model: PlayModel, lowest_v: float, highest_v: float, largest
     `highest_v` ≥ 0.
 
     They lie within ±`largest_um`. With a drive of one sign alone, the remanence is the end next to 0: the actuator is
-    at 0 before its first peak, and does not return there. Raises ValueError for a model without inverse.
+    at 0 before its first peak, and does not return to 0. Raises ValueError for a model without inverse.
     """
     is_negative = model.weights.sum() < 0
     if is_negative or -lowest_v > highest_v:

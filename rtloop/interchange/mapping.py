@@ -246,7 +246,7 @@ def _normalised_name(name: str) -> str:
 
 
 def _normalised_path(name: str) -> str:
-    """Return a normalised name with slashes, in place of dots and backslashes too, between the parts of its path."""
+    """Return a normalised name without quotes, with slashes in place of the dots and backslashes of its path."""
     return re.sub(r"[\\./]+", "/", _normalised_name(name).replace('"', "").strip("/"))
 
 

@@ -32,7 +32,7 @@ TIME: dict[str, str | float] = {"Name": "Time", "Unit": "s", "Raster": RASTER}
 
 
 def write_mat(recording: Recording, part: IO[bytes], target: Path, selection: Selection) -> int:
-    """Write the selected ticks to `part`, which will be called `target`. Returns their number.
+    """Write the selected ticks to the open file `part`, which is renamed to `target` later. Returns their number.
 
     Raises RecordingError above the 2 GiB of a MAT file, for a pattern that fits no signal and for a limited time span
     without ticks; OSError if the write fails.

@@ -87,7 +87,7 @@ class Layout:
         return self._extend_record(STATE, 1)
 
     def _extend_record(self, axis_record: np.dtype[np.void], part: int) -> np.dtype[np.void]:
-        """Return a type of record with the slots behind it; `part` is 0 for coefficients, 1 for state."""
+        """Return the type of `axis_record` followed by both slots; `part` is 0 for coefficients, 1 for state."""
         slots: tuple[Slot, ...] = ("feedforward", "controller")
         return np.dtype([*axis_record.descr, *((slot, np.uint8, (self.slot_bytes(slot)[part],)) for slot in slots)])
 

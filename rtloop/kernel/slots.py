@@ -73,9 +73,9 @@ def _call_feedforward(law, a, function, result, value):
 def controller_output(law, a, coefficients, control_address):
     """Compute the output of the controller whose first axis is `a`. Returns (succeeded, command in µm, not checked).
 
-    `control_address` is `law.controls` for a controller of one axis, `law.together` for a coupled one, which writes its
-    commands there; the number returned is then meaningless. A law that raised is recorded in the axis's state: (False,
-    NaN).
+    `control_address` is `law.controls` for a controller of one axis, `law.together` for a coupled one. A coupled one
+    writes its commands to its control record, and the number returned is meaningless. If the law raised, the failure is
+    recorded in the axis's state, and (False, NaN) returned.
     """
     status = _call_controller(law, a, law_functions(law, coefficients.controller_law).output, control_address)
     if status in (OK, NONE):
@@ -132,9 +132,9 @@ def feedforward_output(law, a, coefficients, state, command_um):
 
 @jit_rare
 def feedforward_enter(law, a, drive_v):
-    """Call `enter` of the feedforward of axis `a`, if it has one, with the drive in force; its state is not zeroed.
+    """Call `enter` of the feedforward of axis `a`, if it has one, with the present drive in V; its state is not zeroed.
 
-    A law that raised is recorded in the axis's state; nothing is returned.
+    Returns None; if the law raised, the failure is recorded in the axis's state.
     """
     functions = law_functions(law, coefficients_record(law, a).feedforward_law)
     if functions.enter != 0 and _call_feedforward(law, a, functions.enter, law.result, drive_v) not in (OK, NONE):

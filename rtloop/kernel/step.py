@@ -227,7 +227,7 @@ def _trip_on_law_failure(loop):
 
 @jit
 def _control_axis(law, a):
-    """Set the command of one axis, in its state and its CONTROL record, by a controller for itself alone.
+    """Set the command of one axis, in its state and its CONTROL record, by its controller, which has no other axes.
 
     Returns False, with the failure recorded in the state, if its law failed.
     """
@@ -293,8 +293,8 @@ def _gather_signals(law, first, count):
 def _set_control_inputs(law, i, coefficients, state, resting_um):
     """Set the signals of axis `i` for its controller, which rests at an error of `resting_um`.
 
-    The error has the decaying offset of a bumpless entry, and the reference agrees with it; the command is the one in
-    force.
+    The decaying offset of a bumpless entry is subtracted from the error, and the reference agrees with the result; the
+    command is the one applied last, without the part from the reference.
     """
     control = axis_control(law, i)
     entry_error_um = state.error_um - _bump_offset(coefficients, state, state.error_um - resting_um)
@@ -310,8 +310,8 @@ def _set_control_inputs(law, i, coefficients, state, resting_um):
 def _set_command(law, i, coefficients, state, command_um):
     """Set the command of an axis: the controller's command, its decaying offset, and the part from the reference.
 
-    The controller receives its own part alone. Returns False, with the failure recorded, for a command that is not a
-    usable number.
+    The CONTROL record gets the command without the part from the reference. Returns True; False, with the failure
+    recorded, for a command that is not a usable number.
     """
     gap_um = state.applied_command_um - state.feed_um - command_um
     state.command_bump_um = _decayed_offset(coefficients, state.command_bump_um, state.entering != 0, gap_um)
@@ -382,7 +382,7 @@ def _compute_drive(law, a, loop, coefficients, state, reference):
 
 @jit
 def _bump_offset(coefficients, state, gap):
-    """Advance and return the decaying offset (µm, or V in RAW) that makes a new mode continue from the drive in force.
+    """Advance and return the decaying offset (µm, or V in RAW) that makes a new mode continue from the present drive.
 
     It restarts at `gap` in the tick that enters the mode.
     """

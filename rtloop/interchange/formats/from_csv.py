@@ -87,7 +87,7 @@ class _NumberLines(io.TextIOBase):
         return iter(self._file)
 
     def close(self) -> None:
-        """Close the file behind the text."""
+        """Close the file."""
         self._file.close()
 
 

@@ -1,4 +1,4 @@
-"""Stabilizer's data stream (QUARTIQ): the payloads of its UDP datagrams in a row, as `nc -ul 9293 > FILE` writes them.
+"""Stabilizer's data stream (QUARTIQ): the payloads of its UDP datagrams, joined, as `nc -ul 9293 > FILE` writes them.
 
 A frame has a header, `<HBBI`: 0x057B, format, samples per batch, sequence of the first batch. Format 1 follows with
 batches of two ADC and two DAC channels, 16-bit codes, one channel after the other.
