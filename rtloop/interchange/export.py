@@ -135,7 +135,7 @@ def _write_parquet(recording: Recording, file: IO[bytes], selection: Selection, 
 def _write_npz(recording: Recording, file: IO[bytes], selection: Selection, progress: ReportTicks) -> int:
     """Write an array for each signal, and the texts header_json and events_json.
 
-    The recording is read several times if its columns take more than PASS_BYTES. Returns the number of ticks.
+    Each pass over the recording reads columns of up to PASS_BYTES, at least one. Returns the number of ticks.
     """
     all_names = selection.selected_names(recording)
     ticks = sum(len(rows) for rows in selection.read_blocks(recording, ["tick"]))

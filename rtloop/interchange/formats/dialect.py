@@ -208,7 +208,8 @@ def _first_row(rows: Iterable[Sequence[str]], width: int, numbers: Sequence[int]
 def _header(lines: Sequence[str], delimiter: str | None, width: int) -> tuple[tuple[str, ...], tuple[str, ...], bool]:
     """Return names and units of all `width` columns by the lines above the numbers, and whether there are names.
 
-    A column without a name is `column_1`, …; one without a unit has "".
+    The names are from the last of these lines with `width` or `width` − 1 fields, or from the one before if the last
+    has units, as `_are_units` finds. A column without a name is `column_1`, …; one without a unit has "".
     """
     header_rows = [split_fields(_COMMENT.sub("", line, count=1), delimiter) for line in lines]
     candidates = [

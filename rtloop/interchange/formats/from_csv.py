@@ -49,7 +49,7 @@ def read_csv(path: Path) -> Table:
     about = {
         "table": f"columns separated by {delimiter_name}, decimal sign {dialect.decimal!r}, "
         f"{dialect.encoding.removesuffix('-sig')}, numbers from line {dialect.first + 1} on"
-        + ("" if dialect.has_header else ", no names")
+        + ("" if dialect.has_header else ", no column names")
     }
     text = [name for k, name in enumerate(dialect.names) if k not in used_columns and not name.startswith("column_")]
     if text:
