@@ -68,7 +68,7 @@ def open_folder(path: Path, mode: int | None = None, *, shared: bool = False) ->
 def trusted_owners(folder: Path) -> set[int]:
     """Return the user ids whose files in `folder` are trusted: this user and root, and possibly a third user.
 
-    The third user owns `folder` or a folder above it, while root owns all folders further above.
+    The third user owns `folder` or a folder above it, while root owns all folders further above, which are not sticky.
 
     Raises UntrustedPath if another user owns, or may change, a folder or link of the path, OSError if the system
     refuses.

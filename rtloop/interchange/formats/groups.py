@@ -57,7 +57,7 @@ class FileColumns:
 
         A name that exists already gets a number in brackets. Single values are ignored; arrays of text, matrices with
         more than MATRIX_COLUMNS columns and arrays of more dimensions are listed in `left_out`. Raises UnreadableData
-        for more than MAX_COLUMNS columns.
+        if the file has more than MAX_COLUMNS columns.
         """
         array = np.asarray(values)
         if array.dtype.kind not in "fiub":
