@@ -145,8 +145,8 @@ def extremes(values: Real) -> dict[str, float | None]:
 def _select_signals(table: Table, path: Path, selection: ColumnSelection, time_base: TimeBase) -> ImportedSignals:
     """Return the selected columns as signals, tick and deadline first.
 
-    Raises UnreadableData in the cases of `_select_columns`, and if the values of a signal of whole numbers, such as
-    flags, are not whole.
+    Raises UnreadableData if a column is missing, ambiguous or of another unit, a name is reserved or mapped twice, no
+    column besides the time is left, or the values of a signal of whole numbers, such as flags, are not whole.
     """
     signals = _select_columns(table, path, selection)
     notes = [*time_base.notes, *(column.assumption for column in signals.values() if column.assumption)]

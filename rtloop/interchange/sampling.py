@@ -81,8 +81,8 @@ def is_from_recording(table: Table) -> bool:
 def time_column(table: Table) -> str | None:
     """Return the name of the column of times; None without one.
 
-    The first of these that exists: a recording's deadlines, the file's own column, a column with one of TIME_NAMES, a
-    first column as `_first_column_as_time` accepts it.
+    The first of these that exists: a recording's deadlines, the file's own column, a column with one of TIME_NAMES, the
+    first column if its name ends in `_1`, others follow, and it grows evenly.
     """
     if is_from_recording(table):
         return RECORDING_TIME_COLUMNS[1]

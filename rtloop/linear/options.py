@@ -46,7 +46,11 @@ class TransferOptions(Options):
 
     @model_validator(mode="after")
     def _check(self) -> Self:
-        """Return the options. Raises ValueError for a key that `form` does not take, and like `_transfer`."""
+        """Return the options unchanged.
+
+        Raises ValueError for a key that `form` does not take, for a missing `gain` or `d`, and for values that make no
+        proper transfer function.
+        """
         allowed = {
             "factors": {"gain", "numerator", "denominator"},
             "zpk": {"gain", "zeros", "poles"},
