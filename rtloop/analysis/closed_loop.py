@@ -104,7 +104,7 @@ class Loop:
         """Positions at the POINTS instants of a period, the sample first, from the closed loop's states and the error's
         reference.
 
-        Of a loop whose `between` is None, the position at the sample alone: (1, n) and (1,).
+        If `between` is None, these are the position at the sample alone: (1, n) and (1,).
         """
         _, _, c, d = self.matrices
         if self.between is None:

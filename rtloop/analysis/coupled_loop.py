@@ -56,7 +56,7 @@ class CoupledPlant:
     def hold_plants(self, period_s: float) -> list[HeldPlant]:
         """Return each axis's plant with its delay behind a zero-order hold, without the coupling.
 
-        Raises ValueError for a plant with direct feedthrough and for a negative delay.
+        Raises ValueError for a plant with direct feedthrough, a negative delay and a period that is not positive.
         """
         for plant in self.dynamics:
             if not plant.is_strictly_proper:
@@ -69,10 +69,10 @@ class CoupledPlant:
 
 
 def coupling_matrix(names: Sequence[str], coupling: Sequence[Mapping[str, float]]) -> Real:
-    """Return K (axes, axes), the µm that the row's axis moves, before its dynamics, per µm of the column's command.
+    """Return the coupling K (axes, axes): µm at the input of the row's dynamics per µm of the column's command.
 
-    `coupling` has, for each of `names` in order, the factors of its row by the names of the other axes. K is 1 on the
-    diagonal, and 0 for axes that the dict does not name; other names in the dict are ignored.
+    `coupling` has a dict for each of `names`, in the same order: the factors of its row by the names of the other axes.
+    K is 1 on the diagonal, and 0 for axes that the dict does not name; other names in the dict are ignored.
     """
     pairs = zip(names, coupling, strict=True)
     return np.array([[1.0 if a == b else factors.get(b, 0.0) for b in names] for a, factors in pairs])
@@ -82,7 +82,7 @@ def coupling_matrix(names: Sequence[str], coupling: Sequence[Mapping[str, float]
 class BrokenLoop(Loop):
     """The loop of one axis, the other axes closed: `plant` is from error to position, `command` from error to command.
 
-    `command_injection` is the signal added to the axis's command.
+    `command_injection` is the effect of a signal added to the axis's command.
     """
 
     command: System = UNIT_SYSTEM
@@ -238,7 +238,7 @@ def _structured_singular_value(matrices: Complex) -> Real:
     """Return an upper bound (k,) of the structured singular value μ of `matrices` (k, m, m), for one complex change per
     axis (a diagonal); exact for two axes.
 
-    The bound is σ̄ after a scaling that makes the norms of each row and column beside the diagonal equal (Osborne,
+    The bound is σ̄ after a scaling that makes the norms of each row and column off the diagonal equal (Osborne,
     1960): the Frobenius norm is then least, and with it, for two axes, the largest singular value, as their product
     does not depend on the scaling.
     """

@@ -33,8 +33,9 @@ again."""
 
 
 def cycle_periods(period_ticks: int, rate_hz: float) -> tuple[int, int]:
-    """Return the least whole numbers of periods that settle (SETTLE_S) and that are then evaluated (EVALUATION_S) in a
-    cycle.
+    """Return two numbers of periods in a learning cycle: those to settle first, and those to evaluate then.
+
+    They are the least numbers that last SETTLE_S and EVALUATION_S.
     """
     period_s = period_ticks / rate_hz
     return math.ceil(SETTLE_S / period_s), math.ceil(EVALUATION_S / period_s)

@@ -76,7 +76,7 @@ def loop_margins(loop: OpenLoop) -> Margins:
 def gain_crossovers(loop: OpenLoop) -> list[float]:
     """Return the frequencies in Hz at which |L| of the open loop is 1, rising; [] without one.
 
-    They lie between points of the grid and are refined there.
+    Each is refined between the two points of the grid that enclose it.
     """
     hz = loop.frequencies
     changes = _sign_changes(hz, np.abs(loop.open(hz)) - 1)
@@ -84,10 +84,10 @@ def gain_crossovers(loop: OpenLoop) -> list[float]:
 
 
 def _gain_margin(loop: OpenLoop, hz: Real, response: Complex) -> tuple[float, float]:
-    """Return the smallest gain factor > 1 that makes the loop unstable, and its frequency in Hz; inf, NaN without one.
+    """Return the smallest gain factor > 1 that brings L to −1, and the frequency in Hz; inf, NaN without one.
 
-    `response` (k,) is L at the loop's grid `hz` (k,). L is real, negative and above −1 there: inside the grid, or at
-    its ends, where L(z = ±1) is real.
+    `response` (k,) is L at the loop's grid `hz` (k,). At the frequency, L is real, negative and above −1: inside the
+    grid, at 0 Hz, or at half the sampling rate.
     """
     real_axis_frequencies = [
         zero_between(lambda f: loop.open(f).imag, *ends) for ends in _sign_changes(hz, np.imag(response))

@@ -55,7 +55,8 @@ def stability_range(build_loop: LoopBuilder, plant: Transfer, change: PlantChang
     """Return the range of a change of `plant`, downwards and upwards in percent (both ≥ 0), over which the loop stays
     stable.
 
-    It is (0, 0) for a loop that is unstable without change; an end is None if the search found no unstable loop there.
+    It is (0, 0) for a loop that is unstable without change; an end is None if the search found no unstable loop on its
+    side.
     Raises the errors of `build_loop`.
     """
     return holding_range(lambda changed_plant: build_loop(changed_plant).is_stable, plant, change)
@@ -71,7 +72,8 @@ def holding_range(
     """Return how far a plant may change, downwards and upwards in percent (both ≥ 0), while `holds(plant)` is true.
 
     The range ends at the nearest failure; it is (0, 0) if `holds` is false without change. An end without a failure, up
-    to the end of the search, is None. `coarse` multiplies the steps of the search; `tolerance` in percent.
+    to the end of the search, is None. `coarse` multiplies the steps of the search; the ends are exact to
+    `tolerance` percent.
     """
     if not holds(plant):
         return PercentRange(0.0, 0.0)
@@ -94,7 +96,7 @@ def change_damping(plant: Transfer, percent: float) -> Transfer:
     """Return the plant with the damping ratio of its least damped pole pair multiplied by 1 + `percent`/100; |pole| and
     D(0) stay.
 
-    Raises ValueError where all poles are real, and for a damping ratio above 1.
+    Raises ValueError where all poles are real, and for a new damping ratio beyond ±1.
     """
     pair = least_damped_pole(plant)
     size, damping = abs(pair), -pair.real / abs(pair) * (1 + percent / 100)
@@ -136,7 +138,7 @@ def plants_around(plant: Transfer, percent: float, count: int = 5) -> list[tuple
     """Return (name, plant) of the plant itself and of plants whose resonance is shifted within ±`percent`.
 
     The names are "the model", then such as "resonance +2 %". The shifts are `count` evenly spaced ones, ends included,
-    without a shift of 0. Without a resonance, and for 0 percent, the plant itself is alone.
+    without a shift of 0. The list has the plant itself alone if it has no resonance, or `percent` is 0.
     """
     plants = [("the model", plant)]
     if percent and np.any(plant.poles.imag > 0):

@@ -23,7 +23,8 @@ SAMPLE_COUNT = 1 << 16
 class StepResponse(NamedTuple):
     """Response to a unit step of the reference at 0 s: `time_s`, `position` x, `command` v, each (k,).
 
-    In discrete time there are `POINTS` of each period, over which the command stands still.
+    In discrete time each period has `POINTS` entries, or one where only the samples are known; the command is constant
+    over a period.
     """
 
     time_s: Real
@@ -49,8 +50,9 @@ class StepMetrics(NamedTuple):
 def step_response(loop: Loop, duration_s: float | None = None) -> StepResponse:
     """Return the response to a unit step of the reference, from rest, for `duration_s`.
 
-    By default these are ten times 1/|Re s| of the slowest closed-loop pole, in discrete time plus the pre-filter's
-    settling. A discrete response ends after SAMPLE_COUNT ticks at the latest.
+    The default duration is ten times 1/|Re s| of the slowest closed-loop pole, or 1 s without poles and for a pole on
+    the imaginary axis; in discrete time plus the pre-filter's settling. A discrete response ends after SAMPLE_COUNT
+    ticks at the latest.
     """
     if loop.period_s is not None:
         return _discrete_response(loop, loop.period_s, duration_s)
@@ -118,8 +120,7 @@ def _continuous_response(loop: Loop, interval_s: float) -> StepResponse:
 
 
 def _discrete_response(loop: Loop, period_s: float, duration_s: float | None) -> StepResponse:
-    """Return the step response from rest for `duration_s`, for None as in `step_response` plus the pre-filter's
-    settling.
+    """Return the step response from rest for `duration_s`; None: for the default duration of `step_response`.
 
     The responses to steps of error and command are filtered by the pre-filter and summed.
     """

@@ -76,8 +76,9 @@ class ModalSystem:
 def conjugate_pairs(roots: npt.ArrayLike) -> Complex:
     """Return the roots of a real polynomial: the real ones, ascending, then pairs with exactly conjugate members.
 
-    Pairs are in the order of their real parts, the root with positive imaginary part first. Raises ValueError where a
-    complex root has no conjugate within 1e-9 of its magnitude.
+    Pairs are in the order of their real parts, the root with positive imaginary part first. A root whose imaginary part
+    is up to 1e-12 of its magnitude counts as real. Raises ValueError where a complex root has no conjugate within 1e-9
+    of its magnitude.
     """
     values: Complex = np.asarray(roots, dtype=np.complex128).reshape(-1)
     real = np.sort(values[np.abs(values.imag) <= 1e-12 * np.abs(values)].real)
@@ -99,7 +100,8 @@ def modal_sum(zeros: npt.ArrayLike, poles: npt.ArrayLike, gain: float) -> ModalS
     """Return the partial fractions of gain·Π(s − z)/Π(s − p), from the factors and never from expanded polynomials.
 
     The poles are in the order of `conjugate_pairs`; there is one output. Raises RepeatedPoles where two poles lie
-    closer than CLUSTER_TOLERANCE, ValueError for more zeros than poles and for a root without its conjugate.
+    closer than CLUSTER_TOLERANCE times their magnitude, ValueError for more zeros than poles and for a root without its
+    conjugate.
     """
     numerator, denominator = conjugate_pairs(zeros), conjugate_pairs(poles)
     if numerator.size > denominator.size:

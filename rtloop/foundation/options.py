@@ -74,7 +74,10 @@ class Options(BaseModel):
         return copy
 
     def _require_unset(self, name: str, value: str, *fields: str) -> None:
-        """Raise ValueError if one of `fields` is neither () nor None: only `value` in field `name` would use it."""
+        """Raise ValueError for the first of `fields` that is neither () nor None, and so set without effect.
+
+        The message asks for `value` in field `name`, which would use it; the present value of `name` is not checked.
+        """
         for field in fields:
             if getattr(self, field) not in ((), None):
                 current = getattr(self, name)

@@ -6,5 +6,5 @@ import os
 
 
 def usable_processors() -> int:
-    """Return the number of processors on which the system lets this process run; of all where it does not say."""
+    """Return the number of processors on which this process may run; of all if the system does not tell."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

@@ -66,7 +66,9 @@ def open_folder(path: Path, mode: int | None = None, *, shared: bool = False) ->
 
 
 def trusted_owners(folder: Path) -> set[int]:
-    """Return the user ids whose files in `folder` are trusted: this user, root, and a user to whom root gave it.
+    """Return the user ids whose files in `folder` are trusted: this user and root, and possibly a third user.
+
+    The third user owns `folder` or a folder above it, while root owns all folders further above, which are not sticky.
 
     Raises UntrustedPath if another user owns, or may change, a folder or link of the path, OSError if the system
     refuses.
@@ -97,7 +99,7 @@ def open_file(path: Path, flags: int, mode: int = 0o600, *, group: bool = False)
     elif not _is_own(status) and not is_group_file:
         reason = _foreign_owner_text(status)
     elif status.st_mode & (stat.S_IWOTH if is_group_file else _OTHERS_WRITE):
-        reason = "other users may write to this file"
+        reason = "other users may write to this file; take this permission from them (chmod)"
     else:
         return fd
     close_descriptor(fd)
@@ -162,7 +164,7 @@ def is_own(path: Path) -> bool:
 
 
 def make_file(path: Path, mode: int = 0o666) -> int:
-    """Make a new file and return its descriptor, for reading and writing; others may write to its folder.
+    """Make a new file and return its descriptor, for reading and writing; its folder may be writable for others.
 
     Raises FileExistsError if the name is used, UntrustedPath if the path leads through another user's link, OSError if
     the system refuses.
@@ -174,7 +176,7 @@ def make_file(path: Path, mode: int = 0o666) -> int:
 
 
 def replace_file(path: Path, mode: int = 0o666) -> int:
-    """Make a new file like `make_file` does, in place of a regular file of this user or root, which is removed.
+    """Make a new file like `make_file` does; a regular file of this user or root with this name is removed first.
 
     Raises BlockingIOError if a process has locked that file, UntrustedPath if it is another user's or not a regular
     file, or if the path leads through another user's link, OSError if the system refuses.
@@ -227,10 +229,10 @@ def overwrite_file(path: Path, mode: int = 0o666) -> int:
 
 
 def _empty_file(fd: int, path: Path, folder: os.stat_result) -> int:
-    """Empty an open regular file (a FIFO or device stays), make it blocking, and return it.
+    """Empty the open regular file `fd` (a FIFO or device stays), make the descriptor blocking, and return `fd`.
 
-    Raises UntrustedPath, after closing it unchanged, if it is another user's, and if it has several names in a folder
-    where others may write. `folder` is the status of its folder.
+    Raises UntrustedPath, after closing the unchanged file, if it belongs to another user, and if it has several names
+    and others may write to its folder. `folder` is the status of its folder.
     """
     status = os.fstat(fd)
     if not _is_own(status):
@@ -267,7 +269,7 @@ def _require_regular(fd: int, path: Path | str) -> int:
 
 @contextmanager
 def _open_parent(path: Path) -> Iterator[int]:
-    """Yield a descriptor of the folder of `path`, to which others may write.
+    """Yield a descriptor of the folder of `path`, which may be writable for others.
 
     Raises UntrustedPath if the path leads through another user's link, OSError if the folder is missing.
     """
@@ -283,10 +285,11 @@ def _walk_path(
 ) -> tuple[int, set[int], bool]:
     """Resolve a path; return the folder's descriptor, the trusted user ids, and whether the folder is sticky.
 
-    Missing folders are made with `mode`, unless it is None. With `trusts_grants`, owners of the path's folders count as
-    trusted as long as root owns all folders above them. Without `checks_trust`, any folder is accepted, and a link of a
-    user who alone may write to the link's folder; the folder is then never called sticky. Raises UntrustedPath for
-    another user's link or folder and for a folder where others may write, OSError for a missing folder.
+    Missing folders are made with `mode`, unless it is None. With `trusts_grants`, the owner of a folder counts as
+    trusted if root owns all folders above it and they are not sticky. Without `checks_trust`, any folder is accepted,
+    and a link of a user who alone may write to the link's folder; the folder is then never called sticky. Raises
+    UntrustedPath for another user's link or folder and for a folder, not sticky, where others may write, OSError for a
+    missing folder.
     """
     trusted_ids, links = {0, os.geteuid()}, 0
     remaining_names = list(reversed((path if path.is_absolute() else Path.cwd() / path).parts[1:]))

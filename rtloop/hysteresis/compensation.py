@@ -51,7 +51,7 @@ class Residual:
     def printed_bound_um(self) -> float:
         """The right side of eq (3) in µm, |Σ ζ w| over thresholds ζ and weights w of `operator`.
 
-        It bounds the residual |Ω| only where the weights behind the first have one sign.
+        It bounds the residual |Ω| for ρ = `gain`, but only where all weights after the first have one sign.
         """
         return float(abs(self.operator.thresholds @ self.operator.weights))
 
@@ -106,7 +106,7 @@ def residual_operator(actuator: PlayModel, inverse: PlayModel, command_um: float
 
 
 def compensated_output(actuator: PlayModel, inverse: PlayModel, commands_um: npt.ArrayLike) -> Real:
-    """Return the actuator's output y (samples,) in µm behind the inverse, for commands v (samples,) in µm.
+    """Return the output y (samples,) in µm of the actuator that the inverse drives, for commands v (samples,) in µm.
 
     Both models are simulated from rest, without limits.
     """

@@ -57,8 +57,8 @@ class PlayModel:
 def play_model(name: str, thresholds: npt.ArrayLike, weights: npt.ArrayLike) -> PlayModel:
     """Return a model of the given thresholds and weights.
 
-    Raises ValueError, whose text begins with `name`, unless there are as many of each, 1 to MAX_PLAYS, all finite, and
-    the thresholds ascend from at least 0.
+    Raises ValueError, whose text begins with `name`, unless there are equally many thresholds and weights, 1 to
+    MAX_PLAYS, all are finite, and the thresholds ascend from at least 0.
     """
     r, p = np.atleast_1d(np.asarray(thresholds, float)), np.atleast_1d(np.asarray(weights, float))
     if r.shape != p.shape or r.ndim != 1 or not 1 <= r.size <= MAX_PLAYS:

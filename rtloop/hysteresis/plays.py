@@ -75,7 +75,7 @@ def loading_curve(model: PlayModel, drive: npt.ArrayLike) -> Real:
 def _reversals(u: Real) -> npt.NDArray[np.intp]:
     """Return the indices of the samples after which the drive `u` changes direction.
 
-    Of several equal samples in succession, it is the last one.
+    If several samples in succession are equal, the last one counts.
     """
     steps = np.flatnonzero(np.diff(u))
     directions = np.sign(np.diff(u)[steps])

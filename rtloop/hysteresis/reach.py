@@ -40,11 +40,11 @@ class PositionRange(NamedTuple):
 
 
 def reachable_range(model: PlayModel, lowest_v: float, highest_v: float, largest_um: float = np.inf) -> PositionRange:
-    """Return the positions that `model` takes in any order, from rest, with a drive of `lowest_v` ≤ 0 to `highest_v` ≥
-    0.
+    """Return the range of positions that `model`, from rest, can take in any order, with a drive of `lowest_v` ≤ 0 to
+    `highest_v` ≥ 0.
 
     They lie within ±`largest_um`. With a drive of one sign alone, the remanence is the end next to 0: the actuator is
-    at 0 before its first peak, and does not return there. Raises ValueError for a model without inverse.
+    at 0 before its first peak, and does not return to 0. Raises ValueError for a model without inverse.
     """
     is_negative = model.weights.sum() < 0
     if is_negative or -lowest_v > highest_v:

@@ -18,12 +18,13 @@ LARGEST_SHARE = 0.5
 
 
 def add_residual_hysteresis(model: PlayModel, percent: float, drive_v: float) -> PlayModel:
-    """Return a changed actuator of which the inverse of `model` leaves a hysteresis loop, over drives of ±`drive_v`.
+    """Return a changed actuator whose compensation by the inverse of `model` leaves a hysteresis loop.
 
-    The loop's height is `percent` of the range of its output, as in `LoopShape.percent`.
+    The loop is measured over drives of ±`drive_v`. Its height is `percent` % of the range of its output, as in
+    `LoopShape.percent`. The inverse is of the model without its dead band. For 0 the model is returned unchanged.
 
-    For 0 the model is returned unchanged. Raises ValueError unless `percent` is between the residuals of the dead band
-    alone and of δ = LARGEST_SHARE, and if the model without its dead band has no inverse.
+    Raises ValueError unless `percent` is between the residuals of the dead band alone and of δ = LARGEST_SHARE, and if
+    the model without its dead band has no inverse.
     """
     if percent == 0:
         return model
@@ -40,7 +41,8 @@ def add_residual_hysteresis(model: PlayModel, percent: float, drive_v: float) ->
     lowest_percent, highest_percent = residual_percent(0.0), residual_percent(LARGEST_SHARE)
     if not lowest_percent < percent < highest_percent:
         raise ValueError(
-            f"residual_percent: {percent:g} %; allowed: above {lowest_percent:.3g} % and below {highest_percent:.3g} %"
+            f"residual_percent: {percent:g} %; allowed: 0, or above {lowest_percent:.3g} % and below "
+            f"{highest_percent:.3g} %"
         )
     share = root_scalar(lambda share: residual_percent(share) - percent, bracket=(0.0, LARGEST_SHARE), xtol=1e-6).root
     return _add_play(model, share, drive_v)

@@ -36,9 +36,9 @@ class MissingStroke(NamedTuple):
 def covered_intervals(drive: Real) -> npt.NDArray[np.intp]:
     """Return for each sample (samples,) the number of its covered interval, from 0, and −1 outside all intervals.
 
-    A covered interval is a run of samples within the range that the drive covered before. It begins at an end of that
-    range. Plays with thresholds up to half the interval's range are observable in it. Runs with a range below
-    MIN_INTERVAL_SHARE of the drive's are omitted.
+    A covered interval is a run of samples within the range that the drive covered before. It follows a sample at an
+    end of that range. Plays with thresholds up to half the interval's range are observable in it. Runs with a range
+    below MIN_INTERVAL_SHARE of the drive's are omitted.
     """
     is_extended = np.diff(np.maximum.accumulate(drive)) - np.diff(np.minimum.accumulate(drive)) > 0
     beyond = np.concatenate([[True], is_extended, [True]])

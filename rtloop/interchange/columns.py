@@ -41,10 +41,10 @@ class ColumnSelection(BaseModel):
 
 
 def extend_selection(maps: Sequence[str], selection: ColumnSelection) -> ColumnSelection:
-    """Return a copy of `selection` with further columns: `NAME=COLUMN` as a signal, any other text as one to keep.
+    """Return a copy of `selection` with a further column for each of `maps`.
 
-    NAME is of letters, digits and _, and begins with no digit; a text with another one is a column to keep. A signal
-    NAME that is selected already gets the new mapping.
+    A text `NAME=COLUMN` adds or replaces the mapping of the signal NAME, which has up to 100 ASCII letters, digits
+    and _, and begins with no digit. Any other text is a column to keep under its own name.
     """
     signals, keep = dict(selection.signals), [*selection.keep]
     for text in maps:

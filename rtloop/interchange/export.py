@@ -44,12 +44,13 @@ def export(
 ) -> dict[str, object]:
     """Write the selected signals and ticks of a recording in format `to`, a key of EXPORT_SUFFIXES.
 
-    `progress` receives the number of ticks so far; of npz, whose columns are written one after the other, the number of
-    all ticks times the share of the columns so far. `output` is by default beside the recording. Returns {recording,
-    output, ticks, bytes, problems}; the problems are damaged parts of the recording, which are left out. Raises
-    RecordingError for another format, an unreadable recording, a pattern that fits no signal, a limited time span
-    without ticks and a MAT file above 2 GiB; OutputError if the output exists or cannot be written; MissingExtra if the
-    format's package is missing. An incomplete output is removed.
+    `progress` receives the number of ticks written; for npz, whose columns are written one after the other, the number
+    of all ticks times the share of columns written; for mat, only the final number. `output` is by default a file
+    beside the recording, with its name and the format's suffix. Returns {recording, output, ticks, bytes, problems};
+    the problems are texts on damaged parts of the recording, which are left out. Raises RecordingError for an unknown
+    format, an unreadable recording, a pattern that fits no signal, a limited time span without ticks and a MAT file
+    above 2 GiB; OutputError if the output exists or cannot be written; MissingExtra if the format's package is missing.
+    An incomplete output is removed.
     """
     if to not in EXPORT_SUFFIXES:
         raise RecordingError(f"export to {to!r}; allowed: {', '.join(EXPORT_SUFFIXES)}")
@@ -75,9 +76,10 @@ def export(
 
 @contextmanager
 def _new_file(target: Path) -> Iterator[IO[bytes]]:
-    """Open a file for writing, which becomes `target` if the block succeeds, and is removed otherwise.
+    """Yield a new file `target`.part, open for writing; rename it to `target` if the block succeeds, else remove it.
 
-    Raises OutputError if `target` exists, or for an OSError in the block.
+    An old `target`.part is replaced. Raises OutputError if `target` exists, the file cannot be made, or the block
+    raises OSError.
     """
     part = target.with_name(target.name + ".part")
     if os.path.lexists(target):
@@ -94,7 +96,7 @@ def _new_file(target: Path) -> Iterator[IO[bytes]]:
 
 
 def _write_csv(recording: Recording, file: IO[bytes], selection: Selection, progress: ReportTicks) -> int:
-    """Write a line of names, then a line a tick; `float()` of each field gives the recorded number.
+    """Write a line of names, then a line for each tick; `float()` of each field gives the recorded number.
 
     Returns the number of ticks.
     """
@@ -131,9 +133,9 @@ def _write_parquet(recording: Recording, file: IO[bytes], selection: Selection, 
 
 
 def _write_npz(recording: Recording, file: IO[bytes], selection: Selection, progress: ReportTicks) -> int:
-    """Write an array for each signal, and the texts header_json and events_json, in several passes if memory requires.
+    """Write an array for each signal, and the texts header_json and events_json.
 
-    Returns the number of ticks.
+    Each pass over the recording reads columns of up to PASS_BYTES, at least one. Returns the number of ticks.
     """
     all_names = selection.selected_names(recording)
     ticks = sum(len(rows) for rows in selection.read_blocks(recording, ["tick"]))
@@ -176,13 +178,13 @@ def _write_hdf5(recording: Recording, file: IO[bytes], selection: Selection, pro
 
 
 def _add_array(archive: zipfile.ZipFile, name: str, array: npt.NDArray[np.generic]) -> None:
-    """Write an array as a member of an npz archive."""
+    """Write an array as the member `name`.npy of an npz archive."""
     with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
         np.lib.format.write_array(member, array, allow_pickle=False)
 
 
 def _join_blocks(blocks: Iterable[Real]) -> Iterator[Real]:
-    """Yield the blocks, joined to ROW_GROUP rows or a little more; the last one may have fewer."""
+    """Yield the rows of `blocks`, joined to blocks of at least ROW_GROUP rows; the last one may have fewer."""
     pending: list[Real] = []
     for rows in blocks:
         pending.append(rows)

@@ -77,10 +77,10 @@ def import_data(
     """Write the selected columns of a file, all where none is selected, as the recording `output`.
 
     `output` is by default NAME.mcap beside the file, NAME.imported.mcap for a file NAME.mcap. `table` is the file's
-    content, if it was read already; `progress` receives the ticks so far. Returns {file, output, ticks, rate_hz,
-    duration_s, time, signals, notes, about, in_other_files}; `signals` are {name, unit, from, least, largest}, `from`
-    being the mapping as text; `about` has texts about the file by topic, `in_other_files` names data that the file only
-    points to.
+    content, if it was read already; `progress` receives the number of ticks written. Returns {file, output, ticks,
+    rate_hz, duration_s, time, signals, notes, about, in_other_files}; `time` is a text on the source of the times;
+    `signals` are {name, unit, from, least, largest}, `from` being the mapping as text; `about` has texts about the file
+    by topic, `in_other_files` names data that the file only points to.
 
     Raises UnreadableData if the file cannot be read, or a column, its unit or the time does not fit; MissingExtra if
     the format's package is missing; OutputError if the output exists or cannot be written; OSError if the file
@@ -113,9 +113,9 @@ def list_columns(path: Path, table: Table, selection: ColumnSelection) -> Mappin
     """Return the content of a file, with unit and extremes of each column.
 
     Keys: file, rows, time, time_column, rate_hz, notes, columns, about, in_other_files; `columns` are {name, unit,
-    grows_evenly, least, largest}, `time_column` is the name of the table's own column of times, None without one. Of
-    `selection`, only time and rate count.
-    Where the time is unusable, `time`, a text on its source, and `rate_hz` are None, and `notes` says why.
+    grows_evenly, least, largest}, `time_column` is the name of the column of times found, None without one;
+    `time` is a text on the source of the times. Only `time` and `rate_hz` of `selection` are used. If they give no
+    usable times, `time` and `rate_hz` are None, and `notes` says why.
     """
     columns = [
         {"name": name, "unit": column_unit(table, name), "grows_evenly": grows_evenly(values), **extremes(values)}
@@ -145,8 +145,8 @@ def extremes(values: Real) -> dict[str, float | None]:
 def _select_signals(table: Table, path: Path, selection: ColumnSelection, time_base: TimeBase) -> ImportedSignals:
     """Return the selected columns as signals, tick and deadline first.
 
-    Raises UnreadableData if a column is missing, ambiguous or of another unit, a name is reserved, or values that must
-    be whole numbers are not.
+    Raises UnreadableData if a column is missing, ambiguous or of another unit, a name is reserved or mapped twice, no
+    column besides the time is left, or the values of a signal of whole numbers, such as flags, are not whole.
     """
     signals = _select_columns(table, path, selection)
     notes = [*time_base.notes, *(column.assumption for column in signals.values() if column.assumption)]
@@ -170,9 +170,9 @@ def _select_signals(table: Table, path: Path, selection: ColumnSelection, time_b
 
 
 def _select_columns(table: Table, path: Path, selection: ColumnSelection) -> dict[str, MappedColumn]:
-    """Return the selected columns by signal name; where none or `all` is selected, also all others except the times.
+    """Return the selected columns by signal name; if none or `all` is selected, also all others except the times.
 
-    A column kept under its own name gets a number behind it if a signal, the tick or the deadline has this name.
+    A column kept under its own name gets a number appended if a signal, the tick or the deadline has this name.
     Raises UnreadableData for a missing or ambiguous column, a unit that does not fit, a reserved name, two mappings of
     one signal, and where no column besides the time is left.
     """
@@ -286,10 +286,10 @@ def _make_header(path: Path, signals: ImportedSignals, time_base: TimeBase, is_p
 def _write_recording(
     output: Path, header: dict[str, Any], signals: ImportedSignals, rate_hz: float, progress: ReportTicks
 ) -> None:
-    """Write all rows and the final event to the new file `output`; `progress` receives the ticks so far.
+    """Write all rows and the final event to the new file `output`; `progress` receives the number of ticks written.
 
-    Raises OutputError, also if the file exists, finished or unfinished, which then stays. The incomplete new file is
-    removed after any error.
+    Raises OutputError if the file cannot be written, or exists, finished or unfinished; an existing file stays. The
+    incomplete new file is removed after any error.
     """
     columns = [*signals.columns.values()]
     ticks, deadlines = columns[0], columns[1]

@@ -32,9 +32,10 @@ MEMORY_BYTES = 6 * MAX_BYTES
 def read_table(path: Path, group: str | None = None) -> Table:
     """Return the columns of a file, read in a separate process; `group` picks one of several rasters, groups or topics.
 
-    None: the longest one, if possible of several columns; an MCAP file must then have a single topic. `group` is
-    ignored for CSV, Parquet and Stabilizer files. Raises UnopenedData if the file cannot be opened; UnreadableData if
-    it is of no known format, damaged, too large or has no such group; MissingExtra if the format's package is missing.
+    None: the longest one with several columns, or else the longest one; an MCAP file must then have a single topic.
+    `group` is ignored for CSV, Parquet and Stabilizer files. Raises UnopenedData if the file cannot be opened;
+    UnreadableData if it is of no known format, damaged, too large or has no such group, or if the process is killed;
+    MissingExtra if the format's package is missing.
     """
     command = [sys.executable, "-m", __name__, str(path), *([] if group is None else [group])]
     environment = os.environ | {"OPENBLAS_NUM_THREADS": "1"}

@@ -64,8 +64,9 @@ def map_column(table: Table, path: Path, signal: str, source: str) -> MappedColu
     """Return the column for `signal` by the mapping `source`, such as `Sensor [V] * 2.5 µm/V - 3 µm`.
 
     A `signal` without a known unit gets the unit of the column, or of its product with a sensitivity. A column without
-    a unit counts as in the unit that the mapping needs; `assumption` says so. Raises UnreadableData if the column is
-    missing or ambiguous, its unit unknown or not convertible to the signal's, or the factor too large or too small.
+    a unit counts as in the unit that the mapping needs; `assumption` says so, and also if the unit in `source` differs
+    from the file's. Raises UnreadableData if the column is missing or ambiguous, a unit is unknown or cannot be
+    converted to the signal's, or the factor is too large or too small.
     """
     match = None if source in table.columns else _SOURCE.fullmatch(source)
     parts = match.groupdict() if match else {}
@@ -165,7 +166,10 @@ def find_column(table: Table, path: Path, name_or_path: str) -> str:
 
 
 def column_unit(table: Table, name: str) -> str | None:
-    """Return the unit of a column by the file: beside its name, within it, or as the end of it; None without one."""
+    """Return the unit of a column in the file; None without one.
+
+    It is the unit that `table` states, or else the unit in the name, as in "drive [mV]", "drive in mV" or "drive_mV".
+    """
     if table.units.get(name):
         return table.units[name]
     if unit := _split_unit(name)[1]:
@@ -175,14 +179,17 @@ def column_unit(table: Table, name: str) -> str | None:
 
 
 def name_without_unit(name: str) -> str:
-    """Return a column's name without the unit at its end, unchanged if no known unit ends it."""
+    """Return a column's name without the unit at its end, as in "x [mV]", "x (mV)", "x / mV" or "x in mV".
+
+    Any other name, such as "x_mV", is returned unchanged.
+    """
     return _split_unit(name)[0]
 
 
 def signal_name(text: str) -> str:
-    """Return a signal's name with its axis: `drive_v`, as each signal of an axis, belongs to axis x: `x_drive_v`.
+    """Return `x_drive_v` for `drive_v`, and likewise x_NAME for the name of any other signal of an axis.
 
-    Any other name is unchanged.
+    Any other text is returned unchanged.
     """
     return f"{FIRST_AXIS}_{text}" if text in {signal.name for signal in AXIS_SIGNALS} else text
 
@@ -190,8 +197,8 @@ def signal_name(text: str) -> str:
 def default_signal_name(column: str) -> str:
     """Return a column's name in a recording: without its unit, of ASCII letters, digits and underscores.
 
-    A long name loses its beginning: the last MAX_NAME_CHARACTERS stay.
-    `column_` precedes a name that does not begin with a letter, `file_` one that every recording has.
+    A long name loses its beginning: the last MAX_NAME_CHARACTERS stay. The prefix `column_` is added to a name that
+    does not begin with a letter, `file_` to the name of a signal that every recording has, such as tick.
     """
     plain = (
         normalize("NFKD", name_without_unit(column).replace("µ", "u").replace("ß", "ss"))
@@ -206,7 +213,7 @@ def default_signal_name(column: str) -> str:
 def axis_names(signals: list[str]) -> list[str]:
     """Return the names of the axes to which signals belong, each once, in the order of `signals`: x for `x_drive_v`.
 
-    `x_true_position_um` belongs to x where there is an axis x, else to an axis x_true.
+    `x_true_position_um` belongs to an axis x_true if this axis has a drive signal or there is no axis x, else to x.
     """
     candidates = [
         name.removesuffix(f"_{signal.name}")
@@ -234,12 +241,12 @@ def _split_unit(name: str) -> tuple[str, str | None]:
 
 
 def _normalised_name(name: str) -> str:
-    """Return a name without unit, quotes and case."""
+    """Return a name in lower case (casefold), without its unit and the quotes and blanks around it."""
     return name_without_unit(name).strip(" \"'").casefold()
 
 
 def _normalised_path(name: str) -> str:
-    """Return a normalised name with slashes, in place of dots and backslashes too, between the parts of its path."""
+    """Return a normalised name without quotes, with slashes in place of the dots and backslashes of its path."""
     return re.sub(r"[\\./]+", "/", _normalised_name(name).replace('"', "").strip("/"))
 
 

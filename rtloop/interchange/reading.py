@@ -18,9 +18,10 @@ MCAP_MAGIC = b"\x89MCAP0\r\n"
 
 
 def read_in_process(path: Path, group: str | None = None) -> Table:
-    """Return the columns of a file; `group` is that of `isolated_reader.read_table`.
+    """Return the columns of a file, read in this process; `group` picks one of several rasters, groups or topics.
 
-    A library may raise any error for a damaged file, or crash: `isolated_reader.read_table` guards against it. Raises
+    None: the longest one with several columns, or else the longest one; an MCAP file must then have a single topic. A
+    library may raise any error for a damaged file, or crash: `isolated_reader.read_table` guards against it. Raises
     UnopenedData if the file cannot be opened; UnreadableData if it is of no known format, damaged, too large or has no
     such group; MissingExtra if the format's package is missing.
     """

@@ -81,7 +81,8 @@ def is_from_recording(table: Table) -> bool:
 def time_column(table: Table) -> str | None:
     """Return the name of the column of times; None without one.
 
-    In this order: a recording's deadlines, the file's own column, a usual name, a first column that grows evenly.
+    The first of these that exists: a recording's deadlines, the file's own column, a column with one of TIME_NAMES, the
+    first column if its name ends in `_1`, others follow, and it grows evenly.
     """
     if is_from_recording(table):
         return RECORDING_TIME_COLUMNS[1]
@@ -149,7 +150,7 @@ def _deadlines_ns(path: Path, name: str, times: Real, unit: str) -> tuple[Real, 
 
 
 def _rate_hz(deadlines: Real, period_ns: float) -> float:
-    """Return the rate in Hz by the mean period where all periods are even, else by `period_ns`, the median one."""
+    """Return the rate in Hz: by the mean period if all are within ROUNDED_NS of the median `period_ns`, else by it."""
     is_even = bool(np.all(np.abs(np.diff(deadlines) - period_ns) <= ROUNDED_NS))
     period_ns = float(deadlines[-1] - deadlines[0]) / (deadlines.size - 1) if is_even else period_ns
     return float(f"{1e9 / period_ns:.9g}")

@@ -25,7 +25,7 @@ FormatRows = Callable[[Sequence[str], Real], bytes]
 def write_csv(file: IO[bytes], names: Sequence[str], blocks: Iterable[Real], progress: Callable[[int], None]) -> int:
     """Write a line of names, then a line for each row of `blocks` (n, names). Returns the number of rows.
 
-    Whole numbers in signals of COUNTS have no decimal point. `progress` receives the number of rows so far. pyarrow
+    Whole numbers in signals of COUNTS have no decimal point. `progress` receives the number of rows written. pyarrow
     formats the rows, in a thread for each processor; without pyarrow, Python does, in one thread.
     """
     file.write((",".join(names) + "\n").encode("ascii"))
@@ -49,7 +49,9 @@ def _formatter() -> tuple[FormatRows, int]:
 def _format_in_order(
     names: Sequence[str], blocks: Iterable[Real], format_rows: FormatRows, threads: int
 ) -> Iterator[tuple[bytes, Real]]:
-    """Split each block into parts; yield (lines of CSV, the part's rows) in order. `names` are the columns.
+    """Split each block into parts; yield (lines of CSV, rows) of each part, in the order of the rows.
+
+    `names` are the columns.
 
     At most two parts for each thread are held: being formatted, queued, or finished but not yielded.
     """

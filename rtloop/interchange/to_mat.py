@@ -32,7 +32,7 @@ TIME: dict[str, str | float] = {"Name": "Time", "Unit": "s", "Raster": RASTER}
 
 
 def write_mat(recording: Recording, part: IO[bytes], target: Path, selection: Selection) -> int:
-    """Write the selected ticks to `part`, which will be called `target`. Returns their number.
+    """Write the selected ticks to the open file `part`, which is renamed to `target` later. Returns their number.
 
     Raises RecordingError above the 2 GiB of a MAT file, for a pattern that fits no signal and for a limited time span
     without ticks; OSError if the write fails.
@@ -60,9 +60,10 @@ def write_mat(recording: Recording, part: IO[bytes], target: Path, selection: Se
 
 
 def matlab_variable(path: Path) -> str:
-    """Return the variable's name in a file: the stem of its name in letters, digits and underscores.
+    """Return the name of MATLAB's variable for a file: the stem of the file's name, with _ for other characters.
 
-    "rec_" precedes a name that does not begin with a letter. It is cut to LONGEST_NAME characters.
+    Other characters are all but ASCII letters, digits and _. The prefix "rec_" is added to a name that does not begin
+    with a letter; the result is cut to LONGEST_NAME characters.
     """
     name = re.sub(r"\W", "_", path.stem, flags=re.ASCII)
     return (name if name[:1].isalpha() else f"rec_{name}")[:LONGEST_NAME]

@@ -42,7 +42,7 @@ class UnknownUnit(ValueError):
 
 
 Powers = tuple[tuple[str, int], ...]
-"""Symbols without a prefix, in order, and their exponents."""
+"""Symbols without a prefix, sorted, and their exponents."""
 
 
 class Unit(NamedTuple):

@@ -80,7 +80,7 @@ def joint_control(law, first, count):
 
 @jit
 def law_functions(law, number):
-    """Return the FUNCTIONS record of law `number`, a view: addresses of functions, sizes of records; not checked."""
+    """Return the FUNCTIONS record of law `number`, a view: functions, sizes of records; the number is not checked."""
     return carray(address_pointer(law.functions + number * FUNCTIONS_BYTES), 1, FUNCTIONS)[0]
 
 

@@ -57,10 +57,10 @@ INTERLOCK_STATE = [
 
 @jit
 def axis_trip(coefficients, state, adc_v, conditions, among):
-    """Evaluate the trip conditions of one axis whose Flag bit is in `among`, after `count_ticks`.
+    """Evaluate the trip conditions of one axis whose Flag bits are in `among`; call `count_ticks` first in each tick.
 
-    Returns the causes as Flag bits, then the first of them with its value and limit; zeros if there is none. A law's
-    value is its return value and its limit the `Failure` code.
+    Returns the causes as Flag bits, then the first cause with its value and limit; zeros without a cause. For a failed
+    law, the value is the number that it returned, and the limit is the `Failure` code.
     """
     c, s = coefficients, state
     age_us, limit_um = conditions.sample_age_us, c.position_limit_um
@@ -84,7 +84,7 @@ def axis_trip(coefficients, state, adc_v, conditions, among):
 
 @jit
 def _check(trip, among, flag, is_tripped, value, limit):
-    """Return `trip`, a result of `axis_trip` so far, with the cause `flag` added if `is_tripped` and `among` has it.
+    """Return `trip`, a tuple as `axis_trip` returns, with the cause `flag` added if `is_tripped` and `among` has it.
 
     The first cause added sets the value and the limit.
     """

@@ -87,7 +87,7 @@ class Layout:
         return self._extend_record(STATE, 1)
 
     def _extend_record(self, axis_record: np.dtype[np.void], part: int) -> np.dtype[np.void]:
-        """Return a type of record with the slots behind it; `part` is 0 for coefficients, 1 for state."""
+        """Return the type of `axis_record` followed by both slots; `part` is 0 for coefficients, 1 for state."""
         slots: tuple[Slot, ...] = ("feedforward", "controller")
         return np.dtype([*axis_record.descr, *((slot, np.uint8, (self.slot_bytes(slot)[part],)) for slot in slots)])
 
@@ -96,7 +96,10 @@ class Layout:
         return 8 + axes * (self.coefficients.itemsize + self.state.itemsize) + LOOP_STATE.itemsize
 
     def slot_law(self, coefficients: np.void, slot: Slot) -> LawRecords | None:
-        """Return the law in a slot of an axis with these coefficients; None if a preceding axis has the controller."""
+        """Return the law in a slot of an axis with these coefficients.
+
+        None for the slot "controller" if a preceding axis has the controller.
+        """
         if slot == "controller" and not coefficients["controller_axes"]:
             return None
         return self.laws[int(coefficients[f"{slot}_law"])]
@@ -105,7 +108,7 @@ class Layout:
         self, snapshot: bytes | npt.NDArray[np.uint8], axes: int
     ) -> tuple[int, Records, Records, Records]:
         """Return tick, coefficients (axes,), states of the axes (axes,) and state of the loop (1,), aligned copies,
-        from a law's snapshot.
+        from a snapshot of a loop's memory.
 
         Raises ValueError if the length does not fit `axes`, a count, an index or a switch is not allowed, a law is in a
         wrong slot, or an axis has not exactly one controller.
@@ -316,7 +319,7 @@ class LawMemory:
             array[...] = copies[name]
 
     def slot_record(self, axis: int, slot: Slot, kind: RecordKind) -> np.record | None:
-        """Return a view of the record of the law in a slot of axis number `axis`; None if a preceding axis has it."""
+        """Return a view of the record of the law in a slot of an axis; None if a preceding axis has the controller."""
         law = self.layout.slot_law(self.coefficients[axis], slot)
         records = self.coefficients if kind == "coefficients" else self.axes
         return None if law is None else slot_view(records[axis], slot, getattr(law, kind))

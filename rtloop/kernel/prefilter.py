@@ -24,7 +24,8 @@ def refill_prefilter(state):
 def tap_outputs_um(coefficients, state):
     """Return the outputs of both rows of taps for the stored history, in µm: target, addition to the command.
 
-    Nothing advances. Without taps, or before the memory is filled, the target is a stored reference and the addition 0.
+    Nothing advances. Without taps, or before the memory is filled, the target is a reference stored earlier, possibly
+    long ago, and the addition 0.
     """
     if coefficients.tap_count == 0 or state.tap_index < 0:
         return state.tap_history[max(state.tap_index, 0)], 0.0

@@ -59,7 +59,7 @@ TURN = 2.0 * math.pi
 def reference_sample(generator, tick, period_s, table, inputs):
     """Return the reference of one axis at `tick`, in µm (V for mode raw).
 
-    Generator.HOLD and TABLE store their sample in `generator`, with the tick up to which it is returned again.
+    Generator.HOLD and TABLE store their sample in `generator`, with the first tick at which it is no longer valid.
     Generator.TABLE also sets `generator.feed_um`, the addition to the command in µm; all other kinds leave it. `table`
     (n,) has the samples of all tables, `inputs` readings in V. An index outside `table` or `inputs` raises IndexError.
     """

@@ -73,9 +73,9 @@ def _call_feedforward(law, a, function, result, value):
 def controller_output(law, a, coefficients, control_address):
     """Compute the output of the controller whose first axis is `a`. Returns (succeeded, command in µm, not checked).
 
-    `control_address` is `law.controls` for a controller of one axis, `law.together` for a coupled one, which writes its
-    commands there; the number returned is then meaningless. A law that raised is recorded in the axis's state: (False,
-    NaN).
+    `control_address` is `law.controls` for a controller of one axis, `law.together` for a coupled one. A coupled one
+    writes its commands to its control record, and the number returned is meaningless. If the law raised, the failure is
+    recorded in the axis's state, and (False, NaN) returned.
     """
     status = _call_controller(law, a, law_functions(law, coefficients.controller_law).output, control_address)
     if status in (OK, NONE):
@@ -86,9 +86,9 @@ def controller_output(law, a, coefficients, control_address):
 
 @jit_rare
 def controller_enter(law, a, control_address):
-    """Set the state of the controller whose first axis is `a` to zeros and let it enter at the command in force.
+    """Set the state of the controller whose first axis is `a` to zeros, and call its function `enter`, if it has one.
 
-    Returns False, with the failure recorded, if the law raised.
+    Returns True; False, with the failure recorded in the axis's state, if the law raised.
     """
     functions = law_functions(law, coefficients_record(law, a).controller_law)
     state = carray(
@@ -104,9 +104,9 @@ def controller_enter(law, a, control_address):
 
 @jit
 def controller_update(law, a, coefficients, control_address):
-    """Advance the controller whose first axis is `a` by a tick.
+    """Advance the controller whose first axis is `a` by a tick, by its function `update`.
 
-    Returns False, with the failure recorded, if the law raised.
+    Returns True; False, with the failure recorded in the axis's state, if the law raised.
     """
     if _call_controller(law, a, law_functions(law, coefficients.controller_law).update, control_address) in (OK, NONE):
         return True
@@ -118,7 +118,7 @@ def controller_update(law, a, coefficients, control_address):
 def feedforward_output(law, a, coefficients, state, command_um):
     """Return the drive in V for a command in µm; NaN if the law raised.
 
-    Records that failure, and a drive that is not a usable number but returned all the same, in `state`.
+    This failure is recorded in `state`, and so is a drive that is not a usable number, which is returned unchanged.
     """
     function = law_functions(law, coefficients.feedforward_law).output
     if _call_feedforward(law, a, function, law.result, command_um) not in (OK, NONE):
@@ -132,9 +132,9 @@ def feedforward_output(law, a, coefficients, state, command_um):
 
 @jit_rare
 def feedforward_enter(law, a, drive_v):
-    """Call `enter` of the feedforward of axis `a`, if it has one, with the drive in force; its state is not zeroed.
+    """Call `enter` of the feedforward of axis `a`, if it has one, with the present drive in V; its state is not zeroed.
 
-    A law that raised is recorded in the axis's state; nothing is returned.
+    Returns None; if the law raised, the failure is recorded in the axis's state.
     """
     functions = law_functions(law, coefficients_record(law, a).feedforward_law)
     if functions.enter != 0 and _call_feedforward(law, a, functions.enter, law.result, drive_v) not in (OK, NONE):

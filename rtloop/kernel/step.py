@@ -59,9 +59,10 @@ FEEDFORWARD_FAILURES = float(Failure.FEEDFORWARD_OUTPUT)
 
 @jit
 def coefficients_fit(law, a, address):
-    """Return whether every count in the coefficients of axis `a` at `address` stays within its record.
+    """Return whether the coefficients of axis `a` at `address` have allowed counts and numbers of laws.
 
-    The kernels rely on it: they check no count.
+    Each count must stay within its array, each law exist and fit its slot, and the whole numbers of the laws keep
+    their rules. The kernels rely on it: they check no count.
     """
     coefficients = carray(address_pointer(address), 1, COEFFICIENTS)[0]
     count = np.int64(coefficients.controller_axes)
@@ -102,10 +103,11 @@ def all_coefficients_fit(law):
 
 @jit
 def set_mode(law, mode, at_rest):
-    """Change the mode, bumplessly, and clear failures of laws; `at_rest`: before the first tick, the state is zero.
+    """Change the mode and clear failures of laws.
 
-    A mode that drives restarts the pre-filter with the present reference: its history may be volts. A latched trip is
-    not cleared, and sets mode OFF again in the next tick.
+    The next tick enters the mode without a jump of the drive, except if `at_rest` says that no tick has run yet.
+    A mode other than OFF, unless `at_rest`, restarts the pre-filter with the next reference: its history may be volts.
+    A latched trip is not cleared, and sets mode OFF again in the next tick.
     """
     loop_state(law).mode = mode
     for a in range(law.axis_count):
@@ -117,7 +119,10 @@ def set_mode(law, mode, at_rest):
 
 @jit
 def mark_new_controller(law, a):
-    """Let axis `a`, and the axes that share its controller, enter a new controller, whose coefficients are in place."""
+    """Let axis `a`, and the axes that share its controller, enter a new controller, whose coefficients are in place.
+
+    An axis that is to enter another mode does so instead, which includes the new controller.
+    """
     for i in range(a, a + max(np.int64(coefficients_record(law, a).controller_axes), 1)):
         state = axis_state(law, i)
         if state.entering == 0:
@@ -126,7 +131,7 @@ def mark_new_controller(law, a):
 
 @jit
 def continue_prefilter(law, a, last_um):
-    """Let new taps of axis `a`, which are in place, continue from `last_um`, the two outputs of the taps before them.
+    """Let new taps of axis `a`, which are in place, continue from `last_um`, the last two outputs of the old taps.
 
     In closed loop the differences go to the decaying offsets of the command and, without sections, of the error; in
     other modes nothing is done.
@@ -197,7 +202,10 @@ def evaluate(record, adc_v, references, feeds_um, conditions):
 
 @jit_rare
 def _record_trip(law, adc_v, conditions, causes):
-    """Set the TRIP record to the first axis with a cause among `causes`, and its first cause; NO_AXIS without one."""
+    """Set the TRIP record to the first axis with a cause among `causes`, and to its first cause with value and limit.
+
+    Without such an axis, as for a cause of the whole loop, the axis is NO_AXIS and the rest 0.
+    """
     trip = trip_record(law)
     trip.axis, trip.cause, trip.law, trip.value, trip.limit = NO_AXIS, 0, 0, 0.0, 0.0
     for a in range(law.axis_count):
@@ -219,7 +227,7 @@ def _trip_on_law_failure(loop):
 
 @jit
 def _control_axis(law, a):
-    """Set the command of one axis, in its state and its CONTROL record, by a controller for itself alone.
+    """Set the command of one axis, in its state and its CONTROL record, by its controller, which has no other axes.
 
     Returns False, with the failure recorded in the state, if its law failed.
     """
@@ -285,8 +293,8 @@ def _gather_signals(law, first, count):
 def _set_control_inputs(law, i, coefficients, state, resting_um):
     """Set the signals of axis `i` for its controller, which rests at an error of `resting_um`.
 
-    The error has the decaying offset of a bumpless entry, and the reference agrees with it; the command is the one in
-    force.
+    The decaying offset of a bumpless entry is subtracted from the error, and the reference agrees with the result; the
+    command is the one applied last, without the part from the reference.
     """
     control = axis_control(law, i)
     entry_error_um = state.error_um - _bump_offset(coefficients, state, state.error_um - resting_um)
@@ -302,8 +310,8 @@ def _set_control_inputs(law, i, coefficients, state, resting_um):
 def _set_command(law, i, coefficients, state, command_um):
     """Set the command of an axis: the controller's command, its decaying offset, and the part from the reference.
 
-    The controller receives its own part alone. Returns False, with the failure recorded, for a command that is not a
-    usable number.
+    The CONTROL record gets the command without the part from the reference. Returns True; False, with the failure
+    recorded, for a command that is not a usable number.
     """
     gap_um = state.applied_command_um - state.feed_um - command_um
     state.command_bump_um = _decayed_offset(coefficients, state.command_bump_um, state.entering != 0, gap_um)
@@ -374,7 +382,7 @@ def _compute_drive(law, a, loop, coefficients, state, reference):
 
 @jit
 def _bump_offset(coefficients, state, gap):
-    """Advance and return the decaying offset (µm, or V in RAW) that makes a new mode continue from the drive in force.
+    """Advance and return the decaying offset (µm, or V in RAW) that makes a new mode continue from the present drive.
 
     It restarts at `gap` in the tick that enters the mode.
     """
@@ -393,7 +401,7 @@ def _decayed_offset(coefficients, offset, restarts, gap):
 def update(record):
     """Advance the memory of all laws by the drives that were applied, and set each axis's applied command.
 
-    Controllers advance in closed loop alone. A law that fails trips the next tick.
+    Controllers advance in closed loop alone. A law that fails trips the loop in the next tick.
     """
     law = unpack_law(record)
     loop = loop_state(law)
@@ -412,7 +420,8 @@ def update(record):
 def _update_coupled(law, first, count, loop):
     """Advance the shared controller of axes `first` … `first` + `count` − 1, and the feedforwards of all but the first.
 
-    The controller advances in closed loop only. A failure adds TRIP_LAW to `loop.pending`: the next tick trips.
+    The controller advances in closed loop only. A failure adds TRIP_LAW to `loop.pending`, which trips the loop in the
+    next tick.
     """
     for i in range(first + 1, first + count):
         _update_feedforward(law, i, loop, coefficients_record(law, i))
@@ -426,7 +435,7 @@ def _update_coupled(law, first, count, loop):
 def _update_feedforward(law, a, loop, coefficients):
     """Advance the feedforward of one axis, and set the applied command for its controller.
 
-    A failure trips the next tick.
+    A failure trips the loop in the next tick.
     """
     state = axis_state(law, a)
     applied_um = feedforward_update(law, a, coefficients, state, state.drive_v)

@@ -91,7 +91,8 @@ def tracking_share(a: Real, m: Real, c: Real, tracking_s: float, period_s: float
 def steady_state_gain(system: System) -> Real:
     """Return (I − A)⁻¹ b (n,), the final states of a discrete-time system for a constant input of 1.
 
-    A must be upper quasi-triangular, as of `blocks`. A block of one state with λ = 1 exactly integrates, and gets 0.
+    A must be upper quasi-triangular, as `blocks` takes it. A block of one state with λ = 1 exactly integrates, and gets
+    0.
     """
     resting = np.ones(system.b.size, dtype=bool)
     for block in blocks(system.a):

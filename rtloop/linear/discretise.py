@@ -192,7 +192,7 @@ def _map_matched(transfer: Transfer, period_s: float) -> tuple[Complex, Complex,
     """Return zeros, poles and gain of C(z), by z = exp(sT); zeros at infinity become −1, and the gain at 0 Hz stays.
 
     For a root at 0, this gain counts s as (z − 1)/T. A zero to the right of MAX_EXPONENT/T becomes a factor of the
-    gain, as (z − image)/(1 − image) rounds to 1. Raises ValueError for a pole there.
+    gain, as (z − image)/(1 − image) rounds to 1. Raises ValueError for a pole to the right of MAX_EXPONENT/T.
     """
     if np.any(transfer.poles.real * period_s > MAX_EXPONENT):
         raise ValueError(

@@ -46,7 +46,11 @@ class TransferOptions(Options):
 
     @model_validator(mode="after")
     def _check(self) -> Self:
-        """Require the keys of `form` and no others, with values that make a proper transfer function."""
+        """Return the options unchanged.
+
+        Raises ValueError for a key that `form` does not take, for a missing `gain` or `d`, and for values that make no
+        proper transfer function.
+        """
         allowed = {
             "factors": {"gain", "numerator", "denominator"},
             "zpk": {"gain", "zeros", "poles"},
@@ -71,7 +75,8 @@ class TransferOptions(Options):
     def _transfer(self) -> Transfer:
         """The transfer function, computed when the options are validated.
 
-        Raises ValueError for a missing key, for lists of another depth than `form` takes, and like `Transfer`.
+        Raises ValueError for a missing `gain` or `d`, for lists of another depth than `form` takes, and in the cases of
+        `Transfer`.
         """
         if self.form == "zpk":
             zeros, poles = ([complex(*root) for root in group] for group in (self.zeros, self.poles))

@@ -65,8 +65,8 @@ class System(NamedTuple):
 def realise(zeros: Complex, poles: Complex, gain: float, points: Complex) -> tuple[System, Form]:
     """Return a scaled real realisation and its form: "modal" where `well_conditioned_sum` has a sum, else "cascade".
 
-    Complex `zeros` (m,) and `poles` (n,), m ≤ n, stand beside their conjugates. `points` (k,) are the complex points at
-    which cancellation and the scale of the states are judged.
+    In `zeros` (m,) and `poles` (n,), m ≤ n, each complex root is next to its conjugate. `points` (k,) are the complex
+    points at which cancellation and the scale of the states are judged.
     """
     modal = well_conditioned_sum(zeros, poles, gain, points)
     if modal is None:
@@ -96,7 +96,7 @@ def cascade(zeros: Complex, poles: Complex, gain: float) -> System:
     """Return gain·Π(x − z)/Π(x − p) as sections in series, with an upper quasi-triangular A.
 
     The first section has the last states. The poles of largest real part come last in the series: integrators have the
-    first states. Complex roots stand beside their conjugates.
+    first states. Each complex root must be next to its conjugate.
     """
     total = System(np.empty((0, 0)), np.empty(0), np.empty(0), 1.0)
     for group, section_zeros in _sections(zeros, poles):
@@ -108,7 +108,7 @@ def cascade(zeros: Complex, poles: Complex, gain: float) -> System:
 
 
 def _section(zeros: Complex, poles: Complex) -> System:
-    """Return a section with one or two poles, at most as many zeros, and gain 1 as leading coefficient.
+    """Return a section with one or two poles and at most as many zeros; the leading coefficients are 1.
 
     The numerator is expanded about the poles, not about 0.
     """
@@ -138,8 +138,8 @@ def _sections(zeros: Complex, poles: Complex) -> list[tuple[Complex, Complex]]:
     """Return (poles, zeros) of each section, in rising order of the largest real part of its poles.
 
     A pair of zeros joins the nearest free pair of poles; a single zero joins the single pole or, without one, the
-    nearest free pair. The other poles have no zeros. Complex roots stand beside their conjugates, and there are no more
-    zeros than poles.
+    nearest free pair. The other poles have no zeros. Each complex root must be next to its conjugate, and there must be
+    no more zeros than poles.
     """
     pole_groups, zero_groups = _root_pairs(poles), _root_pairs(zeros)
     sections: list[tuple[Complex, Complex]] = []
@@ -212,6 +212,6 @@ def imaginary_axis_points(roots: Complex) -> Complex:
 def unit_circle_points() -> Complex:
     """Return 401 points just outside |z| = 1, from 1e-6 to 0.9 of half the sampling rate, in a constant ratio.
 
-    At z = −1, zeros dominate.
+    They end before z = −1, where zeros dominate.
     """
     return np.exp((0.01 + 1j) * np.pi * np.geomspace(1e-6, 0.9, 401))

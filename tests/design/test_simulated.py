@@ -203,7 +203,7 @@ def test_a_model_stands_for_hardware() -> None:
     assert simulations[1].steps[0].overshoot_percent > simulations[0].steps[0].overshoot_percent
     with pytest.raises(ValueError, match=r"axis.x.model: missing; the simulation of the hardware"):
         Bench(hardware_setup, {"x": exact_model._replace(model=None)})
-    with pytest.raises(ValueError, match=r"residual_percent: 90 %; allowed: above .* % and below .* %"):
+    with pytest.raises(ValueError, match=r"residual_percent: 90 %; allowed: 0, or above .* % and below .* %"):
         Bench(hardware_setup, {"x": exact_model._replace(residual_percent=90.0)})
 
 

@@ -54,7 +54,7 @@ def test_every_manner_of_writing_is_read_exactly(case: str, tmp_path: Path):
 def test_the_dialect_is_reported(tmp_path: Path):
     (tmp_path / "scan.csv").write_bytes(german())
     about = read_csv(tmp_path / "scan.csv").about
-    assert about["table"] == "columns separated by ';', decimal ',', utf-8, numbers from line 3 on"
+    assert about["table"] == "columns separated by ';', decimal sign ',', utf-8, numbers from line 3 on"
     assert about["left out"] == "Bemerkung (text)"
 
 

@@ -127,7 +127,7 @@ def test_a_file_of_pointers_alone_is_refused(tmp_path: Path, canary: Path):
         for pointer in POINTERS:
             pointer(file, pointer.__name__, canary)
     with pytest.raises(
-        UnreadableData, match="no column of numbers; left out because their values are in other files: external_link"
+        UnreadableData, match="two or more numbers; left out because their values are in other files: external_link"
     ):
         read_in_process(path)
 

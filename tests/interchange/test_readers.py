@@ -150,7 +150,7 @@ def test_hdf5_of_nothing_but_a_loop(tmp_path: Path):
     with h5py.File(tmp_path / "a.h5", "w") as file:
         file["a/b"] = file.create_group("c")
         file["c/d"] = file["a"]
-    with pytest.raises(UnreadableData, match="contains no column of numbers"):
+    with pytest.raises(UnreadableData, match="contains no column with two or more numbers"):
         read_in_process(tmp_path / "a.h5")
 
 

@@ -29,7 +29,10 @@ CERTAIN_DEVIATIONS = 3.0
 
 
 def first_period(grid: LineGrid, amplitude_um: float) -> Real:
-    """Return a period (samples,), µm, of equal lines; its peak is FIRST_AMPLITUDE_RATIO times `amplitude_um`."""
+    """Return one period (samples,) of the first reference, µm, with equal amplitudes at all lines.
+
+    Its peak is FIRST_AMPLITUDE_RATIO times `amplitude_um`.
+    """
     wave = grid.waveform(low_crest_amplitudes(grid, np.ones(grid.excited.size)))
     return wave * (FIRST_AMPLITUDE_RATIO * amplitude_um / np.abs(wave).max())
 

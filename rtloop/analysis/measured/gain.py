@@ -1,7 +1,7 @@
 """Static gain of a plant, measured in closed loop: position per command at references that are held in turn.
 
-    x̄_i, v̄_i   means of position and command while reference i is held         K̂ = Σ |x̄_i+1 − x̄_i| / Σ |v̄_i+1 −
-    v̄_i|
+    x̄_i, v̄_i   means of position and command while reference i is held
+    K̂ = Σ |x̄_i+1 − x̄_i| / Σ |v̄_i+1 − v̄_i|
 
 The references go out in equal steps and back in the same ones. A step after a turn is left out: there hysteresis
 answers with its narrow loops alone. The slopes of the others scatter by noise and by the hysteresis that an inverse
@@ -53,7 +53,8 @@ def static_gain(reference: Real, position: Real, command: Real, rate_hz: float) 
 
     All three are (ticks,), in µm, of the staircase alone.
 
-    Raises ValueError unless position and command move the same way at each step that counts.
+    The first step in each direction does not count. Raises ValueError unless position and command move the same way at
+    each other step.
     """
     count = round(JUDGED * HELD_S * rate_hz)
     x, v = (signal.reshape(2 * STEPS + 1, -1)[:, -count:].mean(axis=1) for signal in (position, command))

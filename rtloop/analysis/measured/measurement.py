@@ -46,7 +46,7 @@ class LoopMeasurement:
 
         Keys: periods, lines (their number), from_hz, to_hz, moved_um, margins ({name: {value, std}}), resonance (the
         fields of LightMode), gain (those of StaticGain), model ({margins: {name: value}, gain_ratio}). The last three
-        are None where there is none.
+        are None where no mode was found, no gain measured or no model given.
         """
         measured = self.response
         return to_jsonable(
@@ -133,8 +133,9 @@ def measure_loop(
 
 
 def _find_mode(measured: MeasuredResponse, rate_hz: float, near_hz: float | None) -> LightMode | None:
-    """Return the lightly damped mode near `near_hz`, for None near the largest certain response; None for fewer than
-    MIN_LINES lines there or without a mode.
+    """Return the lightly damped mode near `near_hz`; None without a mode and for fewer than MIN_LINES lines near it.
+
+    If `near_hz` is None, it is the line of the largest plant response whose spread is below MAX_LINE_SPREAD.
     """
     if near_hz is None:
         certain_gains = np.where(measured.spread < MAX_LINE_SPREAD, np.abs(measured.plant), 0.0)

@@ -22,7 +22,7 @@ PER_DECADE = 100
 DENSE_BAND = 0.12
 """Half width, as a fraction of a resonance's frequency, of the band in which every odd line is a candidate."""
 SILENT_INTERVAL = 4
-"""Number of candidate lines of which one stays silent."""
+"""Number of successive odd lines of which one stays silent."""
 FLATTENINGS, CLIPPING_RATIO = 60, 0.85
 FADE_IN_PART = 0.5
 """Fraction of the settling period during which the reference grows."""
@@ -60,10 +60,10 @@ def make_grid(
 ) -> LineGrid:
     """Return odd lines between two frequencies, evenly on a logarithmic scale, dense about `near_hz`.
 
-    The period is rounded to whole samples. One of SILENT_INTERVAL candidates stays silent, chosen at random by `seed`.
-    `silent` has the harmonics, even ones too, that are not excited, from one below the lowest odd line of the band to
-    one above the highest. Raises ValueError for fewer than three odd lines, for frequencies that do not rise from above
-    0, and for a band beyond HIGHEST_PART of the rate.
+    The period is rounded to whole samples. In a run of successive odd lines, one of SILENT_INTERVAL stays silent,
+    chosen at random by `seed`. `silent` has all harmonics, even ones too, that are not excited, from one below the
+    lowest odd line of the band to one above the highest. Raises ValueError for fewer than three odd lines in the band,
+    and unless 0 < `from_hz` < `to_hz` ≤ HIGHEST_PART of the rate.
     """
     samples = round(period_s * rate_hz)
     if not 0 < from_hz < to_hz <= HIGHEST_PART * rate_hz:
@@ -90,8 +90,9 @@ def make_grid(
 
 
 def _choose_silent(candidates: Lines, random: np.random.Generator) -> Lines:
-    """Return candidates that stay silent: one, at random, of each SILENT_INTERVAL successive ones; never an end of a
-    run.
+    """Return the candidates that stay silent: in each run of successive odd lines, one at random of SILENT_INTERVAL.
+
+    The ends of a run are never silent.
     """
     runs = np.split(candidates, np.flatnonzero(np.diff(candidates) > 2) + 1)
     groups = [

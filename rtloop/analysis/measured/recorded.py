@@ -37,9 +37,10 @@ class PeriodicPart(NamedTuple):
         return signal[self.tick_slice].reshape(self.periods, self.samples)
 
     def grid(self, reference: Real, rate_hz: float) -> LineGrid:
-        """Return the excited lines, and the silent ones between them, of the first period of `reference` (ticks,).
+        """Return the excited lines of the first period of `reference` (ticks,), and the silent lines.
 
-        Raises ValueError for fewer than LEAST_LINES excited lines, and where no line is silent.
+        The silent lines are all others from one below the lowest excited line to one above the highest. Raises
+        ValueError for fewer than LEAST_LINES excited lines, and where no line is silent.
         """
         sizes = np.abs(np.fft.rfft(reference[self.start : self.start + self.samples]))
         sizes[0] = 0.0
@@ -59,10 +60,9 @@ class PeriodicPart(NamedTuple):
 
 
 def find_periodic_part(reference: Real) -> PeriodicPart | None:
-    """Return the longest range of a reference (ticks,) that repeats itself at least twice after settling; None without
-    one.
+    """Return the longest part of a reference (ticks,) with two or more equal periods after settling; None without one.
 
-    Of equally long ranges the last one is returned.
+    The last one of equally long parts is returned.
     """
     parts = [part for start, end in _moving_ranges(reference) if (part := _repeating_part(reference, start, end))]
     return max(reversed(parts), key=lambda part: part.samples * part.periods, default=None)
@@ -81,7 +81,10 @@ def _moving_ranges(reference: Real) -> list[tuple[int, int]]:
 
 
 def _repeating_part(reference: Real, start: int, end: int) -> PeriodicPart | None:
-    """Return the whole periods, two or more, within a range of the reference, without one to settle; None for fewer."""
+    """Return the equal whole periods, two or more, about the middle of a range of the reference; None for fewer.
+
+    One period is left out, to settle, if less than SETTLING_PART of a period precedes the repetition in the range.
+    """
     part = reference[start:end]
     middle = part.size // 2
     candidate_periods = np.flatnonzero(part[middle + LEAST_SAMPLES :] == part[middle]) + LEAST_SAMPLES

@@ -55,7 +55,7 @@ class ExportedKernel:
 
     @property
     def _c_types(self) -> list[type[ctypes._SimpleCData[int]]]:
-        """The ctypes of the result and of each argument."""
+        """The ctypes types of the result and of each argument, in this order."""
         return [C_TYPES[type_name] for type_name in re.findall(r"\w+\(float64\)|\w+", self._signature)]
 
 

@@ -82,7 +82,8 @@ def _make_private_folder(path: Path) -> bool:
 def _cache_folder() -> tuple[Path, bool]:
     """Return the cache's folder, made if needed, and whether its files survive a restart of the machine.
 
-    It is in the user's cache folder, whose files survive, else in /tmp, else a new folder for this process alone.
+    It is in the user's cache folder, whose files survive, else in the folder for temporary files, such as /tmp, else a
+    new folder for this process alone.
     """
     if not HAS_OWNERS:  # A folder that others cannot change is not known to be one.
         return Path(tempfile.mkdtemp(prefix="rtloop-")), False

@@ -41,8 +41,8 @@ def write(path: Path, data: bytes) -> None:
 def read(path: Path) -> bytes | None:
     """Return a file's contents without the digest; None if it is missing or damaged.
 
-    A damaged file, and one that cannot be read or belongs to another user, is renamed; the first causes a warning on
-    stderr.
+    A damaged file, and one that cannot be read or belongs to another user, is renamed; the first one in this process
+    causes a warning on stderr.
     """
     try:
         data = _contents(path)

@@ -148,6 +148,7 @@ def intrinsic(function: Callable[..., object], uncompiled: Callable[..., object]
 
         @wraps(function)
         def typing_function(_: object, *arguments: Type) -> object:
+            """Call `function` with the module `native.compiler` in place of numba's typing context."""
             return function(compiler, *arguments)
 
         return compiler.types.Function(compiler.make_intrinsic_template(symbol, typing_function, function.__name__))
@@ -223,7 +224,7 @@ def native_address(kernel: Any, signature: Any) -> int:
 def cached_address(kernel: Kernel, name: str, signature: Callable[[], Signature]) -> int:
     """Return the address of a kernel, loaded from the cache by `name`, or compiled and stored under that name.
 
-    `signature()` is called for a compilation alone; it returns numba's signature. Raises numba's errors for a function
+    `signature()` is called only for a compilation; it returns numba's signature. Raises numba's errors for a function
     that cannot be compiled.
     """
     return machine_code.load(name) or compile_kernel(kernel.py_func, signature(), name, kernel.options)

@@ -53,8 +53,8 @@ def c_function_object_code(cfunc: Any, name: str) -> bytes | None:
 def _emit_object_code(module: llvm.ModuleRef, name: str, machine: llvm.TargetMachine, raises: bool) -> bytes | None:
     """Return object code that exports `name` alone.
 
-    None if it needs a symbol that neither LLVM nor this process has, or may raise without `raises`. `module` is
-    changed.
+    None if the code needs a symbol that neither LLVM nor this process has, or if it may raise although `raises` is
+    False. `module` is changed.
     """
     for symbol in (*module.functions, *module.global_variables):
         if symbol.name != name and not symbol.is_declaration:

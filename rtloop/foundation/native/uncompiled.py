@@ -45,7 +45,7 @@ def is_uncompiled_allowed() -> bool:
 
 
 def register_function(function: Callable[..., object]) -> int:
-    """Assign the next number, from 1, to `function`, by which `call` and `call_law` find it; return the number."""
+    """Assign the next number, from 1, to `function` and return it: `call` and `call_law` find `function` by it."""
     number = next(_numbers)
     _functions[number] = function
     return number

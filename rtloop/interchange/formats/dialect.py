@@ -1,7 +1,7 @@
 """Dialect of a table in text: encoding, delimiter, decimal sign, header, units; found from its lines.
 
 Programs write any text at the beginning of a file: the lines of numbers are searched, and the names above them. Lines
-of the middle and of the end are examined too, as a German program at rest writes 0 and not 0,0.
+from the middle and the end are examined too: the first numbers of a German file may be 0, which shows no decimal sign.
 """
 
 from __future__ import annotations
@@ -68,7 +68,8 @@ class CsvDialect(NamedTuple):
 def detect_dialect(path: Path) -> CsvDialect:
     """Return the dialect of a file, by a sample of its lines.
 
-    Raises UnreadableData if it is empty or no text, or no rows of numbers are found in its first SAMPLE_BYTES.
+    Raises UnreadableData if the file is empty or no text, its first line is longer than SAMPLE_BYTES, or no row of
+    numbers is found in its first SAMPLE_BYTES.
     """
     encoding, head, later_lines = _read_sample(path)
     lines = [*head, *later_lines]
@@ -85,7 +86,9 @@ def detect_dialect(path: Path) -> CsvDialect:
         )
     first = _first_row((split_fields(line, delimiter) for line in head), width, numbers, decimal)
     if first is None:
-        raise UnreadableData(f"{path}: no row of numbers in the first {SAMPLE_BYTES >> 10} KiB")
+        raise UnreadableData(
+            f"{path}: no row of numbers in the first {SAMPLE_BYTES >> 10} KiB; shorten the text above the numbers"
+        )
     names, units, has_header = _header(head[:first], delimiter, width)
     unit_matches = [_TRAILING_UNIT.search(field) for field in split_fields(head[first], delimiter)]
     units = tuple(match[1] if match else unit for match, unit in zip(unit_matches, units, strict=True))
@@ -155,7 +158,10 @@ def _encoding(block: bytes) -> str:
 
 
 def _score(lines: Sequence[str], delimiter: str | None, decimal: str) -> float:
-    """Return the fraction of numbers among the fields of lines of usual width, times the fraction of such lines."""
+    """Return the fraction of numbers among the fields of usual lines, times the fraction of usual lines.
+
+    A usual line has the most frequent number of fields. Blank lines do not count; an empty field is no number.
+    """
     rows = [split_fields(line, delimiter) for line in lines if line.strip()]
     width = _width(rows)
     regular_rows = [row for row in rows if len(row) == width]
@@ -190,7 +196,7 @@ def _dates(rows: Sequence[Sequence[str]], width: int) -> tuple[int, ...]:
 def _first_row(rows: Iterable[Sequence[str]], width: int, numbers: Sequence[int], decimal: str) -> int | None:
     """Return the index of the first row of `width` fields with numbers in all columns `numbers`; None without one.
 
-    Fields may be empty, but not all of them.
+    Some of these columns may be empty in the row, but not all of them.
     """
     for number, row in enumerate(rows):
         is_data_row = len(row) == width and all(is_number(row[column], decimal) for column in numbers)
@@ -202,7 +208,8 @@ def _first_row(rows: Iterable[Sequence[str]], width: int, numbers: Sequence[int]
 def _header(lines: Sequence[str], delimiter: str | None, width: int) -> tuple[tuple[str, ...], tuple[str, ...], bool]:
     """Return names and units of all `width` columns by the lines above the numbers, and whether there are names.
 
-    A column without a name is `column_1`, …; one without a unit has "".
+    The names are from the last of these lines with `width` or `width` − 1 fields, or from the one before if the last
+    has units, as `_are_units` finds. A column without a name is `column_1`, …; one without a unit has "".
     """
     header_rows = [split_fields(_COMMENT.sub("", line, count=1), delimiter) for line in lines]
     candidates = [
@@ -218,7 +225,7 @@ def _header(lines: Sequence[str], delimiter: str | None, width: int) -> tuple[tu
 
 
 def _are_units(fields: Sequence[str]) -> bool:
-    """Whether at least half of the nonempty fields of a row below the names are units, or stand in brackets."""
+    """Whether at least half of the nonempty `fields` of a row are units, or at least half stand in brackets."""
     nonempty_fields = [field for field in fields if field]
     bracketed_count = sum(field[0] + field[-1] in ("[]", "()") for field in nonempty_fields)
     return bool(nonempty_fields) and max(

@@ -29,8 +29,9 @@ DELIMITER_NAMES = {None: "blanks", "\t": "tabs"}
 def read_csv(path: Path) -> Table:
     """Return the columns of numbers and dates; columns of text are left out.
 
-    Dates become s since the first row, and the first of them the time. Raises UnreadableData for a file without a
-    table, with damaged or uneven rows, or beyond MAX_COLUMNS or the memory limit; MissingExtra without pandas.
+    Dates become s since the first row; the first column of dates becomes the table's column of times. Raises
+    UnreadableData for a file without a table, with damaged or uneven rows, with a text among the numbers or a missing
+    date, and beyond MAX_COLUMNS, MAX_ROWS or MAX_BYTES; MissingExtra without pandas.
     """
     dialect = detect_dialect(path)
     if len(dialect.names) > MAX_COLUMNS:
@@ -46,9 +47,9 @@ def read_csv(path: Path) -> Table:
         columns[name], units[name] = (columns[name] - columns[name][:1]) * 1e-9, "s"
     delimiter_name = DELIMITER_NAMES.get(dialect.delimiter, repr(dialect.delimiter))
     about = {
-        "table": f"columns separated by {delimiter_name}, decimal {dialect.decimal!r}, "
+        "table": f"columns separated by {delimiter_name}, decimal sign {dialect.decimal!r}, "
         f"{dialect.encoding.removesuffix('-sig')}, numbers from line {dialect.first + 1} on"
-        + ("" if dialect.has_header else ", no names")
+        + ("" if dialect.has_header else ", no column names")
     }
     text = [name for k, name in enumerate(dialect.names) if k not in used_columns and not name.startswith("column_")]
     if text:
@@ -86,15 +87,15 @@ class _NumberLines(io.TextIOBase):
         return iter(self._file)
 
     def close(self) -> None:
-        """Close the file behind the text."""
+        """Close the file."""
         self._file.close()
 
 
 def _read_numbers(path: Path, dialect: CsvDialect) -> list[list[npt.NDArray[Any]]]:
     """Return blocks of rows, each a list of columns (rows,): first the dates, in ns since 1970, then the numbers.
 
-    Raises UnreadableData with the place of a text among the numbers, for a row of another length, and for too many
-    rows; MissingExtra without pandas.
+    Raises UnreadableData, with the place, for a text among the numbers, a missing date and a row with too many or too
+    few fields; also for too many rows. Raises MissingExtra without pandas.
     """
     try:
         import pandas
@@ -139,8 +140,8 @@ def _read_numbers(path: Path, dialect: CsvDialect) -> list[list[npt.NDArray[Any]
 def _require_even_rows(path: Path, dialect: CsvDialect, without_last: npt.NDArray[np.intp]) -> None:
     """Raise UnreadableData for the first row with fewer columns than the others, unless it is the last of the file.
 
-    Only the rows `without_last` are examined: (rows,) the numbers, rising from 0 for the first row of numbers, of rows
-    without a value in their last column. The last row of a file may be cut off.
+    `without_last` has the rising indices of the rows to examine, which have no value in their last column; the first
+    row of numbers has index 0. The last row of a file may be cut off.
     """
     checked_count, short_row = 0, None
     with contextlib.closing(_NumberLines(path, dialect)) as lines:
@@ -188,7 +189,7 @@ def _column_numbers(path: Path, dialect: CsvDialect, values: Any) -> Real:
 def _dates_ns(path: Path, dialect: CsvDialect, values: Any) -> npt.NDArray[np.int64]:
     """Return the dates of a column, a series of pandas, as ns since 1970 in UTC, int64.
 
-    Raises UnreadableData at the first field without a date, such as NaN.
+    A date without a time zone counts as UTC. Raises UnreadableData at the first field without a date, such as NaN.
     """
     import pandas
 

@@ -10,7 +10,7 @@ from rtloop.interchange.formats.table import Table
 
 
 def read_hdf5(path: Path, group: str | None = None) -> Table:
-    """Return the columns of `group`; None: of the longest group, if possible of several columns.
+    """Return the columns of `group`; for None, of the longest group with several columns, or else of the longest one.
 
     Raises UnreadableData if the file is no HDF5 file, damaged, too large or too deeply nested, or has no such group or
     no numbers; MissingExtra without h5py.

@@ -32,10 +32,10 @@ VALUE_KEYS = ("data", "values")
 
 
 def read_mat(path: Path, group: str | None = None) -> Table:
-    """Return the signals of the raster or structure `group`; None: of the longest one, if possible of several columns.
+    """Return the signals of the raster or structure `group`.
 
-    Raises UnreadableData if the file is no MAT file, damaged or too large, or has no such group or no numbers;
-    MissingExtra without h5py for version 7.3.
+    For None, it is the longest group with several columns, or else the longest one. Raises UnreadableData if the file
+    is no MAT file, damaged or too large, or has no such group or no numbers; MissingExtra without h5py for version 7.3.
     """
     with os.fdopen(open_user_file(path), "rb") as file:
         head = file.read(HDF5_OFFSET + len(HDF5_MAGIC))
@@ -54,8 +54,8 @@ def read_mat(path: Path, group: str | None = None) -> Table:
 def _load_variables(path: Path, head: bytes) -> dict[str, object]:
     """Return the variables of a file of version 5 or older by name, structures as dicts.
 
-    `head` is the begin of the file, at least HEADER_BYTES, which tells the version. Raises UnreadableData if it is no
-    MAT file, damaged, or larger than MAX_BYTES when unpacked; OSError if it cannot be opened.
+    `head` has the first bytes of the file, at least HEADER_BYTES, which tell the version. Raises UnreadableData if the
+    file is no MAT file, damaged, or larger than MAX_BYTES when unpacked; OSError if it cannot be opened.
     """
     from scipy.io import loadmat
 
@@ -74,9 +74,9 @@ def _load_variables(path: Path, head: bytes) -> dict[str, object]:
 
 
 def _require_bounded_size(path: Path, order: str) -> None:
-    """Raise UnreadableData where an element is damaged or cut off, or all are larger than MAX_BYTES unpacked.
+    """Raise UnreadableData if an element of a MAT file is damaged or cut off, or all unpacked exceed MAX_BYTES.
 
-    `order` is the byte order, "<" or ">".
+    `order` is the file's byte order, "<" or ">".
     """
     size, position, total = path.stat().st_size, HEADER_BYTES, 0
     with os.fdopen(open_user_file(path), "rb") as file:
@@ -84,9 +84,14 @@ def _require_bounded_size(path: Path, order: str) -> None:
             file.seek(position)
             kind, length = np.frombuffer(file.read(8).ljust(8, b"\0"), f"{order}u4").tolist()
             if kind not in (MATRIX, COMPRESSED):
-                raise UnreadableData(f"{path}: damaged: no element of a MAT file at byte {position}")
+                raise UnreadableData(
+                    f"{path}: damaged: no element of a MAT file at byte {position}; copy or save the file again"
+                )
             if position + 8 + length > size:
-                raise UnreadableData(f"{path}: cut off: the element at byte {position} ends beyond the end of the file")
+                raise UnreadableData(
+                    f"{path}: cut off: the element at byte {position} ends beyond the end of the file; copy or save "
+                    "the file again"
+                )
             total += length if kind == MATRIX else _decompressed_size(path, file, length, MAX_BYTES - total)
             if total > MAX_BYTES:
                 raise UnreadableData(
@@ -96,10 +101,10 @@ def _require_bounded_size(path: Path, order: str) -> None:
 
 
 def _decompressed_size(path: Path, file: IO[bytes], length: int, limit: int) -> int:
-    """Return the decompressed size in bytes of an element of `length` bytes at the place that `file` has reached.
+    """Return the decompressed size in bytes of an element of `length` bytes at the current position of `file`.
 
-    Counting ends with the first block beyond `limit`, so that a larger size is only known to be above it. Raises
-    UnreadableData if it is damaged.
+    Counting ends beyond `limit`: a result above it is a lower bound of the size. Raises UnreadableData if the element
+    is damaged.
     """
     stream, total, remaining = zlib.decompressobj(), 0, length
     try:
@@ -122,9 +127,10 @@ def _is_controldesk(value: object) -> TypeGuard[Mapping[str, object]]:
 
 
 def _controldesk_tables(path: Path, value: Mapping[str, object]) -> dict[str, Table]:
-    """Return a table for each X that has columns, by the name of its raster: "X(2)" without a name, "" for a single X.
+    """Return a table for each X, the times of a raster, that has columns.
 
-    A Y belongs to an X of equal length, unless its XIndex or its raster names another one.
+    The key is the raster's name, such as "X(2)" for the second X if it names no raster, and "" if there is one X alone.
+    A signal Y belongs to each X of equal length, unless its XIndex or its Raster names another one.
     """
     times, tables = _as_list(value["X"]), dict[str, Table]()
     about = {"layout": "ControlDesk", **_description(value)}
@@ -165,10 +171,11 @@ def _description(value: Mapping[str, object]) -> dict[str, str]:
 
 
 def _collect_arrays(columns: FileColumns, path: str, value: object, depth: int, unit: str | None = None) -> None:
-    """Collect every array of numbers below `value` into `columns`, by its path; names and units are beside it.
+    """Add every array of numbers in `value` to `columns`, by its path.
 
-    `unit` counts if `value` is an array itself; `depth` is the number of levels above it. Objects that only MATLAB
-    can read are listed as left out. Raises UnreadableData for structures that are nested too deeply.
+    A structure's fields Name and Unit, its own or in its DataInfo, are name and unit of its field Data or Values.
+    `unit` is the unit of `value` if it is an array itself; `depth` is the number of levels above it. Objects that only
+    MATLAB can read are listed as left out. Raises UnreadableData for structures that are nested too deeply.
     """
     if depth > MAX_DEPTH:
         raise UnreadableData(f"{columns.path}: {path}: nested too deeply; allowed: up to {MAX_DEPTH} levels")
@@ -199,9 +206,10 @@ def _collect_arrays(columns: FileColumns, path: str, value: object, depth: int, 
 
 
 def _collect_signals(columns: FileColumns, path: str, signals: object, depth: int) -> None:
-    """Collect Simulink's signals(k) into `columns`: values under their label, others like any structure.
+    """Add Simulink's signals(k) to `columns`: `values` under the signal's label, title or block name.
 
-    In values of three or more dimensions, the time is the last one.
+    A signal without `values` is added like any structure. If `values` has three or more dimensions, the last one is
+    the time.
     """
     for number, signal in enumerate(_as_list(signals), start=1):
         if isinstance(signal, dict) and "values" in signal:

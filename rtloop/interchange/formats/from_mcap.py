@@ -3,7 +3,7 @@
     log_time_s      time of a message's log, in s since the first message of the topic
     FIELD.INNER.0   its numbers; NaN where a message lacks one
 
-Of a file that was cut off or is damaged, the part before the damage is read, and `about["problems"]` names the damage.
+The part of a file before a damage, such as a cut-off end, is read, and `about["problems"]` names the damage.
 """
 
 from __future__ import annotations
@@ -44,8 +44,9 @@ def read_mcap(path: Path | str, topic: str | None = None) -> Table:
 
     Columns are `log_time_s`, from 0 at the first message, and each number of a message by its path, such as `pose.x.0`,
     NaN where a message lacks it. Messages after a damage are left out, which `about["problems"]` says. Raises
-    UnreadableData if the file is no MCAP file or empty, the topic is missing or not the only one, has no number, too
-    many messages or a message that cannot be decoded; MissingExtra if a decoder's package is missing.
+    UnreadableData if the file is no MCAP file or has no messages, if it has no `topic` or, for None, several topics,
+    and if the topic has no number, too many messages or fields, or a message that cannot be decoded; MissingExtra if
+    a decoder's package is missing.
     """
     path = Path(path)
     try:
@@ -58,7 +59,7 @@ def read_mcap(path: Path | str, topic: str | None = None) -> Table:
 
 
 def _count_messages(source: McapSource) -> McapContents:
-    """Count the messages and bytes of every topic, up to the first damage, which is noted in `problems`."""
+    """Return the counts of messages and bytes by topic, up to the first damage, which `problems` names."""
     contents = McapContents(Counter(), Counter(), [])
     for schema, channel, message in _messages_until_damage(source, contents.problems):
         contents.counts[channel.topic, encoding(channel, schema)] += 1
@@ -75,7 +76,10 @@ def _messages_until_damage(source: McapSource, problems: list[str]) -> Iterator[
 
 
 def _choose_topic(path: Path, contents: McapContents, topic: str | None) -> str:
-    """Return `topic`, or the only one if None. Raises UnreadableData if it is missing or there is no single one."""
+    """Return `topic`; for None, the only topic.
+
+    Raises UnreadableData for a file without messages or without `topic`, and, for None, with several topics.
+    """
     topics = set(contents.bytes)
     if topic is not None and topic in topics:
         return topic
@@ -138,9 +142,10 @@ class _TopicReader:
         return Table({LOG_TIME: elapsed_ns * 1e-9} | columns, {LOG_TIME: "s"}, LOG_TIME, about)
 
     def _add_message(self, item: Item, row: int) -> None:
-        """Store log time and numbers of a message in row `row`; a field that is new gets a column.
+        """Store log time and numbers of a message in row `row`; a new field gets a column.
 
-        Raises UnreadableData if it cannot be decoded or its fields exceed the memory limit; MissingExtra.
+        Raises UnreadableData if the message cannot be decoded or its fields exceed the memory limit; MissingExtra if a
+        decoder's package is missing.
         """
         schema, channel, message = item
         self._log_times[row] = message.log_time

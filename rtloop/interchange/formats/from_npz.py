@@ -16,10 +16,10 @@ WORKBOOK = "xl/workbook.xml"
 
 
 def read_npz(path: Path, group: str | None = None) -> Table:
-    """Return the arrays of one length, by the name `group`; None: the longest ones, if possible of several columns.
+    """Return the arrays of a group, which have one length, by its name `group`.
 
-    Raises UnreadableData if the file is no npz file, damaged, an Excel workbook or too large, or has no such group or
-    no numbers.
+    For None, it is the longest group with several columns, or else the longest one. Raises UnreadableData if the file
+    is no npz file, damaged, an Excel workbook or too large, or has no such group or no numbers.
     """
     columns = FileColumns(path)
     try:

@@ -22,7 +22,7 @@ def read_parquet(path: Path) -> Table:
     """Return all columns of numbers and times: durations in s, dates in s from the first row.
 
     The table's `about` names the other columns, which are left out. Raises UnreadableData if the file cannot be opened,
-    is no Parquet file, is damaged or too large, or has no column of numbers with two rows or more; MissingExtra without
+    is no Parquet file, is damaged or too large, or has no column with two or more numbers; MissingExtra without
     pyarrow.
     """
     try:

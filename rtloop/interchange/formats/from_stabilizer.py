@@ -1,4 +1,4 @@
-"""Stabilizer's data stream (QUARTIQ): the payloads of its UDP datagrams in a row, as `nc -ul 9293 > FILE` writes them.
+"""Stabilizer's data stream (QUARTIQ): the payloads of its UDP datagrams, joined, as `nc -ul 9293 > FILE` writes them.
 
 A frame has a header, `<HBBI`: 0x057B, format, samples per batch, sequence of the first batch. Format 1 follows with
 batches of two ADC and two DAC channels, 16-bit codes, one channel after the other.
@@ -73,8 +73,8 @@ def _frames(path: Path, data: np.ndarray, samples: int) -> np.ndarray:
 
     `samples` is the number of samples of each channel in a batch.
 
-    The length is the shortest one with which every frame begins with the first one's header but for the sequence.
-    Raises UnreadableData without such a length.
+    The frames have the shortest length at which each begins with the magic number, format and sample count of the
+    first. Raises UnreadableData without such a length.
     """
     step = 2 * len(CHANNELS) * samples
     for length in range(HEADER.itemsize + step, min(len(data), LARGEST_FRAME) + 1, step):

@@ -40,9 +40,9 @@ class FileColumns:
     bytes: int = 0
 
     def require_room(self, name: str, shape: tuple[int, ...]) -> None:
-        """Add an array of doubles of `shape` to the memory used.
+        """Add the size of an array of doubles of `shape` to `bytes`.
 
-        Raises UnreadableData beyond MAX_BYTES in all, or MAX_ROWS in this array.
+        Raises UnreadableData if `bytes` exceeds MAX_BYTES, or the longest side of this array MAX_ROWS.
         """
         rows, size = max(shape, default=1), 8 * int(np.prod(shape, dtype=object))
         self.bytes += size
@@ -55,8 +55,9 @@ class FileColumns:
     def add_column(self, name: str, values: npt.ArrayLike, unit: str | None = None) -> None:
         """Add one column as float64, or each column of a matrix, whose longer side is the time, as NAME_1, NAME_2, ….
 
-        A name that exists already gets a number in brackets. Single values are ignored; text, larger matrices and
-        arrays of more dimensions are listed in `left_out`. Raises UnreadableData for more than MAX_COLUMNS columns.
+        A name that exists already gets a number in brackets. Single values are ignored; arrays of text, matrices with
+        more than MATRIX_COLUMNS columns and arrays of more dimensions are listed in `left_out`. Raises UnreadableData
+        if the file has more than MAX_COLUMNS columns.
         """
         array = np.asarray(values)
         if array.dtype.kind not in "fiub":
@@ -80,12 +81,13 @@ class FileColumns:
                 self.units[name] = unit
 
     def grouped_tables(self) -> dict[str, Table]:
-        """Return tables by group name: each has the columns of one length that share the nearest column of times.
+        """Return tables by group name: each has the columns of one length with the same nearest column of times.
 
-        Without a column of times of their length, they share none.
+        The nearest column of times has the same length and shares the most folders of its path with the column. Columns
+        of a length without a column of times are one group.
 
         A group's name is the folder that all its columns share, which their names then lack; without one, the folder of
-        the times, or the number of rows.
+        the times, or else the number of rows, such as "100 rows".
         """
         times = [name for name in self.columns if _base_name(name).casefold() in TIME_NAMES]
         times.sort(key=lambda name: TIME_NAMES.index(_base_name(name).casefold()))
@@ -112,7 +114,7 @@ class FileColumns:
 def select_table(
     path: Path, tables: Mapping[str, Table], group: str | None, in_other_files: Sequence[str] = ()
 ) -> Table:
-    """Return the table of `group`; by default the longest one, if possible of several columns.
+    """Return the table of `group`; for None, the longest one with several columns, or else the longest one.
 
     Its `about` names the other groups; `in_other_files` becomes the table's. Raises UnreadableData without a table, and
     for an unknown group.
@@ -123,7 +125,7 @@ def select_table(
             if in_other_files
             else ""
         )
-        raise UnreadableData(f"{path}: contains no column of numbers{hint}")
+        raise UnreadableData(f"{path}: contains no column with two or more numbers{hint}")
     if group is not None and group not in tables:
         raise UnreadableData(f"{path}: no group {group!r}; there are {', '.join(map(repr, tables))}")
     name = (

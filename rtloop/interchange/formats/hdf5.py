@@ -72,11 +72,11 @@ def _collect_group(
     visited: set[tuple[int, int]],
     depth: int,
 ) -> None:
-    """Collect into `datasets`, by path, the datasets of a group and of the groups in it, without text.
+    """Add the datasets of a group and of the groups in it, except text, to `datasets`, by path.
 
-    `visited` holds the objects met so far, and grows. Links to them and to nowhere are listed in `columns.left_out`,
-    data in other files in `columns.in_other_files`. Raises UnreadableData for groups nested too deeply, and for too
-    many objects.
+    `visited` holds the objects that were met already, and grows. Links to such objects and links without a target are
+    listed in `columns.left_out`, data in other files in `columns.in_other_files`. Raises UnreadableData for groups
+    nested too deeply, and for too many objects.
     """
     import h5py
 
@@ -105,9 +105,10 @@ def _collect_group(
 
 
 def _resolve_member(columns: FileColumns, group: h5py.Group, key: str, name: str) -> h5py.HLObject | None:
-    """Return the object of a group under `key`; None where it is not in the file, which is then listed as `name`.
+    """Return the object of a group under `key`; None for a link into another file or without a target.
 
-    It is listed in `columns.in_other_files` if a link leads into another file, else in `columns.left_out`.
+    A link into another file is listed as `name` in `columns.in_other_files`, one without a target in
+    `columns.left_out`.
     """
     try:
         return _resolve_path(group, key, MAX_DEPTH)
@@ -119,9 +120,9 @@ def _resolve_member(columns: FileColumns, group: h5py.Group, key: str, name: str
 
 
 def _resolve_path(group: h5py.Group, path: str, links: int) -> h5py.HLObject:
-    """Return the object at a path, reached by hard links and at most `links` soft ones within each other.
+    """Return the object at a path, reached by hard links and at most `links` nested soft links.
 
-    Raises _OtherFileLink where the path leaves the file, KeyError without a target, and for more links.
+    Raises _OtherFileLink if the path leads into another file, KeyError if a link has no target or more are nested.
     """
     import h5py
 
@@ -144,7 +145,7 @@ def _resolve_path(group: h5py.Group, path: str, links: int) -> h5py.HLObject:
 
 
 def _is_in_other_files(columns: FileColumns, dataset: h5py.Dataset, name: str) -> bool:
-    """Whether the values of a dataset are in other files; it is then listed as `name` in `in_other_files`."""
+    """Whether a dataset is virtual, or stores its values in other files; `in_other_files` then lists it as `name`."""
     import h5py
 
     creation = dataset.id.get_create_plist()
@@ -158,7 +159,7 @@ def _is_in_other_files(columns: FileColumns, dataset: h5py.Dataset, name: str) -
 
 
 def _report_other_file(columns: FileColumns, name: str, reason: str) -> None:
-    """List an object as `name` in `in_other_files`, with the reason why it is left out."""
+    """List an object as `name`, without control characters, in `in_other_files`, with the reason."""
     columns.in_other_files.append(f"{re.sub(CONTROL, ' ', name)} ({reason})")
 
 
@@ -167,7 +168,7 @@ class _OtherFileLink(Exception):
 
 
 def _read_dataset(columns: FileColumns, dataset: h5py.Dataset, name: str) -> None:
-    """Add a dataset of numbers with its unit, or the fields of a dataset of records without units, to `columns`."""
+    """Add a dataset of numbers, with its unit, to `columns`; a dataset of records adds its fields, without units."""
     unit = next((_as_text(dataset.attrs[key]) for key in UNIT_ATTRIBUTES if key in dataset.attrs), None)
     values = dataset[()]
     for field in dataset.dtype.names or ():
@@ -204,10 +205,10 @@ def matlab_variables(columns: FileColumns) -> dict[str, object]:
 def _group_values(
     columns: FileColumns, file: h5py.File, names: dict[str, str], group: h5py.Group, depth: int
 ) -> dict[str, Any]:
-    """Return the values of a group's members by key, without those outside the file; see `_member_value`.
+    """Return the values of a group's members by key, each as `_member_value` returns it.
 
-    `names` has the full name of each key; `depth` is the number of groups above. Raises UnreadableData for members
-    nested too deeply.
+    `names` has the full name of each key to read; `depth` is the number of groups above. Links into other files or
+    without a target are left out. Raises UnreadableData for members nested too deeply, and beyond the memory limit.
     """
     members = {key: _resolve_member(columns, group, key, name) for key, name in names.items()}
     return {
@@ -221,8 +222,8 @@ def _member_value(columns: FileColumns, file: h5py.File, member: Any, name: str,
     """Return a structure as dict, a structure array as list of dicts, text as str, numbers as an array.
 
     An array of object references, such as a cell array, is a list of the values that they refer to, in MATLAB's order.
-    A named type and values in other files are an empty array. Raises UnreadableData for members nested too deeply, and
-    beyond the memory limit.
+    A named type, an empty array and values in other files are an empty array, an empty text is "". Raises
+    UnreadableData for members nested too deeply, and beyond the memory limit.
     """
     import h5py
 

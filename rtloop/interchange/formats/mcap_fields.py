@@ -159,7 +159,7 @@ def _protobuf(schema: Schema) -> Callable[[bytes], Fields]:
 
 
 def _present(message: Message) -> Iterator[tuple[str, object]]:
-    """Yield the fields of a protobuf message, except optional fields without a value."""
+    """Yield name and value of each field of a protobuf message; a field with presence only if it is set."""
     for field in message.DESCRIPTOR.fields:
         if not field.has_presence or message.HasField(field.name):
             yield field.name, getattr(message, field.name)
