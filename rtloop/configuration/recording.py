@@ -11,7 +11,6 @@ from rtloop.engine.memory import RING_SECONDS, Sizes, ring_ticks
 from rtloop.foundation.options import Options
 from rtloop.recording.capture.conditions import parse_comparison, signal_problem
 from rtloop.recording.file.event_window import EventWindow
-from rtloop.recording.file.topics.overview import MAX_COLUMNS
 
 MOST_BYTES = 1 << 30
 """Limit for the loop's ring, which is locked in memory, and the recorder's copy of it."""
@@ -87,14 +86,12 @@ def ring_sizes(options: AroundOptions | None, sizes: Sizes) -> Sizes:
 def event_recording_faults(options: AroundOptions | None, columns: Sequence[str], rate_hz: float) -> list[str]:
     """Return a line for each fault of [recording] around; [] for None. `columns` are all signals of a record.
 
-    Faults are a condition of `on` with an unknown signal, more than MAX_COLUMNS columns (the overview has them all),
-    and more than MOST_BYTES of memory for the ticks before an event.
+    Faults are a condition of `on` with an unknown signal, and more than MOST_BYTES of memory for the ticks before an
+    event.
     """
     if options is None:
         return []
     faults = [f"recording.around.on: {fault}" for text in options.on if (fault := signal_problem(text, columns))]
-    if len(columns) > MAX_COLUMNS:
-        faults.append(f"recording.around: {len(columns)} signals; allowed: up to {MAX_COLUMNS}")
     window = event_window(options)
     memory_bytes = 8 * len(columns) * (
         ring_ticks(rate_hz * window.ring_factor(RING_SECONDS)) + round(window.max_delay_s * rate_hz)

@@ -125,6 +125,17 @@ def test_all_columns_under_their_own_names(scan: Path):
     assert run("plot", "scan.mcap").exit_code == 0
 
 
+@pytest.mark.parametrize("option", [["--time", "c0"], ["--rate", "1000"]])
+def test_as_many_columns_as_an_import_allows_can_be_read(option: list[str], folder: Path):
+    """With --rate all 2,000 columns become signals beside tick and deadline_ns."""
+    names = [f"c{number}" for number in range(2000)]
+    rows = "\n".join(",".join([f"{row / 1000}"] * 2000) for row in range(20))
+    (folder / "wide.csv").write_text(",".join(names) + "\n" + rows + "\n")
+    answer("import", "wide.csv", "--all", *option)
+    assert answer("info", "wide.mcap")["duration_s"] == pytest.approx(0.02)
+    assert load("wide.mcap")["c1999"][19] == 0.019
+
+
 def test_jitter_and_missing_samples_are_reported_and_kept(folder: Path):
     random = np.random.default_rng(1)
     times = np.delete(TIME + random.uniform(-5e-6, 5e-6, COUNT) + 1e-5, np.arange(1000, 1004))

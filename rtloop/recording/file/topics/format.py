@@ -200,14 +200,19 @@ def doubles(columns: Sequence[str]) -> list[tuple[str, str]]:
     """
     fields: list[tuple[str, str]] = []
     for number, name in enumerate(columns, start=1):
-        fields += [(f"_tag_{number}", "u1" if number <= SHORT_TAGS else "<u2"), (name, "<f8")]
+        fields += [(f"_tag_{number}", f"V{len(_double_tag(number))}"), (name, "<f8")]
     return fields
 
 
 def fill_tags(records: Records, columns: Sequence[str]) -> None:
     """Write the tag before each column into `records`, which have the fields of `doubles`."""
     for number in range(1, len(columns) + 1):
-        records[f"_tag_{number}"] = int.from_bytes(_varint(number << 3 | _WIRE_64BIT), "little")
+        records[f"_tag_{number}"] = np.void(_double_tag(number))
+
+
+def _double_tag(number: int) -> bytes:
+    """Return the protobuf tag of field number `number`, a double."""
+    return _varint(number << 3 | _WIRE_64BIT)
 
 
 def fixed_bytes(template: Records, varying: Sequence[str]) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.uint8]]:

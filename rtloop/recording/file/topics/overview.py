@@ -24,8 +24,6 @@ from rtloop.signals import DEADLINE, TICK
 
 MINIMUM, MAXIMUM, MEAN = range(3)
 STATISTICS = ("min", "max", "mean")
-MAX_COLUMNS = 2047 // len(STATISTICS)
-"""Maximum number of columns; with more, the tag of a protobuf field would take three bytes."""
 Intervals = Real
 """Array (n, columns, 3) of statistics: minimum, maximum, mean."""
 Range = tuple[int, int]
@@ -97,10 +95,7 @@ class OverviewLayout:
     """Layout of the overview messages of a recording with `columns`."""
 
     def __init__(self, columns: Sequence[str]) -> None:
-        """Make the layout of messages with three figures for each of `columns`.
-
-        The caller must ensure that there are at most MAX_COLUMNS of them.
-        """
+        """Make the layout of messages with three figures for each of `columns`."""
         self._columns, names = len(columns), _field_names(columns)
         self._dtype = np.dtype(format.doubles(names))
         self._names = names

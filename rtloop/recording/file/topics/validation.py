@@ -142,7 +142,7 @@ class _HeaderBase(_CheckedModel):
     name: Text
     created_unix_ns: Annotated[int, Field(ge=0, lt=LARGEST_NS)]
     observed: list[Name]
-    columns: Annotated[list[Name], Field(max_length=2000)]
+    columns: Annotated[list[Name], Field(max_length=2002)]  # tick, deadline_ns, and all columns of an imported file
     rate_hz: Annotated[float, Field(ge=LOWEST_RATE_HZ, le=HIGHEST_RATE_HZ)]
     paced: bool
     ticks_expected: Tick | None = None
