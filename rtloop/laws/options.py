@@ -34,7 +34,7 @@ class LawOptions(Options):
         return self._law
 
     def bind(self, law: Any) -> None:
-        """Set the `LawReference` of the law that has these options, which are immutable otherwise."""
+        """Set the `LawReference` of the law that has these options; the options are immutable otherwise."""
         self._law = law
 
     def __reduce_ex__(self, protocol: Any) -> Any:
@@ -53,8 +53,8 @@ class FeedforwardOptions(LawOptions):
     def actuator(self) -> PlayModel:
         """Return the actuator that the feedforward inverts, as a sum of plays.
 
-        Without hysteresis it is a single play of threshold 0. Experiments and cautions use the actuator. The options of
-        every feedforward must define this method.
+        An actuator without hysteresis is a single play of threshold 0. Experiments and cautions use the actuator. The
+        options of every feedforward must define this method: the base class raises NotImplementedError.
         """
         raise NotImplementedError
 
