@@ -17,7 +17,8 @@ class LawOptions(Options):
     """Base class of the options of a law."""
 
     kind: str = ""
-    """Name of the law; by default the name of the shipped law."""
+    """Name of the law; without `kind` and `file` it is `transfer` for a controller, `prandtl_ishlinskii` for a
+    feedforward."""
     file: str | None = None
     """Python file that defines the law, relative to the configuration's."""
     _law: Any = PrivateAttr(None)
