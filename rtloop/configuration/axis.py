@@ -37,7 +37,7 @@ class PrefilterOptions(Options):
 
     @model_validator(mode="after")
     def _check(self) -> Self:
-        """Require at most MAX_TAPS taps in a row, and at most MAX_SECTIONS sections, each stable and of five numbers."""
+        """Require at most MAX_TAPS taps in a row, and at most MAX_SECTIONS stable sections of five numbers each."""
         taps = max(len(self.taps), len(self.command_taps))
         if taps > MAX_TAPS or len(self.sections) > MAX_SECTIONS:
             raise ValueError(

@@ -58,7 +58,7 @@ def option_cautions(prepared: Prepared) -> list[str]:
 
 
 def comparison_warnings(check: AxisCheck) -> list[str]:
-    """Return a warning for each notch or resonance of C(s) that C(z) lacks or shifts clearly; [] for other laws."""
+    """Return a warning for each notch or resonance of C(s) that C(z) lacks or shifts too far; [] without a C(s)."""
     if check.comparison is None:
         return []
     return [f"axis.{check.name}.controller: {warning}" for warning in check.comparison.warnings]
@@ -104,9 +104,9 @@ def _margins(axis: AxisOptions, check: AxisCheck) -> Iterator[str]:
 
 
 def tracking_problem(check: AxisCheck) -> str | None:
-    """Describe why a stable loop does not follow its reference at rest, to the fraction SETTLING_BAND of a step.
+    """Return a text if a stable loop does not follow its reference at rest, to the fraction SETTLING_BAND of a step.
 
-    None where it does, for an unstable loop, and where no loop is known.
+    None if the loop follows, is unstable or is not known.
     """
     if check.on_model is None or not check.on_model.is_stable:
         return None
@@ -120,9 +120,9 @@ def tracking_problem(check: AxisCheck) -> str | None:
 
 
 def rig_problem(axis: AxisOptions, check: AxisCheck, comparison: RigComparison) -> str | None:
-    """Describe why the loop of an axis does not control the simulated rig: it is unstable, or does not follow.
+    """Return a text if the loop of an axis is unstable on the simulated rig, or does not follow its reference there.
 
-    None where it controls the rig, and where `comparison` has no check on the rig.
+    None if it is stable and follows, and if `comparison` has no check on the rig.
     """
     lines, on_rig = comparison
     if on_rig is None or on_rig.on_model is None:

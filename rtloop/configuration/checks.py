@@ -48,7 +48,7 @@ class Findings:
 
     @contextmanager
     def collect_faults(self, key: str) -> Iterator[None]:
-        """Append a ValueError raised in the block to the faults, behind `key`, and continue after the block."""
+        """Append a ValueError raised in the block to the faults, as `key` and its message; continue after the block."""
         try:
             yield
         except ValueError as error:
@@ -75,9 +75,10 @@ class SharedLoop:
         return None if self.loop is None else self.loop.margins
 
     def broken_loop(self, dynamics: Transfer, delay_ticks: int, reference: ReferencePath) -> Loop:
-        """Return the loop broken at axis `place`, whose plant is replaced by `dynamics` and `delay_ticks`.
+        """Return the loop broken at axis `place`, with the plant `dynamics` behind `delay_ticks` samples in place of
+        this axis's model.
 
-        The other axes' loops stay closed. Raises ValueError where the linear law or a model is unknown.
+        The other axes' loops stay closed. Raises ValueError where the law is not linear or a model is missing.
         """
         if self.linear is None or self.plant is None:
             fault = f"the law {NOT_LINEAR}" if self.linear is None else "an axis has no model"
@@ -280,7 +281,7 @@ def _warn_of_missing_model(axis: AxisOptions, findings: Findings) -> None:
 def _report_instability(loop: Loop, options: ControllerOptions, key: str, models: str, findings: Findings) -> None:
     """Append to `findings` a fault, or with `allow_unstable` a warning, where a sampled loop is unstable.
 
-    The message begins with the `key` of the controller; `models` names the plants in it.
+    The message begins with the `key` of the controller; `models` is the text in it that names the plants.
     """
     if loop.is_stable or loop.period_s is None:
         return

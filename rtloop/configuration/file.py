@@ -140,8 +140,8 @@ class Configuration:
 
     @cached_property
     def owners(self) -> tuple[int, ...]:
-        """For each axis, the number of the axis whose controller controls it: its own number, unless it shares the
-        controller of an earlier axis."""
+        """Number of the axis whose controller controls an axis, for each axis in turn: its own number, unless it shares
+        the controller of an earlier axis."""
         owner_numbers: list[int] = []
         for number, axis in enumerate(self.axes):
             owner = number if axis.controller or not owner_numbers else owner_numbers[-1]
@@ -155,7 +155,7 @@ class Configuration:
 
     @property
     def wiring(self) -> dict[str, Wiring]:
-        """Channels of each axis by name, in the order of the axes."""
+        """Names of the input and output channel of each axis, by the axis's name, in the order of the axes."""
         return {
             axis.name: Wiring(self.channels[axis.name].input, self.channels[axis.name].output) for axis in self.axes
         }

@@ -90,7 +90,7 @@ def _text(path: Path) -> str:
 
 
 def select_options(value: object, info: ValidationInfo, base: type[Law], default: str) -> object:
-    """Return a table as options of the law that it names, bound to it; a value that is no table unchanged.
+    """Return a table as options of the law that it names, bound to this law; a value that is no table unchanged.
 
     Raises ValueError for a law that is missing, is no subclass of `base`, does not allow so many axes, or is not loaded
     by the running loop; ValidationError for wrong options.

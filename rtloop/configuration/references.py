@@ -39,7 +39,7 @@ class TableOfSamples:
     """All samples of the references in one array, which the loop reads; grows while references are built."""
 
     def __init__(self) -> None:
-        """Begin without samples."""
+        """Begin with an empty table."""
         self._parts: list[npt.NDArray[np.float64]] = []
         self._size = 0
 

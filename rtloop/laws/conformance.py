@@ -160,7 +160,7 @@ class LawConformance:
     def test_a_limited_command_does_not_wind_it_up(self, bench: Bench) -> None:
         """The loop returns from a long limit about as fast as from rest, with about the same overshoot.
 
-        The plant is that of `rtloop.laws.limited_return`: a lag with the gain of the law's model, or 1. Skipped for a
+        The plant of `rtloop.laws.limited_return` is used: a lag with the gain of the law's model, or 1. Skipped for a
         feedforward, and where the loop does not return from rest without a limit."""
         if not isinstance(self.law, Controller):
             pytest.skip("a feedforward has no loop")

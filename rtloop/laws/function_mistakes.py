@@ -128,7 +128,7 @@ def _unknown_names(
 
 def _wrong_returns(function: ast.FunctionDef, law: type[Law]) -> Iterator[Mistake]:
     """Yield a mistake if a function must return a number but has no `return` with a value and no `raise`, or if it must
-    return nothing but has a `return` with a value.
+    not return a value but does.
 
     `output`, except a coupled controller's, and a feedforward's `update` must return a number; no other function may.
     """

@@ -42,7 +42,7 @@ class LimitedLoop:
     """Loop of a law's `tick` and the plant; `limit_um` is the limit of the command."""
 
     def __init__(self, tick: Tick, gains: Real, limit_um: float) -> None:
-        """Put the plant, with `gains` (axes,), at the edge of its limited range; the law's state is the caller's."""
+        """Put the plant, with `gains` (axes,), at the edge of its limited range; the caller sets the law's state."""
         self._tick, self._gains, self.limit_um = tick, gains, limit_um
         self.position_um = self.edge_um
 

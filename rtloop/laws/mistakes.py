@@ -20,8 +20,8 @@ BASES = ("Controller", "CoupledController", "Feedforward")
 
 
 def find_mistakes(text: str, names: Mapping[str, object]) -> Iterator[Mistake]:
-    """Yield the mistakes in the laws of a text, law by law: those of the records, or, if the records are right, those
-    of the options and then of the functions.
+    """Yield the mistakes in the laws of a text, law by law: of the records, or, if the records are right, of the
+    options and then of the functions.
 
     `names` are the names that the text defines when it runs. The functions of a law whose `coefficients` are a dtype
     are not read.
@@ -39,7 +39,7 @@ def find_mistakes(text: str, names: Mapping[str, object]) -> Iterator[Mistake]:
 
 
 def missing_law(text: str, names: Mapping[str, object]) -> Mistake | None:
-    """Return the mistake of the first class that is meant as a law but is none; None if no class is.
+    """Return the mistake of the first class that resembles a law but is none; None if there is no such class.
 
     Such a class is a subclass of Law that lacks a function, or another class that has `build` and `output`. `names` are
     the names that the text defines when it runs.

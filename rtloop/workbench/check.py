@@ -121,8 +121,9 @@ def _second_opinion_faults(prepared: Prepared) -> list[str]:
 
 
 def _loops(check: AxisCheck) -> dict[str, Loop]:
-    """Return the loops of an axis, "continuous C(s)" on the model, if there is a C(s), then "as it runs"; {} without
-    one.
+    """Return the loops of an axis on its model by label: "continuous C(s)", if there is a C(s), then "as it runs".
+
+    {} if the loop on the model is not known.
     """
     if check.on_model is None:
         return {}

@@ -87,7 +87,7 @@ class DesignResult(Result):
 
     @property
     def headline(self) -> str:
-        """Order and norms of the controller."""
+        """The controller's order, its order before reduction, γ_opt and ‖F_l(P, C)‖∞, in one line."""
         order = f"controller of order {self.order} ({self.full_order} before reduction)"
         return f"{order}, γ_opt {self.gamma_opt:.6g}, ‖F_l(P, C)‖∞ {self.achieved:.6g}"
 

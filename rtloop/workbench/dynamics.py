@@ -87,7 +87,7 @@ class DynamicsResult(IdentifiedModel):
 
     @property
     def headline(self) -> str:
-        """Order, modes, delay and fit."""
+        """Order, frequency (Hz) and damping of each mode, delay in samples and fit in percent, in one line."""
         modes = ", ".join(f"{mode.frequency_hz:.1f} Hz (ζ {mode.damping:.4f})" for mode in self.fit.modes)
         delay = count_text(self.delay_ticks, "sample")
         return f"order {self.order}: {modes}; delay {delay}, fit {self.fit.fit_percent:.2f} %"

@@ -59,8 +59,8 @@ class ReplayResult(Result):
 
     @property
     def gaps(self) -> list[dict[str, int]]:
-        """Gaps of the files, [{first_tick, count}, …]: ticks that are missing, except those that the recorder omitted
-        on purpose, outside the time around events.
+        """Gaps of the files, [{first_tick, count}, …]: missing ticks, without the ticks that the recorder omitted on
+        purpose because they lie outside the time around events.
 
         A gap that the recording does not declare as lost is in `not_verified` too.
         """
@@ -78,7 +78,7 @@ class ReplayResult(Result):
 
     @property
     def headline(self) -> str:
-        """Verdict, first difference and number of compared ticks."""
+        """First difference or, without one, the verdict; then the number of compared ticks and the file, in one line."""
         difference = self.first_difference
         verdict = "identical" if self.identical else "not verified as a whole"
         if difference is not None:

@@ -157,7 +157,7 @@ class LimitedProcess:
         self._unanswered += 1
 
     def _send(self, data: bytes) -> None:
-        """Send a message, unless the process has died: then no answer will come."""
+        """Send a message; it is lost if the process has died."""
         with contextlib.suppress(BrokenPipeError):
             write_frame(self._pipes[0], data)
 
@@ -212,7 +212,7 @@ class LimitedProcess:
 
     @property
     def _end_of_message(self) -> int:
-        """End of the first message in the received data, in bytes; needs its length field."""
+        """End of the first message in the received data, in bytes; its length field must have been received."""
         return LENGTH.size + LENGTH.unpack_from(self._data)[0]
 
     def _read_output(self) -> None:

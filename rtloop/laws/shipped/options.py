@@ -63,8 +63,8 @@ class PrandtlIshlinskiiOptions(FeedforwardOptions):
     def _models(self) -> tuple[PlayModel, PlayModel]:
         """Forward model and inverse, computed once by the check.
 
-        Raises ValueError if both or none of them are given, if a model has no inverse, and if the first threshold of a
-        given inverse is not 0.
+        Raises ValueError if the options give both or neither, if a model has no inverse, and if the first threshold of
+        a given inverse is not 0.
         """
         if bool(self.thresholds_v) == bool(self.inverse_thresholds_um):
             raise ValueError(

@@ -47,7 +47,7 @@ STATE = cache_line_record(
 def play_output(value, threshold, last):
     """Return the output of the play operator of half-width `threshold` ≥ 0 for `value` after the output `last`.
 
-    By comparisons, so that NaN leaves `last`, and −0 is the same on every machine.
+    Comparisons compute it: NaN as `value` gives `last`, and −0 is the same on every machine.
     """
     low = value - threshold
     high = value + threshold
