@@ -78,7 +78,7 @@ class ReplayResult(Result):
 
     @property
     def headline(self) -> str:
-        """First difference or, without one, the verdict; then the number of compared ticks and the file, in one line."""
+        """First difference or, without one, the verdict; then the number of compared ticks and the file, in a line."""
         difference = self.first_difference
         verdict = "identical" if self.identical else "not verified as a whole"
         if difference is not None:
