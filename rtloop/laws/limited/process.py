@@ -192,8 +192,8 @@ class LimitedProcess:
         while len(self._data) < LENGTH.size or len(self._data) < self._end_of_message:
             if (remaining_s := clock.remaining_s) <= 0:
                 raise self._abandonment(
-                    f"the code took longer than {clock.limit_s:g} s and was stopped; correct a loop that never ends, "
-                    "or a wait"
+                    f"the code took longer than {clock.limit_s:g} s and was stopped; make it faster, or correct a loop "
+                    "that does not end"
                 )
             readable = select.select([answers, printed], [], [], remaining_s)[0]
             if printed in readable:
