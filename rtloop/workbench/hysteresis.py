@@ -61,9 +61,7 @@ class HysteresisResult(IdentifiedModel):
 
     @property
     def error_um(self) -> float:
-        """Rms error in µm over all fitted recordings, each judged by a model fitted to the others; NaN if none can be
-        judged.
-        """
+        """Rms error in µm over all fitted recordings, each judged by a model fitted without it; NaN if none can be."""
         return combine_errors([judgement.rms_um for judgement in self.judgements[0]]).rms_um
 
     @property
