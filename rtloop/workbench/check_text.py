@@ -27,7 +27,7 @@ ROWS = (
     ("static error", lambda loop: f"{loop.static_error_percent:.4f} %"),
     ("settling (5 %)", lambda loop: format_figure(1e3 * loop.settling_time_s, 2, " ms")),
     ("overshoot", lambda loop: format_figure(loop.overshoot_percent, 2, " %")),
-    ("peak command, µm per µm of step", lambda loop: f"{loop.peak_command:.4f}"),
+    ("peak command, µm per µm", lambda loop: f"{loop.peak_command:.4f}"),
 )
 
 
