@@ -371,7 +371,7 @@ def shared_faults(axes: Sequence[AxisOptions]) -> list[str]:
         adjacent = tuple(names[number : number + max(len(controller_axes), 1)])
         if controller_axes and controller_axes != adjacent:
             faults.append(
-                f"{key_text}; allowed: {', '.join(adjacent)}, in this order of the file: the controller's own axis, "
+                f"{key_text}; allowed: {', '.join(adjacent)}, in the order of the file: the controller's own axis, "
                 "then the axes that follow it"
             )
         for other_axis in axes[number + 1 : number + len(controller_axes)]:

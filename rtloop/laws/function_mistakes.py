@@ -22,7 +22,7 @@ REMEDIES = {
     "np": "; add `import numpy as np` at the top of the file",
     "numpy": "; add `import numpy` at the top of the file",
     "math": "; add `import math` at the top of the file",
-    "self": f"; {', '.join(PER_TICK)} have no self: return their numbers from `build`, as coefficients",
+    "self": f"; {', '.join(PER_TICK)} have no self: let `build` return the number as a coefficient, and read c.NAME",
 }
 """Remedy for a name that is often undefined."""
 HIDDEN = {"reserved", "scratch"}

@@ -108,7 +108,7 @@ def _print_law(out: Console, check: AxisCheck) -> None:
             shares if check.together.place else f"law {check.together.law.kind!r} of axes {', '.join(axes)}{order}"
         )
     elif check.discrete is not None and check.comparison is not None:
-        out.print(f"C(z) by {check.discrete.method}, order {check.discrete.order}")
+        out.print(f"C(z) by the method {check.discrete.method!r}, of order {check.discrete.order}")
         for shift in check.comparison.shifts:
             out.print(f"  {shift.kind} of C(s) at {shift.frequency_hz:.1f} Hz: at {shift.discrete_hz:.1f} Hz in C(z)")
     else:
