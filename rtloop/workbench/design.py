@@ -99,7 +99,7 @@ class DesignResult(Result):
         hinf, lines = self.synthesis.hinf, list[str]()
         lines.append(
             f"γ_opt {hinf.gamma_opt:.6g} is the smallest γ that a controller reaches, γ being the bound on the norm of "
-            f"the weighted closed loop; with a smaller γ, a condition of the synthesis fails: {hinf.limiting}"
+            f"the weighted closed loop; with a smaller γ, a condition is not met: {hinf.limiting}"
         )
         if self.slicot_gamma is not None:
             deviation_percent = 100 * (self.slicot_gamma / hinf.gamma_opt - 1)
