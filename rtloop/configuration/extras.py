@@ -45,7 +45,7 @@ class ExtraOutputOptions(Options):
 
     @model_validator(mode="after")
     def _check_level(self) -> Self:
-        """Require `level_um` with mark = "position", and only there."""
+        """Require `level_um` with mark = "position", and refuse it otherwise."""
         if (self.mark == "position") != (self.level_um is not None):
             value = "missing" if self.level_um is None else f"{self.level_um:g} µm"
             raise ValueError(

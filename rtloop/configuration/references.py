@@ -62,7 +62,7 @@ def generator_values(
     """Return a generator's kind, then its parameters: frequencies in Hz, the phase in turns, a sweep's duration in s,
     the time that a sample is held in ticks.
 
-    Samples are appended to `table`; the parameters are then the index of the first one and their number. Raises
+    Samples are appended to `table`; the parameters then begin with the index of the first one and their number. Raises
     ValueError for a duration or frequency that the rate does not allow, an unusable file, and an unknown channel.
     """
     if isinstance(options, HoldOptions):
