@@ -236,7 +236,7 @@ def test_weights_far_beyond_the_sensor_are_not_judged_on_hardware(tmp_path: Path
         (-10.0, 10.0, " or outside -9.99 … 9.99 V at the sensor"),
         (0.0, 10.0, " or above 9.99 V at the sensor, whose input reads 0 … 10 V"),
         (-10.0, 5.0, " or below -9.99 V at the sensor, whose input reads -10 … 5 V"),
-        (0.0, 5.0, ", at no voltage of the sensor, whose input reads 0 … 5 V"),
+        (0.0, 5.0, ", but at no voltage of the sensor, whose input reads 0 … 5 V"),
     ],
 )
 def test_limits_that_the_input_cannot_read_are_not_shown(low_v: float, high_v: float, message: str) -> None:

@@ -21,7 +21,8 @@ class ModelOptions(TransferOptions):
     delay_ticks: int = Field(default=0, ge=0, le=16)
     """Samples of delay beyond the sample that a held output always takes."""
     coupling: dict[str, float] = Field(default_factory=dict)
-    """µm that this axis moves, before its dynamics, per µm of another axis's command; keys are names of axes."""
+    """µm added to this axis's command, at the input of its dynamics, per µm of another axis's command; keys are names
+    of axes."""
 
 
 class PrefilterOptions(Options):
@@ -36,7 +37,7 @@ class PrefilterOptions(Options):
 
     @model_validator(mode="after")
     def _check(self) -> Self:
-        """Require at most MAX_TAPS taps and MAX_SECTIONS sections, each of five numbers and stable."""
+        """Require at most MAX_TAPS taps in a row, and at most MAX_SECTIONS stable sections of five numbers each."""
         taps = max(len(self.taps), len(self.command_taps))
         if taps > MAX_TAPS or len(self.sections) > MAX_SECTIONS:
             raise ValueError(
@@ -53,7 +54,8 @@ class PrefilterOptions(Options):
         return self
 
     def path(self) -> ReferencePath:
-        """Return the taps and sections that the reference passes; without taps, the single tap 1."""
+        """Return the path of the reference: `taps` (without any, the single tap 1) and sections toward the error, and
+        `command_taps` toward the command."""
         return ReferencePath(
             taps=np.array(self.taps or (1.0,)),
             command_taps=np.array(self.command_taps),
@@ -81,7 +83,7 @@ class LimitsOptions(Options):
 
     @property
     def lowest_v(self) -> float:
-        """Lowest drive in V, −drive_v by default."""
+        """Lowest drive in V: drive_min_v, or −drive_v where it is not set."""
         return -self.drive_v if self.drive_min_v is None else self.drive_min_v
 
 

@@ -1,7 +1,7 @@
 """Warnings about a configuration that can run: key, value and the allowed range, a line each.
 
-`option_cautions` reads options and references alone, and belongs to every start of a loop. `cautions` adds results of
-loop analysis: the accuracy of C(z), margins, and the loop on the simulated rig.
+`option_cautions` judges options, references and the loop on the simulated rig, at every start of a loop. `cautions`
+adds the accuracy of C(z) and the margins of the loop.
 """
 
 from __future__ import annotations
@@ -42,8 +42,8 @@ def cautions(prepared: Prepared) -> list[str]:
 
 
 def option_cautions(prepared: Prepared) -> list[str]:
-    """Return warnings, a line each, about options, references and loops that do not control the simulated rig; no
-    margin is computed.
+    """Return warnings, a line each, about options, references, contradictions between axis and hardware, and loops that
+    do not control the simulated rig; no margin is computed.
     """
     configuration = prepared.configuration
     warnings = [f"loop.{line}" for line in _pacing(configuration)] + list(_service(configuration))
@@ -58,7 +58,7 @@ def option_cautions(prepared: Prepared) -> list[str]:
 
 
 def comparison_warnings(check: AxisCheck) -> list[str]:
-    """Return a warning for each notch or resonance of C(s) that C(z) lacks or shifts clearly; [] for other laws."""
+    """Return a warning for each notch or resonance of C(s) that C(z) lacks or shifts too far; [] without a C(s)."""
     if check.comparison is None:
         return []
     return [f"axis.{check.name}.controller: {warning}" for warning in check.comparison.warnings]
@@ -86,7 +86,9 @@ def _service(configuration: Configuration) -> Iterator[str]:
 
 
 def _margins(axis: AxisOptions, check: AxisCheck) -> Iterator[str]:
-    """Yield a warning for a stable loop that does not follow its reference, and each margin beyond [axis.margins]."""
+    """Yield a warning if a stable loop does not follow its reference, and one for each of its margins that
+    [axis.margins] does not allow; none for an unstable or unknown loop.
+    """
     margins, options = check.margins, axis.margins
     if margins is None or check.on_model is None or not check.on_model.is_stable:
         return  # an unstable loop has no margins, and `check_axes` has reported it
@@ -102,9 +104,9 @@ def _margins(axis: AxisOptions, check: AxisCheck) -> Iterator[str]:
 
 
 def tracking_problem(check: AxisCheck) -> str | None:
-    """Describe why a stable loop does not follow its reference at rest, to the fraction SETTLING_BAND of a step.
+    """Return a text if a stable loop does not follow its reference at rest, to the fraction SETTLING_BAND of a step.
 
-    None where it does, for an unstable loop, and where no loop is known.
+    None if the loop follows, is unstable or is not known.
     """
     if check.on_model is None or not check.on_model.is_stable:
         return None
@@ -118,9 +120,9 @@ def tracking_problem(check: AxisCheck) -> str | None:
 
 
 def rig_problem(axis: AxisOptions, check: AxisCheck, comparison: RigComparison) -> str | None:
-    """Describe why the loop of an axis does not control the simulated rig: it is unstable, or does not follow.
+    """Return a text if the loop of an axis is unstable on the simulated rig, or does not follow its reference there.
 
-    None where it controls the rig, and where `comparison` has no check on the rig.
+    None if it is stable and follows, and if `comparison` has no check on the rig.
     """
     lines, on_rig = comparison
     if on_rig is None or on_rig.on_model is None:
@@ -135,9 +137,9 @@ def rig_problem(axis: AxisOptions, check: AxisCheck, comparison: RigComparison) 
 
 
 def _references(prepared: Prepared, axis: AxisOptions) -> Iterator[str]:
-    """Yield a line for each reference beyond the axis's limits: its own and the schedule's.
+    """Yield lines for each reference of the axis, its own and the schedule's, that is beyond the axis's limits.
 
-    Each is judged in the mode that it begins in.
+    Each reference is judged in the mode in which it begins.
     """
     limits, plan = axis.limits, prepared.plan
     for label, mode, values in references_in_plan(plan, plan.axes.index(axis.name)):
@@ -205,7 +207,7 @@ def _beyond_drive(axis: AxisOptions, lowest_um: float, highest_um: float) -> Ite
 
 def _reach(configuration: Configuration, axis: AxisOptions) -> Iterator[str]:
     """Yield a warning if limits.command_um lies beyond the range of the drive, and one if interlocks.position_um lies
-    beyond that of the sensor: such a limit never acts.
+    beyond the range of the sensor: such a limit never acts.
     """
     limits, interlocks = axis.limits, axis.interlocks
     reach_um = max(np.abs(drive_ends_um(axis)))
@@ -219,6 +221,6 @@ def _reach(configuration: Configuration, axis: AxisOptions) -> Iterator[str]:
 
 
 def _delay(configuration: Configuration, axis: AxisOptions, check: AxisCheck) -> Iterator[str]:
-    """Yield a warning for a model that states no delay if rig or driver has one, with which the loop is then judged."""
+    """Yield a warning for a model that states no delay if rig or driver has one: the loop is judged with the latter."""
     if axis.model is not None and axis.model.delay_ticks < driver_delay_ticks(configuration) <= check.delay_ticks:
         yield delay_difference(configuration, axis, axis.model.delay_ticks, check)

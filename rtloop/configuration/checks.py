@@ -48,7 +48,7 @@ class Findings:
 
     @contextmanager
     def collect_faults(self, key: str) -> Iterator[None]:
-        """Append a ValueError raised in the block to the faults, behind `key`, and continue after the block."""
+        """Append a ValueError raised in the block to the faults, as `key` and its message; continue after the block."""
         try:
             yield
         except ValueError as error:
@@ -75,9 +75,10 @@ class SharedLoop:
         return None if self.loop is None else self.loop.margins
 
     def broken_loop(self, dynamics: Transfer, delay_ticks: int, reference: ReferencePath) -> Loop:
-        """Return the loop broken at axis `place`, whose plant is replaced by `dynamics` and `delay_ticks`.
+        """Return the loop broken at axis `place`, with the plant `dynamics` behind `delay_ticks` samples in place of
+        this axis's model.
 
-        The other axes' loops stay closed. Raises ValueError where the linear law or a model is unknown.
+        The other axes' loops stay closed. Raises ValueError where the law is not linear or a model is missing.
         """
         if self.linear is None or self.plant is None:
             fault = f"the law {NOT_LINEAR}" if self.linear is None else "an axis has no model"
@@ -146,7 +147,7 @@ class AxisCheck:
 
     @property
     def is_known(self) -> bool:
-        """Whether `loop` can return one: the law is linear and, if axes share it, all models are known."""
+        """Whether the method `loop` can return a loop: the law is linear and, if axes share it, all have a model."""
         if self.together is not None:
             return self.together.linear is not None and self.together.plant is not None
         return self.linear is not None
@@ -170,7 +171,7 @@ def check_axes(configuration: Configuration, findings: Findings) -> list[AxisChe
 
     Faults, such as unstable loops, and warnings are appended to `findings`. Each law gets the numbers of its inputs and
     outputs. With a user law, all this is done in the limited process, which is killed if a law does not return. Raises
-    ConfigError for mistakes in the code of such a law.
+    ConfigError for mistakes in the code of such a law, AbandonedJob if that process fails while no law runs.
     """
     if needs_limited_process(configuration.laws):
         checks, limited_findings = run_limited(configuration.source, _checks_and_findings, configuration)
@@ -196,12 +197,12 @@ def _checks_and_findings(configuration: Configuration) -> tuple[list[AxisCheck],
 
 
 def delay_ticks(configuration: Configuration, axis: AxisOptions) -> int:
-    """Samples of delay in an axis's loop: the model's, where it states them, else the driver's."""
+    """Return the samples of delay in an axis's loop: the model's, where it states them, else the driver's."""
     return loop_delay_ticks(axis.model, driver_delay_ticks(configuration))
 
 
 def loop_delay_ticks(model: ModelOptions | None, driver_delay_ticks: int) -> int:
-    """Samples of delay that the model states, else `driver_delay_ticks`.
+    """Return the samples of delay that the model states, or `driver_delay_ticks` if it states none.
 
     Neither their sum nor the larger one: a model that states its delay was identified with it, and its dynamics hold
     any further delay of the rig.
@@ -219,7 +220,8 @@ def _delayed_model(axis: AxisOptions, delay: int) -> ModelOptions | None:
 def promised_loop(axis: AxisOptions, rate_hz: float, delay: int, plant: Transfer | None = None) -> Loop | None:
     """Return the loop of an axis on its model, or on another `plant`, with a `delay` in samples.
 
-    None without a model, also with `plant`; for a controller of several axes or none, and for a law that is not linear.
+    None if the axis has no model, even with `plant`; if it has no controller or one for several axes; and if its law is
+    not linear.
     """
     law = make_controller(axis, 1 / rate_hz)
     if axis.model is None or law is None or law.count > 1:
@@ -231,10 +233,11 @@ def promised_loop(axis: AxisOptions, rate_hz: float, delay: int, plant: Transfer
 
 
 def _check_axis(configuration: Configuration, axes: Sequence[AxisOptions], findings: Findings) -> list[AxisCheck]:
-    """Return the check of one axis that shares its controller with no other, and append faults to `findings`.
+    """Return the check of one axis that shares its controller with no other, and append faults and warnings to
+    `findings`.
 
-    `axes` has one entry, and the returned list too. The check has no law if this is a transfer function that cannot be
-    discretised.
+    `axes` has one entry, and the returned list too. The check has no law if there is no controller, or if this is a
+    transfer function that cannot be discretised.
     """
     (axis,) = axes
     key, delay = f"axis.{axis.name}.controller", delay_ticks(configuration, axis)
@@ -278,7 +281,7 @@ def _warn_of_missing_model(axis: AxisOptions, findings: Findings) -> None:
 def _report_instability(loop: Loop, options: ControllerOptions, key: str, models: str, findings: Findings) -> None:
     """Append to `findings` a fault, or with `allow_unstable` a warning, where a sampled loop is unstable.
 
-    The message begins with the `key` of the controller; `models` names the plants in it.
+    The message begins with the `key` of the controller; `models` is the text in it that names the plants.
     """
     if loop.is_stable or loop.period_s is None:
         return
@@ -293,7 +296,8 @@ def _report_instability(loop: Loop, options: ControllerOptions, key: str, models
 
 
 def _check_shared(configuration: Configuration, axes: Sequence[AxisOptions], findings: Findings) -> list[AxisCheck]:
-    """Return a check of each of `axes`, which share the controller of the first one, and append faults to `findings`.
+    """Return a check of each of `axes`, which share the controller of the first one; append faults and warnings to
+    `findings`.
 
     The loops are judged one axis at a time, with the other loops closed, and all axes at once. A check has no law if a
     shipped law is not linear. Raises TypeError for a law that controls one axis only.

@@ -37,7 +37,7 @@ def make_controller(
 
 
 def _law_class(options: LawOptions, default: LawReference) -> Any:
-    """Return the class of the law that `options` are bound to, of `default` if to none."""
+    """Return the class of the law to which `options` are bound, or the class of `default` if they are bound to none."""
     return law_class(options.law or default)
 
 
@@ -52,10 +52,11 @@ def axis_coefficients(
     enable: bool = False,
     place: int = 0,
 ) -> Records:
-    """Return the coefficients (1,) of one axis in a loop that knows `laws`; `enable`: the loop has an enable input.
+    """Return the coefficients (1,) of one axis in a loop that loads `laws`; `enable`: the loop has an enable input.
 
-    An axis that shares a `controller` is number `place` of its axes; axis 0 has the controller's records. Raises
-    ValueError for options that do not fit: limits beyond the channel, a controller of too high an order.
+    An axis that shares a `controller` is number `place` of the controller's axes, from 0. The controller's coefficients
+    are in the record of the axis with `place` 0 alone. Raises ValueError for options that do not fit, such as limits
+    beyond the channel's range or a controller of too high an order.
     """
     coefficients = new_records(law_layout(laws).coefficients, 1)
     feedforward = _law_class(axis.feedforward, DEFAULT_LAWS[0])(axis.feedforward, period_s, axis.model)
@@ -79,7 +80,8 @@ def axis_coefficients(
 def _resting_errors(controller: Controller) -> Real:
     """Return the errors per command at rest, C(1)⁻¹, (axes, axes).
 
-    0 for a controller with an integrator, for one that hardly passes 0 Hz, and for a law that is not linear.
+    0 for a controller with an integrator, for one whose gain at 0 Hz is at most 1/1000 of its largest gain, and for a
+    law that is not linear.
     """
     zeros: Real = np.zeros((controller.count, controller.count))
     try:
@@ -117,9 +119,10 @@ def _assign(coefficients: Records, name: str, value: object) -> None:
 
 
 def _prefilter(options: PrefilterOptions) -> Mapping[str, object]:
-    """Return the pre-filter's coefficients by name: numbers of taps and sections, and where there are any, these.
+    """Return the pre-filter's coefficients by name: `tap_count` and `section_count`, then, if there are any, both rows
+    of taps and the sections.
 
-    `tap_count` is rounded up to a multiple of TAP_LANES; 0 without taps.
+    `tap_count` is the length of the longer row, rounded up to a multiple of TAP_LANES; 0 without taps.
     """
     tap_count = max(len(options.taps), len(options.command_taps))
     fields: dict[str, object] = {
@@ -139,8 +142,8 @@ def limit_fields(options: LimitsOptions, output: Channel, period_s: float) -> Ma
     `bump_decay`, a factor per tick.
 
     Slews are in V per tick; `slew_v_per_tick` is infinite without `slew_v_per_s`. Raises ValueError for a limit
-    of the drive beyond the channel's range, and where the ramp after a trip, from the limit that is farther from
-    `safe_v`, takes longer than LONGEST_RAMP_S.
+    of the drive beyond the channel's range, and if the ramp after a trip, from the end of the channel's range that is
+    farther from `safe_v`, takes longer than LONGEST_RAMP_S.
     """
     lowest_v, highest_v = output.minimum_v, output.maximum_v
     allowed = f"±{highest_v}" if lowest_v == -highest_v else f"{lowest_v} … {highest_v}"
@@ -164,7 +167,7 @@ def limit_fields(options: LimitsOptions, output: Channel, period_s: float) -> Ma
 
 
 def interlock_fields(options: InterlockOptions, enable: bool = False) -> Mapping[str, float]:
-    """Return fields of the interlocks as the kernel compares them; without `enable`, −inf as enable_min_v.
+    """Return INTERLOCK_FIELDS by name, as the kernel compares them; `enable_min_v` is −inf without `enable`.
 
     Raises ValueError unless sensor_min_v is below sensor_max_v.
     """

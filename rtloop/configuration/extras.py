@@ -40,12 +40,12 @@ class ExtraOutputOptions(Options):
     min_v: float | None = None
     """Lowest voltage that the controller can set, by default the channel's lowest."""
     max_v: float | None = None
-    """Ends of the allowed range, the channel's by default. The channel's safe voltage lies between, as parking sets it
-    under any configuration."""
+    """Highest voltage that the controller can set, and the voltage of a mark; by default the channel's highest. The
+    channel's safe voltage must lie between `min_v` and `max_v`, as parking sets it under any configuration."""
 
     @model_validator(mode="after")
     def _check_level(self) -> Self:
-        """Require `level_um` with mark = "position", and only there."""
+        """Require `level_um` with mark = "position", and refuse it otherwise."""
         if (self.mark == "position") != (self.level_um is not None):
             value = "missing" if self.level_um is None else f"{self.level_um:g} µm"
             raise ValueError(
@@ -60,7 +60,9 @@ def extra_faults(
     hold_input: str | None,
     axes: Sequence[AxisOptions],
 ) -> list[str]:
-    """Return a line for each wrong name or number of channels in [inputs], [outputs] and `loop.hold_input`."""
+    """Return a line for each fault of [inputs], [outputs] and `loop.hold_input`: more than MAX_EXTRAS channels, an
+    output with the name of an input, an unknown axis, an unknown input.
+    """
     faults: list[str] = []
     for section, channels in (("inputs", inputs), ("outputs", outputs)):
         if len(channels) > MAX_EXTRAS:
@@ -128,10 +130,11 @@ def _require_channel(key: str, channels: Sequence[Channel], name: str) -> int:
 
 
 def connect(law: Law, owned: Sequence[str], inputs: Sequence[str], outputs: Mapping[str, ExtraOutputOptions]) -> None:
-    """Set `law.channels`, the numbers, from 0, of its inputs and of its outputs by name; `owned` are the law's axes.
+    """Set `law.channels`: by name, the number of each input of the law in `inputs`, and of each output in `outputs`.
 
-    `inputs` and `outputs` are all channels of the configuration, in order. Raises ValueError for a channel that the law
-    names and the configuration lacks, and for an output of another axis or with a mark.
+    `inputs` and `outputs` are all of the configuration, numbered in their order from 0; `owned` are the names of the
+    law's axes. Raises ValueError for a channel that the law names and the configuration lacks, and for an output of
+    another axis or with a mark.
     """
     numbers = {name: number for number, name in enumerate(inputs)}
     numbers |= {name: number for number, name in enumerate(outputs)}

@@ -12,7 +12,7 @@ from functools import cache
 def texts_below(owner: type) -> dict[str, str]:
     """Return the string below each field or member of a class and of its bases in this project, by its name.
 
-    A class's own text replaces that of a base.
+    The text of a class replaces the text of its base for the same field.
     """
     texts: dict[str, str] = {}
     for base in reversed(owner.__mro__):

@@ -140,7 +140,8 @@ class Configuration:
 
     @cached_property
     def owners(self) -> tuple[int, ...]:
-        """Number of the axis whose controller each axis has: its own number, unless it shares another's."""
+        """Number of the axis whose controller controls an axis, for each axis in turn: its own number, unless it shares
+        the controller of an earlier axis."""
         owner_numbers: list[int] = []
         for number, axis in enumerate(self.axes):
             owner = number if axis.controller or not owner_numbers else owner_numbers[-1]
@@ -154,7 +155,7 @@ class Configuration:
 
     @property
     def wiring(self) -> dict[str, Wiring]:
-        """Channels of each axis by name, in the order of the axes."""
+        """Names of the input and output channel of each axis, by the axis's name, in the order of the axes."""
         return {
             axis.name: Wiring(self.channels[axis.name].input, self.channels[axis.name].output) for axis in self.axes
         }
@@ -239,10 +240,10 @@ def _laws(sections: FileOptions, library: Library, faults: list[str]) -> tuple[L
 
 
 def _driver(raw: object, faults: list[str]) -> tuple[str, Options | None, dict[str, ChannelOptions]]:
-    """Return kind, options and channels of [driver]; where it is wrong, faults are appended.
+    """Return kind, options and channels of [driver]; append a line for each fault to `faults`.
 
-    Options that are wrong or of an unknown kind are None, a missing kind is "". Wrong channels are returned as the
-    file's tables, by name.
+    The options are None if they are wrong, or if the driver is unknown or cannot be imported. A missing kind is "".
+    Wrong channels are returned as the file's tables, by name.
     """
     if not isinstance(raw, dict):
         faults.append("driver: missing; needs a section [driver] with kind and channels")
@@ -280,7 +281,7 @@ def _validated(kind: Any, raw: object, prefix: str, faults: list[str], context: 
 
 
 def describe(error: ValidationError, prefix: str, raw: object, known_keys: set[str] | None = None) -> list[str]:
-    """Return a line for each fault of `raw`, the value of key `prefix`; `raw` None: not available.
+    """Return a line for each fault in `error`, raised for `raw`, the value of key `prefix`; `raw` None: not available.
 
     Beyond MAX_FAULTS, a last line says how many more there are. `known_keys` are suggested for an unknown key that
     resembles one; None: no suggestion.
@@ -370,7 +371,7 @@ def shared_faults(axes: Sequence[AxisOptions]) -> list[str]:
         adjacent = tuple(names[number : number + max(len(controller_axes), 1)])
         if controller_axes and controller_axes != adjacent:
             faults.append(
-                f"{key_text}; allowed: {', '.join(adjacent)}, in this order of the file: the controller's own axis, "
+                f"{key_text}; allowed: {', '.join(adjacent)}, in the order of the file: the controller's own axis, "
                 "then the axes that follow it"
             )
         for other_axis in axes[number + 1 : number + len(controller_axes)]:
@@ -383,8 +384,8 @@ def shared_faults(axes: Sequence[AxisOptions]) -> list[str]:
 
 
 def _cross_faults(sections: FileOptions, channels: Mapping[str, ChannelOptions]) -> list[str]:
-    """Return a line for each name that is missing, unknown or used twice, for each setpoint that is refused, and for
-    each entry of the schedule that equals an earlier one.
+    """Return a line for each fault between sections: a name that is missing, unknown or used twice, wrong axes of a
+    shared controller, a constant reference that is refused, an entry of the schedule that equals an earlier one.
     """
     names = [axis.name for axis in sections.axis]
     faults = [

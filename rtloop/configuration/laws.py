@@ -90,10 +90,10 @@ def _text(path: Path) -> str:
 
 
 def select_options(value: object, info: ValidationInfo, base: type[Law], default: str) -> object:
-    """Return a table as options of the law that it names, bound to it; a value that is no table unchanged.
+    """Return a table as options of the law that it names, bound to this law; a value that is no table unchanged.
 
-    Raises ValueError for a law that is missing, no `base`, not for so many axes, or not loaded by the running loop;
-    ValidationError for wrong options.
+    Raises ValueError for a law that is missing, is no subclass of `base`, does not allow so many axes, or is not loaded
+    by the running loop; ValidationError for wrong options.
     """
     if not isinstance(value, Mapping):
         return value
@@ -114,7 +114,7 @@ def select_options(value: object, info: ValidationInfo, base: type[Law], default
 
 
 def _axes(law: LawReference, kind: type[Law], options: Any) -> int:
-    """Return the number of axes of a law for any number of axes; 0 for other laws.
+    """Return the number of axes in `options` for a law whose class leaves this number open; 0 for any other law.
 
     Raises ValueError for a number that the law does not allow.
     """

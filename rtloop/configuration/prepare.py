@@ -119,9 +119,9 @@ def prepare(configuration: Configuration, *, duration_s: float | None = None, pa
 def _facts(configuration: Configuration, paced: bool, findings: Findings) -> Facts:
     """Return the facts of the driver, which is built but not opened.
 
-    Raises ConfigError, with all findings so far, for an unknown driver, options that it refuses, a rate above its
-    limit, and real hardware that is not paced: no other check is possible then. Raises MissingLibrary if its module
-    cannot be imported.
+    Raises ConfigError, with the faults in `findings`, for an unknown driver, options that the driver refuses, a rate
+    above its limit, and real hardware in virtual time: no other check is possible then. Raises MissingLibrary if the
+    driver's module cannot be imported.
     """
     with findings.collect_faults("driver."):
         driver = build_driver(configuration)
@@ -160,7 +160,7 @@ def _pacing(configuration: Configuration, paced: bool) -> Pacing:
 
 
 def _lateness_faults(configuration: Configuration) -> list[str]:
-    """Return a line if ticks shall be late with a driver other than the simulated rig in the loop's process."""
+    """Return a line if loop.simulated_lateness_us is set for a driver other than the simulated rig, else []."""
     if not configuration.loop.simulated_lateness_us or configuration.driver_kind == SimDriver.kind:
         return []
     remedy = f"set driver.kind = {SimDriver.kind!r}, or remove the key"
@@ -178,7 +178,9 @@ def refuse_simulated_lateness(prepared: Prepared) -> None:
 
 
 def _ticks(duration_s: float | None, rate_hz: float, findings: Findings) -> int | None:
-    """Return the duration in ticks, rounded; None for an endless run and, with a fault, for an impossible duration."""
+    """Return the duration in ticks, rounded; None for an endless run, and, with a fault in `findings`, for a duration
+    that rounds to no tick or exceeds MOST_TICKS.
+    """
     if duration_s is None:
         return None
     ticks = duration_s * rate_hz
@@ -197,9 +199,10 @@ def _coefficients(
     findings: Findings,
     place: int,
 ) -> Records | None:
-    """Return the coefficients (1,) of an axis; None, with faults in `findings`, where channel or options do not fit.
+    """Return the coefficients (1,) of an axis; None where its output channel is unknown or its options do not fit.
 
-    An axis that shares its `controller` is number `place`, from 0, of the controller's axes.
+    Faults, also an unknown input channel, go to `findings`. An axis that shares its `controller` is number `place`,
+    from 0, of the controller's axes.
     """
     channel, prefix = configuration.channels[axis.name], f"driver.channels.{axis.name}."
     output: Channel | None = None
@@ -239,7 +242,7 @@ def _generators(
 def _schedule(
     configuration: Configuration, facts: Facts, table: TableOfSamples, findings: Findings
 ) -> npt.NDArray[np.void]:
-    """Return the commands, (n,) of MESSAGE, in the order of their ticks; entries of one tick keep the file's order.
+    """Return the schedule's commands, (n,) of MESSAGE, by rising tick; entries of one tick keep the file's order.
 
     Samples go to `table`. A faulty entry is left out, and its fault goes to `findings`.
     """
@@ -255,7 +258,10 @@ def _schedule(
 def _command(
     entry: ScheduleOptions, names: list[str], configuration: Configuration, facts: Facts, table: TableOfSamples
 ) -> npt.NDArray[np.void]:
-    """Return the message (1,) of one entry of the schedule. Raises ValueError for a wrong reference."""
+    """Return the message (1,), of MESSAGE, for one entry of the schedule; samples of its reference go to `table`.
+
+    `names` are the axes of the configuration. Raises ValueError for a wrong reference.
+    """
     if entry.mode is not None:
         kind, values = Kind.SET_MODE, (float(Mode[entry.mode.upper()]),)
     elif entry.reference is not None:

@@ -39,6 +39,7 @@ class TableOfSamples:
     """All samples of the references in one array, which the loop reads; grows while references are built."""
 
     def __init__(self) -> None:
+        """Begin with an empty table."""
         self._parts: list[npt.NDArray[np.float64]] = []
         self._size = 0
 
@@ -58,10 +59,11 @@ class TableOfSamples:
 def generator_values(
     options: ReferenceOptions, rate_hz: float, inputs: tuple[Channel, ...], folder: Path, table: TableOfSamples
 ) -> tuple[float, ...]:
-    """Return a generator's kind, then its parameters: frequencies in Hz, the phase in turns, durations in ticks or s.
+    """Return a generator's kind, then its parameters: frequencies in Hz, the phase in turns, a sweep's duration in s,
+    the time that a sample is held in ticks.
 
-    Samples are appended to `table`; the parameters name the index of the first one and their number. Raises ValueError
-    for a duration or frequency that the rate does not allow, an unusable file, and an unknown channel.
+    Samples are appended to `table`; the parameters then begin with the index of the first one and their number. Raises
+    ValueError for a duration or frequency that the rate does not allow, an unusable file, and an unknown channel.
     """
     if isinstance(options, HoldOptions):
         return Generator.HOLD, options.value
@@ -102,8 +104,8 @@ def table_values(
 ) -> tuple[float, ...]:
     """Append `samples` (n, 1 or 2) to `table`; return kind and parameters of a generator that plays them.
 
-    Each row is held for `hold_ticks`, without `repeat` the last one for ever. The first column is the reference, the
-    second is added to the command, in µm.
+    Each row is held for `hold_ticks`. After the last row, `repeat` begins anew; otherwise the last row is held. The
+    first column is the reference; the second, in µm, is added to the command of a closed loop.
     """
     count, columns = samples.shape
     first = table.add(samples.T.ravel())
@@ -147,7 +149,8 @@ def read_samples(path: Path, folder: Path | None = None) -> npt.NDArray[np.float
 
 
 def _numbers(text: str) -> npt.NDArray[np.float64]:
-    """Return one or two numbers a line, (n, 1 or 2); skip empty lines and comments (#). Commas or spaces separate.
+    """Return the one or two numbers of each line, (n, 1 or 2), which commas or spaces separate; empty lines and
+    comments (#) are skipped.
 
     Raises _NotANumber for a text that is no number, and for a line of more than two numbers or not as many as the
     first.
@@ -186,7 +189,8 @@ def volts(lowest: float, highest: float) -> str:
 def extent(values: Sequence[float], samples: npt.NDArray[np.float64]) -> tuple[float, float]:
     """Return the lowest and the highest value of a generator `values`: its kind, then its parameters.
 
-    `samples` (n,) belong to a table. (0, 0) for an input, whose range is not known before.
+    `samples` (n,) are the reference of a generator that plays a table. The result for an input channel is (0, 0),
+    because its range is unknown.
     """
     kind = Generator(int(values[0]))
     if kind is Generator.INPUT:

@@ -21,16 +21,16 @@ from rtloop.linear.transfer import Transfer
 def rig_options(configuration: Configuration) -> RigOptions | None:
     """Return the driver's options if they can describe a simulated rig, else None.
 
-    The options of a bus, a node or a board can, even if hardware is connected there: see `simulated_plant`.
+    The options of drivers for a bus, a node or a board can, even if hardware is connected: see `simulated_plant`.
     """
     options = configuration.driver_options
     return options if isinstance(options, RigOptions) else None
 
 
 def driver_delay_ticks(configuration: Configuration) -> int:
-    """Return the ticks of delay that the driver adds: the simulated rig's latency, or the delay in a driver's facts.
+    """Return the ticks of delay that the driver adds: the simulated rig's latency, or the delay in the driver's facts.
 
-    0 for a driver that cannot be built, which other checks name.
+    0 for a driver that cannot be built: `prepare` reports this fault.
     """
     options = configuration.driver_options
     if configuration.driver_kind == "sim" and isinstance(options, RigOptions):
@@ -45,7 +45,8 @@ def driver_delay_ticks(configuration: Configuration) -> int:
 def simulated_plant(configuration: Configuration, axis_name: str) -> PlantOptions | None:
     """Return the plant of an axis on the simulated rig.
 
-    None for other drivers, and behind a bus or a board whose options describe no plant: there it may be hardware.
+    None for drivers whose options describe no rig, and for a bus, a node or a board whose options set neither `plant`
+    nor `plants`: the plant may then be hardware.
     """
     rig = rig_options(configuration)
     if rig is None:

@@ -50,7 +50,7 @@ class ScheduleOptions(Options):
 
 
 def setpoint_fault(value_um: float, position_limit_um: float) -> str | None:
-    """Describe why a constant reference in µm is refused; None for one within ± `position_limit_um`, ends included."""
+    """Return the fault of a constant reference in µm; None for one within ± `position_limit_um`, ends included."""
     if abs(value_um) <= position_limit_um:
         return None
     return (

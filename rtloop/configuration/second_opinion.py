@@ -132,8 +132,8 @@ def axis_faults(
     first-order sensor of bandwidth `sensor_hz` unless it is None, and takes the step through `prefilter`. `record`
     (bytes,) uint8 holds the coefficients of a transfer function as they run; None builds them from the law.
 
-    [] too for an axis that shares its controller (`faults_on_models` judges it), and without a model or a linear part
-    of its law.
+    The result is also [] for an axis that shares its controller (`faults_on_models` judges it), and without a model or
+    a linear law.
     """
     if check.together is not None or check.linear is None or model is None:
         return []
@@ -144,7 +144,7 @@ def axis_faults(
 
 
 def _axis_sentences(name: str, faults: list[str]) -> list[str]:
-    """Return the faults with the name of their axis; the last one has the remedy for all."""
+    """Return the faults, each behind "axis.NAME: "; the last one is followed by REMEDY."""
     return [f"axis.{name}: {fault}{f'; {REMEDY}' if fault is faults[-1] else ''}" for fault in faults]
 
 
@@ -214,7 +214,7 @@ def _opinion(paths: AxisPaths, numbers: LoopNumbers) -> Opinion:
 def disagreements(loop: Loop, opinion: Opinion) -> list[str]:
     """Return a sentence for each quantity in which `loop` and `opinion` differ by more than its tolerance; [] if none.
 
-    Of unstable loops only the poles are compared.
+    Only the poles are compared if `loop` or `opinion` is unstable, or if `loop` is in continuous time.
     """
     faults = []
     ours, theirs = (poles[np.abs(poles) > LEAST_POLE] for poles in (loop.poles, opinion.poles))
@@ -269,7 +269,7 @@ def _margins(open_loop: Any, poles: Complex) -> dict[str, float]:
         return open_loop(np.exp(1j * period_s * np.asarray(rad_s)))
 
     def crossings(value: Callable[[Complex], Real], is_near: npt.NDArray[np.bool_]) -> list[Any]:
-        """Return the angular frequencies at which `value` of L changes sign, where `is_near` (grid,) says so."""
+        """Return the angular frequencies at which `value` of L changes sign, where `is_near` (grid,) is True."""
         at = lambda rad_s: float(value(respond(rad_s)))
         cells = [(grid[k], grid[k + 1]) for k in np.flatnonzero((np.diff(value(response) > 0)) & is_near[:-1])]
         # A sign of rounding size may differ between one evaluation of the whole grid and one of a single point.

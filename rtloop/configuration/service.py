@@ -83,7 +83,7 @@ class ServiceOptions(Options):
 
     @property
     def prepares(self) -> bool:
-        """Whether `depolarise` or `tare_s` is set: a start then prepares the actuator, unless `arm` is set."""
+        """Whether `depolarise` is set or `tare_s` is above 0: a start without `arm` then prepares the actuator."""
         return self.depolarise is not None or self.tare_s > 0
 
     def faults_with_schedule(self) -> list[str]:

@@ -35,8 +35,10 @@ class RigComparison(NamedTuple):
 
 
 def contradictions(configuration: Configuration, axis: AxisOptions, check: AxisCheck) -> list[str]:
-    """Return a line for each key of the axis that contradicts the simulated rig or, of another driver, the sensor's
-    range or the delay: another loop than the checked one would run. [] without contradiction.
+    """Return a line for each contradiction between the axis and its hardware, [] for none: the weights against the
+    simulated actuator and the sensor's range, `um_per_v` against the simulated sensor, the delay against rig or driver.
+
+    A contradiction means that another loop than the checked one would run.
     """
     return [
         *_weights(configuration, axis),
@@ -46,7 +48,7 @@ def contradictions(configuration: Configuration, axis: AxisOptions, check: AxisC
 
 
 def compare_with_rig(configuration: Configuration, axis: AxisOptions, check: AxisCheck) -> RigComparison:
-    """Return the contradictions of an axis, and its check on the simulated rig where there are any, or where the loop
+    """Return the contradictions of an axis, and its check on the simulated rig if there are contradictions or the loop
     is unstable on the rig.
     """
     lines, on_rig = contradictions(configuration, axis, check), _check_on_rig(configuration, axis, check)
@@ -56,9 +58,9 @@ def compare_with_rig(configuration: Configuration, axis: AxisOptions, check: Axi
 
 
 def _check_on_rig(configuration: Configuration, axis: AxisOptions, check: AxisCheck) -> AxisCheck | None:
-    """Return the check of the axis on dynamics, stroke, sensor and delay of the simulated rig, not its model's.
+    """Return the check of the axis on the dynamics, stroke, sensor and delay of the simulated rig instead of its model.
 
-    None for other drivers, and where no linear loop is known.
+    A longer delay of the model is kept. None for other drivers, and where no linear loop is known.
     """
     plant = simulated_plant(configuration, axis.name)
     if plant is None or check.on_model is None:
@@ -113,9 +115,9 @@ def sensor_reach_um(configuration: Configuration, axis: AxisOptions) -> float:
 
 
 def _stroke_ratio(axis: AxisOptions, rig_plays: PlayModel) -> float | None:
-    """Return the rig's position over the feedforward's at `drive_v`, below 0 where the two move in opposite directions.
+    """Return the rig's position divided by the position of the feedforward's model, both at the drive limits.drive_v.
 
-    None where either has no plays or stays at 0.
+    The ratio is below 0 if the two move in opposite directions. None if either has no plays or stays at 0.
     """
     _, stroke_um = drive_ends_um(axis)
     rig_stroke_um = float(loading_curve(rig_plays, axis.limits.drive_v))
@@ -123,10 +125,11 @@ def _stroke_ratio(axis: AxisOptions, rig_plays: PlayModel) -> float | None:
 
 
 def _weights(configuration: Configuration, axis: AxisOptions) -> Iterator[str]:
-    """Yield a line if the weights seem to belong to another actuator.
+    """Yield one line if the weights of the feedforward seem to belong to another actuator, else none.
 
-    Their stroke is then within the noise of the simulated sensor, differs from the simulated actuator's by more than
-    LARGEST_STROKE_RATIO or in sign, or is by this factor beyond the sensor's range and the position interlock.
+    Their stroke is then below the noise of the simulated sensor; differs from the simulated actuator's stroke by more
+    than the factor LARGEST_STROKE_RATIO or in sign; or exceeds the sensor's range and the position interlock by this
+    factor.
     """
     key, reach_um = f"axis.{axis.name}.feedforward.weights_um_per_v", max(np.abs(drive_ends_um(axis)))
     plant, limits = simulated_plant(configuration, axis.name), axis.interlocks
@@ -158,7 +161,7 @@ def _weights(configuration: Configuration, axis: AxisOptions) -> Iterator[str]:
 
 
 def _sensor_scale(configuration: Configuration, axis: AxisOptions) -> Iterator[str]:
-    """Yield a line if `um_per_v` differs from the simulated sensor's.
+    """Yield a line if `um_per_v` differs from the simulated sensor's by more than SAME_SCALE.
 
     The scale of a real sensor is not known, and yields no line.
     """
@@ -186,7 +189,9 @@ def _delay(configuration: Configuration, axis: AxisOptions, check: AxisCheck) ->
 
 
 def delay_difference(configuration: Configuration, axis: AxisOptions, model_ticks: int, check: AxisCheck) -> str:
-    """Return a line with the delays in samples: `model_ticks` of the model, the driver's, and that of the margins."""
+    """Return a line with three delays in samples: `model_ticks` of the model, the driver's, and the one with which the
+    margins are computed.
+    """
     delay_ticks, kind = driver_delay_ticks(configuration), configuration.driver_kind
     driver_text = (
         f"the simulated rig has driver.latency_ticks = {delay_ticks}"

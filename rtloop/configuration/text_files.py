@@ -38,9 +38,9 @@ def read_regular(path: Path, limit_bytes: int) -> bytes:
 
 
 def read_text(path: Path, refused: type[RtloopError] = InputFileError) -> str:
-    """Return a text in UTF-8.
+    """Return the contents of a text file in UTF-8.
 
-    Raises `refused`, which names the file, where it cannot be read, has over MAX_TEXT_BYTES or is no text in UTF-8.
+    Raises `refused`, which names the file, if it cannot be read, has more than MAX_TEXT_BYTES or is no text in UTF-8.
     """
     try:
         return read_regular(path, MAX_TEXT_BYTES).decode()

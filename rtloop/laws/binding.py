@@ -34,14 +34,14 @@ def bind_functions(laws: Sequence[LawReference]) -> npt.NDArray[np.void]:
     """Return the FUNCTIONS records of these laws, in their order, compiled or loaded from the cache.
 
     The fields `output`, `update` and `enter` are addresses, 0 for an `enter` that the law lacks; the others are 0.
-    Raises ValueError for a law that cannot be compiled or calls a forbidden function, and as `law_class` does.
+    Raises ValueError for a law that cannot be compiled or calls a forbidden function, and the errors of `law_class`.
     """
     return np.concatenate([np.zeros(0, FUNCTIONS), *map(_bind_law, laws)])
 
 
 @cache
 def _bind_law(reference: LawReference) -> npt.NDArray[np.void]:
-    """Return the FUNCTIONS record of one law, shape (1,). It is compiled and checked once in a process.
+    """Return the FUNCTIONS record of one law, shape (1,). The law is compiled and checked once in a process.
 
     Raises ValueError as `bind_functions` does.
     """
@@ -75,9 +75,10 @@ def function_names(law: type[Law]) -> list[str]:
 
 
 def _function_address(law: type[Law], law_records: LawRecords, name: str) -> int:
-    """Return the address of a law's function `name`, compiled or loaded.
+    """Return the address of a law's function `name`: loaded from the cache if the law's functions are kernels, else
+    compiled. With NUMBA_DISABLE_JIT it is the address of an uncompiled function, which is not checked.
 
-    Raises ValueError if it cannot be compiled or makes a forbidden call.
+    Raises ValueError if a function that is no kernel cannot be compiled or makes a forbidden call.
     """
     function = getattr(law, name)
     if UNCOMPILED:
@@ -104,17 +105,18 @@ def _function_address(law: type[Law], law_records: LawRecords, name: str) -> int
 
 @cache
 def _checked_kernel(function: Callable[..., object]) -> Kernel:
-    """Return the kernel of a user law's function, with checked indices and divisions; it compiles at its first use.
+    """Return a kernel of a law's Python function, with checked indices and divisions; it compiles at its first use.
 
-    The cache keeps it alive, because the loop calls its address.
+    The cache keeps the kernel alive, because the loop calls its address.
     """
     return jit_strict(function)
 
 
 def _compiler_message(error: Exception) -> str:
-    """Return the compiler's message without advice, at most MAX_CHARACTERS: the lines with the mistake and its place.
+    """Return the lines of numba's message that name the mistake, without place and advice, at most MAX_CHARACTERS.
 
-    An exception other than numba's is returned as its type and text.
+    A missing operation reads "no operation NAME for (TYPES)". Any other exception than numba's is returned as its type
+    and text, of any length.
     """
     from numba.core.errors import NumbaError
 

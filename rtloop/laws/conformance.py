@@ -55,10 +55,10 @@ class LawConformance:
     def frequency_response(self, frequencies_hz: npt.ArrayLike, amplitude_um: float = 1.0) -> Complex:
         """Return the controller's frequency response from error to command, (frequencies,), for tests of one's own.
 
-        Its functions run as in the loop, without a limit of the command, with a sine of the error whose position is
-        −error: the reference is 0. With NUMBA_DISABLE_JIT=1 they run uncompiled. For several axes the shape is
-        (frequencies, axes, axes), with commands as rows and errors as columns. Raises ValueError for a feedforward,
-        frequencies beyond 0 … half of the rate, and a response that does not settle.
+        The law's functions run as in the loop, without a limit of the command. The reference is 0, the error a sine,
+        the position −error. NUMBA_DISABLE_JIT=1 runs them uncompiled. For several axes the shape is (frequencies, axes,
+        axes), with commands as rows and errors as columns. Raises ValueError for a feedforward, for a frequency that is
+        not above 0 and below half of the rate, and for a response that does not settle.
         """
         if self.law.count == 0:
             raise ValueError(
@@ -68,7 +68,7 @@ class LawConformance:
 
     @pytest.fixture
     def bench(self) -> Bench:
-        """The law's functions with their own records."""
+        """Return a Bench of the law: its compiled functions with their own coefficients and state."""
         return Bench(self.law)
 
     def test_build_gives_finite_numbers(self) -> None:
@@ -81,7 +81,8 @@ class LawConformance:
         )
 
     def test_whole_numbers_are_bounded(self) -> None:
-        """Every whole number in the records has its range in `allowed_coefficients` or `allowed_state`."""
+        """Each whole number of the records, and no other field, has its allowed values in `allowed_coefficients` or
+        `allowed_state`."""
         law_records = self.law.records(self.law.count)
         for kind, allowed in (("coefficients", law_records.allowed_coefficients), ("state", law_records.allowed_state)):
             table = getattr(law_records, kind)
@@ -94,8 +95,8 @@ class LawConformance:
             )
 
     def test_compiled_and_uncompiled_give_the_same_bits(self, bench: Bench) -> None:
-        """Compiled and uncompiled functions agree in results and state, over ticks with extreme errors and limited
-        commands."""
+        """Compiled and uncompiled functions give the same bits of results, state and extra outputs, over ticks with
+        extreme errors and limited commands."""
         uncompiled = Bench(self.law, compiled=False)
         for number, (tick_compiled, tick_uncompiled) in enumerate(
             zip(bench.run(TICKS), uncompiled.run(TICKS), strict=True)
@@ -124,12 +125,14 @@ class LawConformance:
         )
 
     def test_it_stays_finite(self, bench: Bench) -> None:
-        """Bounded errors with applied commands give commands below 1e9 µm (V for a feedforward)."""
+        """Bounded inputs give bounded results: a command, or the sum of a feedforward's drive (V) and its command (µm),
+        has a magnitude below 1e9."""
         for number, (value, _) in enumerate(bench.run(20 * TICKS, wild=False)):
             assert np.all(np.abs(value) < 1e9), f"tick {number}: the output is {value}; allowed: magnitudes below 1e9"
 
     def test_no_number_that_is_none_outlives_an_entry(self, bench: Bench) -> None:
-        """A new entry makes all outputs finite again after NaN and infinite inputs."""
+        """All results are finite again after NaN and infinite inputs: a controller's after a new entry, a feedforward's
+        at once."""
         bench.poison()
         bench.enter(*np.multiply.outer([3.0, 1.0, 5.0], np.ones(max(self.law.count, 1))))
         for number, (value, _) in enumerate(bench.run(TICKS, wild=False)):
@@ -138,8 +141,10 @@ class LawConformance:
             )
 
     def test_enter_continues_from_the_command(self, bench: Bench) -> None:
-        """`enter` leaves a bump of at most BUMP; a law without `enter` is skipped, as the loop adds an offset for
-        it."""
+        """The first command after `enter` differs from the command before by at most BUMP · (1 µm + |command| +
+        |error|).
+
+        Skipped for a feedforward, and for a controller without `enter`, to whose command the loop adds an offset."""
         if not isinstance(self.law, Controller) or type(self.law).enter is None:
             pytest.skip("the law does not define `enter`")
         random = np.random.default_rng(SEED)
@@ -155,7 +160,8 @@ class LawConformance:
     def test_a_limited_command_does_not_wind_it_up(self, bench: Bench) -> None:
         """The loop returns from a long limit about as fast as from rest, with about the same overshoot.
 
-        The loop of `rtloop.laws.limited_return` is used: a lag with the gain of the law's model, or 1."""
+        The plant of `rtloop.laws.limited_return` is used: a lag with the gain of the law's model, or 1. Skipped for a
+        feedforward, and where the loop does not return from rest without a limit."""
         if not isinstance(self.law, Controller):
             pytest.skip("a feedforward has no loop")
         free = bench.limited_loop(at_rest=True).unlimited_return()
@@ -182,7 +188,8 @@ class LawConformance:
             assert not calls, f"{name}: " + "; ".join(f"{called} {reason}" for called, reason in calls.items())
 
     def test_what_a_tick_costs(self, bench: Bench, record_property: Callable[[str, object], None]) -> None:
-        """Record `ns_per_tick`, called from Python, for comparison between laws; not a limit."""
+        """Record `ns_per_tick`, the mean time of a tick whose functions are called from Python, for comparison between
+        laws; no limit is tested."""
         began_ns = time.perf_counter_ns()
         deque = [value for value, _ in bench.run(COST_TICKS)]
         record_property("ns_per_tick", (time.perf_counter_ns() - began_ns) / COST_TICKS)
@@ -222,10 +229,12 @@ class Bench:
             return self._kernels[name](*self._rows, law_input)
 
     def run(self, ticks: int, seed: int = SEED, wild: bool = True) -> Iterator[tuple[float | tuple[float, ...], bytes]]:
-        """Run `ticks` ticks with random signals; yield for each (result, bytes of the state and of the extra outputs).
+        """Run `ticks` ticks with random signals; yield for each (result, bytes of the state and, of a controller, of
+        the extra outputs).
 
-        The result is the command in µm (for several axes a tuple), or a feedforward's drive plus its command. With
-        `wild`, every 97th tick of a controller has positions and references up to 1e6 µm.
+        The result is the command in µm (for several axes a tuple), or the sum of a feedforward's drive in V and its
+        command in µm. The applied command is limited to ±REACH_UM. If `wild`, every 97th tick of a controller has
+        positions and references up to 1e6 µm.
         """
         random = np.random.default_rng(seed)
         for number in range(ticks):
@@ -253,7 +262,10 @@ class Bench:
         return float(value) if self._law.count == 1 else tuple(control.command_um.tolist())
 
     def poison(self) -> None:
-        """Run ticks with NaN and infinite inputs; results and arithmetic exceptions are ignored."""
+        """Call `output`, and a controller's `update`, with NaN, +inf and −inf as all inputs, and ignore the results.
+
+        An ArithmeticError, IndexError or ValueError is ignored too.
+        """
         for value in (np.nan, np.inf, -np.inf):
             try:
                 if self._law.count == 0:
@@ -269,8 +281,8 @@ class Bench:
     def enter(self, position_um: Any, error_um: Any, command_um: Any) -> Any:
         """Enter a controller as the loop does, from a state of zeros; return the commands of its first tick.
 
-        The arguments are (axes,), the commands a number or, for several axes, a tuple, all in µm. A feedforward does
-        nothing and returns 0.
+        The arguments are (axes,), the commands a number or, for several axes, a tuple, all in µm. A controller without
+        `enter` keeps its state of zeros. The result for a feedforward is 0, and no function is called.
         """
         if self._law.count == 0:
             return 0.0
@@ -295,10 +307,11 @@ class Bench:
         return response[:, 0, 0] if count == 1 else response
 
     def limited_loop(self, at_rest: bool = False) -> LimitedLoop:
-        """Return the loop of the law and a plant with a lag, at the largest position that a command of REACH_UM holds.
+        """Return the loop of the law and a plant with a lag, at the position that a command of REACH_UM holds.
 
-        The law is entered there with no error. A law without `enter` cannot be: if `at_rest`, it runs at this
-        reference for SETTLING_TICKS without a limit of the command, else it begins from a state of zeros.
+        `enter` of the law is called at this position without an error. A law that lacks `enter` begins from a state of
+        zeros; if `at_rest`, it then runs for SETTLING_TICKS with this position as reference and no limit of the
+        command.
         """
         count = self._law.count
         loop = LimitedLoop(self._limited_tick, dc_gains(self._law.model, count), REACH_UM)

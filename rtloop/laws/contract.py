@@ -195,7 +195,7 @@ def record_type(fields: Fields | np.dtype[np.void]) -> np.dtype[np.void]:
 
 
 def _announce(law: Law) -> None:
-    """Announce that functions of this law run next, if it is a user law; nothing happens outside a limited process."""
+    """Announce that functions of this law run next, unless they are kernels; no effect outside a limited process."""
     if not law.shipped:
         reference = getattr(law.options, "law", None)
         announce(law.kind, reference.file if reference is not None else type(law).__module__)
@@ -204,9 +204,9 @@ def _announce(law: Law) -> None:
 def build_record(law: Law) -> npt.NDArray[np.void]:
     """Return the coefficients that a law builds, shape (1,).
 
-    A shipped law may leave names out: their values, and those behind a shorter array, are 0. Raises ValueError for a
-    result that is no dict, unknown names, missing names of a user law, values that are not numbers, NaN (infinity is
-    allowed), and shapes that do not fit; `build` may raise others."""
+    A law whose functions are kernels (`shipped`) may leave names out: their values, and those behind a shorter array,
+    are 0. Raises ValueError for a result that is no dict, unknown names, missing names of any other law, values that
+    are not numbers, NaN (infinity is allowed), and shapes that do not fit, and the errors of `build`."""
     _announce(law)
     dtype = law.records().coefficients
     record = np.zeros(1, dtype)
@@ -239,7 +239,9 @@ def build_record(law: Law) -> npt.NDArray[np.void]:
 
 
 def _build_location(law: Law) -> str:
-    """Return the beginning of a message about a law's `build`: "controller" or "feedforward", file and line."""
+    """Return the beginning of a message about a law's `build`: "KIND: FILE, line N: build", KIND being "controller" or
+    "feedforward".
+    """
     code = type(law).build.__code__
     part = "feedforward" if isinstance(law, Feedforward) else "controller"
     return f"{part}: {Path(code.co_filename).name}, line {code.co_firstlineno}: build"

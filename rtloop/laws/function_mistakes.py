@@ -22,7 +22,7 @@ REMEDIES = {
     "np": "; add `import numpy as np` at the top of the file",
     "numpy": "; add `import numpy` at the top of the file",
     "math": "; add `import math` at the top of the file",
-    "self": f"; {', '.join(PER_TICK)} have no self: return their numbers from `build`, as coefficients",
+    "self": f"; {', '.join(PER_TICK)} have no self: let `build` return the number as a coefficient, and read c.NAME",
 }
 """Remedy for a name that is often undefined."""
 HIDDEN = {"reserved", "scratch"}
@@ -51,9 +51,9 @@ class _Parameter(NamedTuple):
 
 
 def mistakes_in_function(function: ast.FunctionDef, law: type[Law], names: Mapping[str, object]) -> Iterator[Mistake]:
-    """Yield the mistakes in one function of a law; if its parameters are wrong, this mistake alone.
+    """Yield the mistakes in one function of a law; if number or order of the parameters is wrong, this alone.
 
-    `names` are the names that its module defines.
+    `names` are the names that the function's module defines.
     """
     feedforward = issubclass(law, Feedforward)
     last = "told" if not feedforward else "command_um" if function.name == "output" else "drive_v"
@@ -77,9 +77,9 @@ def mistakes_in_function(function: ast.FunctionDef, law: type[Law], names: Mappi
 
 
 def _undefined_signals(function: ast.FunctionDef, law: type[Law]) -> tuple[str, ...]:
-    """Return the names of a controller's signals that have no value yet in a function; () except in `output`.
+    """Return the names of a controller's signals that have no value yet in a function: () for `update` and `enter`.
 
-    There they are the command and its applied part, of a coupled controller the latter alone, as it sets the commands.
+    In `output` they are command_um and applied_um; in a coupled controller's only applied_um, as it sets command_um.
     """
     if function.name != "output":
         return ()
@@ -127,9 +127,10 @@ def _unknown_names(
 
 
 def _wrong_returns(function: ast.FunctionDef, law: type[Law]) -> Iterator[Mistake]:
-    """Yield a mistake for a function that must return a number and has no `return` with a value, and vice versa.
+    """Yield a mistake if a function must return a number but has no `return` with a value and no `raise`, or if it must
+    not return a value but does.
 
-    `output` must, except of a coupled controller, and `update` of a feedforward; no other function may.
+    `output`, except a coupled controller's, and a feedforward's `update` must return a number; no other function may.
     """
     nodes = list(ast.walk(function))
     values = [node for node in nodes if isinstance(node, ast.Return) and node.value is not None]

@@ -42,7 +42,7 @@ class LimitedLoop:
     """Loop of a law's `tick` and the plant; `limit_um` is the limit of the command."""
 
     def __init__(self, tick: Tick, gains: Real, limit_um: float) -> None:
-        """Put the plant, with `gains` (axes,), at the edge of its limited range; the law's state is the caller's."""
+        """Put the plant, with `gains` (axes,), at the edge of its limited range; the caller sets the law's state."""
         self._tick, self._gains, self.limit_um = tick, gains, limit_um
         self.position_um = self.edge_um
 
@@ -66,7 +66,7 @@ class LimitedLoop:
     def unlimited_return(self) -> Return | None:
         """Run the loop from rest at the edge to 0 without a limit; return the ticks and overshoot of this way.
 
-        None if it takes more than MOST_TICKS, diverges, or overshoots by FURTHEST.
+        None if it takes more than about MOST_TICKS, diverges, or overshoots by FURTHEST of the way or more.
         """
         shares, zero_um = np.ones((1, self._gains.size)), np.zeros_like(self._gains)
         while (ticks := _ticks_until_back(shares)) is None:
@@ -80,8 +80,8 @@ class LimitedLoop:
     def limited_return(self, saturated_ticks: int, most_ticks: int) -> Return | None:
         """Saturate the loop for `saturated_ticks`, then let it return to 0; return the ticks and overshoot of this way.
 
-        The reference is BEYOND times the edge, then 0.
-        None if it takes more than `most_ticks`.
+        The reference is BEYOND times the edge, then 0; the command is limited all the time.
+        None if the return takes more than `most_ticks`.
         """
         self.follow(BEYOND * self.edge_um, saturated_ticks, limited=True)
         start_um = self.position_um
@@ -107,7 +107,7 @@ def _overshoot(part: Real) -> float:
 def dc_gains(model: Any, axes: int) -> Real:
     """Return the gain at 0 Hz (axes,), µm of position per µm of command; +inf with an integrator, 1 without a model.
 
-    `model` is the model of a law: one for every axis, a tuple with one for each, or None, also as an entry.
+    `model` is the model of a law: one for every axis, a tuple with one for each axis, or None; an entry may be None.
     """
     models = model if isinstance(model, tuple) else (model,) * axes
     return np.array([1.0 if axis_model is None else axis_model.transfer().dc_gain for axis_model in models])

@@ -31,8 +31,8 @@ MAX_STATES = 400
 def linear_part(law: Controller) -> Any:
     """Return the law's `linear()`, or, if that is None, its linearisation at rest: the transfer from error to command.
 
-    A SampledController or DiscreteController, of several axes a SampledCoupledSystem. Raises ValueError for a law that
-    cannot be linearised: too many states, not smooth, or failing at rest.
+    The type is SampledController or DiscreteController, for several axes SampledCoupledSystem. Raises ValueError for a
+    law that cannot be linearised: it has more than MAX_STATES states, is not smooth at rest or fails there.
     """
     declared = law.linear()
     return linearise_at_rest(law) if declared is None else declared
@@ -41,8 +41,8 @@ def linear_part(law: Controller) -> Any:
 def linearise_at_rest(law: Controller) -> SampledController | SampledCoupledSystem:
     """Return the linearisation of a law about its rest: a SampledCoupledSystem for several axes.
 
-    States that no error reaches, or that reach no command, are left out. Raises ValueError for a law with too many
-    states, or one that is not smooth or fails at rest.
+    States that no error reaches, or that reach no command, are left out. Raises ValueError for a law that has more than
+    MAX_STATES states, is not smooth at rest or fails there.
     """
     tick = _Tick(law)
     if tick.size > MAX_STATES:
@@ -66,7 +66,10 @@ def linearise_at_rest(law: Controller) -> SampledController | SampledCoupledSyst
     wide, narrow, n = wide[np.ix_(indices, indices)], narrow[np.ix_(indices, indices)], int(is_minimal.sum())
     scale = np.abs(wide).max(axis=1, keepdims=True, initial=0.0) + 1e-12
     if not np.all(np.abs(wide - narrow) <= AGREEMENT * scale):
-        raise ValueError("the law is not smooth at rest")
+        raise ValueError(
+            "the law is not smooth at rest: small changes of its errors and states give changes that are not "
+            "proportional to them"
+        )
     a, b, c, d = narrow[:n, :n], narrow[:n, n:], narrow[n:, :n], narrow[n:, n:]
     if law.count > 1:
         return SampledCoupledSystem(CoupledSystem(a, b, c, d), law.period_s)
@@ -74,7 +77,7 @@ def linearise_at_rest(law: Controller) -> SampledController | SampledCoupledSyst
 
 
 def _place(error: Exception, law: type[Controller]) -> str:
-    """Return file and line of the function of a law that raised an error, as "FILE, line N: "; "" if none did."""
+    """Return the place in the law's files where an error was raised, as "FILE, line N: "; "" if it was elsewhere."""
     files = {python_function(function).__code__.co_filename for function in (law.output, law.update)}
     places = [(frame.f_code.co_filename, line) for frame, line in traceback.walk_tb(error.__traceback__)]
     places = [(file, line) for file, line in places if file in files]

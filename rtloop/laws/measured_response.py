@@ -33,8 +33,8 @@ def measure_response(
     """Return the response (frequencies, axes, axes) from errors, its columns, to commands, its rows.
 
     `tick` runs one tick with errors (axes,) and returns the commands (axes,), all in µm; `restart` returns to rest. The
-    error of one axis at a time is a sine of `amplitude_um`. Raises ValueError for frequencies beyond 0 … half of the
-    rate, and for a response that does not settle.
+    error of one axis at a time is a sine of `amplitude_um`. Raises ValueError for a frequency that is not above 0 and
+    below half of the rate, and for a response that does not settle.
     """
     frequencies = np.atleast_1d(np.asarray(frequencies_hz, float))
     highest_hz = 0.5 / period_s
@@ -54,7 +54,7 @@ def _settled_response(
 ) -> Complex:
     """Return the complex amplitudes of the commands (axes,) for errors `amplitudes_um` (axes,) times a sine.
 
-    Raises ValueError if they still change after MOST_TICKS.
+    Raises ValueError if they still change after MOST_TICKS and at least three windows.
     """
     window = max(LEAST_TICKS, math.ceil(LEAST_PERIODS / (frequency_hz * period_s)))
     previous = np.full(amplitudes_um.size, np.inf + 0j)

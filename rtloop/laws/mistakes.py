@@ -20,9 +20,11 @@ BASES = ("Controller", "CoupledController", "Feedforward")
 
 
 def find_mistakes(text: str, names: Mapping[str, object]) -> Iterator[Mistake]:
-    """Yield the mistakes in the laws of a text, law by law: in records, or else in options and then in functions.
+    """Yield the mistakes in the laws of a text, law by law: of the records, or, if the records are right, of the
+    options and then of the functions.
 
-    `names` are the names that the text defines when it runs.
+    `names` are the names that the text defines when it runs. The functions of a law whose `coefficients` are a dtype
+    are not read.
     """
     for node, law in _classes(text, names):
         if not _is_law(law):
@@ -37,9 +39,10 @@ def find_mistakes(text: str, names: Mapping[str, object]) -> Iterator[Mistake]:
 
 
 def missing_law(text: str, names: Mapping[str, object]) -> Mistake | None:
-    """Return the mistake for which the first class that resembles a law is none: a function or the base is missing.
+    """Return the mistake of the first class that resembles a law but is none; None if there is no such class.
 
-    `names` are the names that the text defines when it runs. None if no class resembles a law.
+    Such a class is a subclass of Law that lacks a function, or another class that has `build` and `output`. `names` are
+    the names that the text defines when it runs.
     """
     for node, law in _classes(text, names):
         functions = {item.name: item.lineno for item in node.body if isinstance(item, ast.FunctionDef)}
@@ -71,7 +74,8 @@ def _is_law(candidate: object) -> TypeGuard[type[Law]]:
 
 
 def _wrong_records(node: ast.ClassDef, law: type[Law]) -> Iterator[Mistake]:
-    """Yield a mistake for `coefficients` or `state` that is missing or describes no record."""
+    """Yield a mistake for `coefficients` or `state` that describes no record, or is missing in a class that is not
+    abstract."""
     lines = {target.id: item.lineno for item in node.body if isinstance(item, ast.Assign)
              for target in item.targets if isinstance(target, ast.Name)}  # fmt: skip
     for name in ("coefficients", "state"):
@@ -86,7 +90,7 @@ def _wrong_records(node: ast.ClassDef, law: type[Law]) -> Iterator[Mistake]:
 
 
 def _wrong_options(node: ast.ClassDef, law: type[Law], names: Mapping[str, object]) -> Iterator[Mistake]:
-    """Yield a mistake for a law that does not name the options that its text defines."""
+    """Yield a mistake if the law's text defines a class of options but the law's `options_model` is from elsewhere."""
     classes = [item for item in names.values() if isinstance(item, type) and item.__module__ == law.__module__]
     options = [item.__name__ for item in classes if issubclass(item, LawOptions)]
     if options and law.options_model.__module__ != law.__module__:

@@ -17,7 +17,8 @@ class LawOptions(Options):
     """Base class of the options of a law."""
 
     kind: str = ""
-    """Name of the law; by default the name of the shipped law."""
+    """Name of the law; without `kind` and `file` it is `transfer` for a controller, `prandtl_ishlinskii` for a
+    feedforward."""
     file: str | None = None
     """Python file that defines the law, relative to the configuration's."""
     _law: Any = PrivateAttr(None)
@@ -34,7 +35,7 @@ class LawOptions(Options):
         return self._law
 
     def bind(self, law: Any) -> None:
-        """Set the `LawReference` of the law that has these options, which are immutable otherwise."""
+        """Set the `LawReference` of the law that has these options; the options are immutable otherwise."""
         self._law = law
 
     def __reduce_ex__(self, protocol: Any) -> Any:
@@ -53,8 +54,8 @@ class FeedforwardOptions(LawOptions):
     def actuator(self) -> PlayModel:
         """Return the actuator that the feedforward inverts, as a sum of plays.
 
-        Without hysteresis it is a single play of threshold 0. Experiments and cautions use the actuator. The options of
-        every feedforward must define this method.
+        An actuator without hysteresis is a single play of threshold 0. Experiments and cautions use the actuator. The
+        options of every feedforward must define this method: the base class raises NotImplementedError.
         """
         raise NotImplementedError
 

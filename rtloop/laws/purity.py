@@ -58,7 +58,7 @@ def foreign_calls(kernel: Kernel, signature: Signature, libm: bool = False) -> d
 
 
 def _reason(name: str) -> str:
-    """Return why a law may not call a function of this name; empty for an allowed one."""
+    """Return the reason for which a law may not call a function of this name; "" for an allowed one."""
     if name.startswith("llvm."):
         function = name.split(".")[1]
         return LIBM if function in _MATHEMATICS else ""

@@ -55,7 +55,7 @@ class LawReference:
     def restore_options(self, values: Mapping[str, object]) -> LawOptions:
         """Return the law's options with `values`, bound to this law.
 
-        Raises ValueError for values that are not allowed, and as `law_class` does.
+        Raises ValueError for values that are not allowed, and the errors of `law_class`.
         """
         options = law_class(self).options_model.model_validate(values)
         options.bind(self)
@@ -76,8 +76,8 @@ def kinds() -> dict[str, str]:
 def find_law(kind: str) -> LawReference:
     """Return a shipped or installed law; the module of an installed one is run.
 
-    Raises ValueError for a kind that is unknown, whose module cannot be imported or read, or whose file does not define
-    it or cannot be run alone.
+    Raises ValueError for an unknown kind, for a module that cannot be imported or read, and for a module whose text
+    fails when it is run alone, has a mistake or does not define the kind.
     """
     if kind in BUILT_IN:
         return LawReference(kind)
@@ -95,9 +95,9 @@ def find_law(kind: str) -> LawReference:
 
 
 def laws_in(text: str, file: str) -> tuple[LawReference, ...]:
-    """Return all laws that a text defines, in the order of their kinds; the text is run once in a process.
+    """Return all laws that a text defines, sorted by kind; the text is run once in a process. `file` is for messages.
 
-    Raises ValueError if it cannot be run or has a mistake.
+    Raises ValueError if the text cannot be run or has a mistake.
     """
     announce(Path(file).stem, file)
     return _laws_in(text, file)
@@ -111,8 +111,8 @@ def _laws_in(text: str, file: str) -> tuple[LawReference, ...]:
 def law_from_text(text: str, file: str, kind: str | None = None) -> LawReference:
     """Return the law that a text defines; `kind` selects one of several. The text is run once in a process.
 
-    Raises ValueError if it defines no law, or no law `kind`, if the choice is open, if it cannot be run or has a
-    mistake.
+    Raises ValueError if the text defines no law, no law `kind`, or several laws while `kind` is None, and if it cannot
+    be run or has a mistake.
     """
     announce(kind or Path(file).stem, file)
     laws = {law.kind: law for law in _laws_in(text, file)}
@@ -130,10 +130,10 @@ def law_from_text(text: str, file: str, kind: str | None = None) -> LawReference
 
 
 def law_class(law: LawReference) -> type[Law]:
-    """Return the class of a law; its text is run once in a process, one that fails at each call.
+    """Return the class of a law; its text is run once in a process, a text that fails at each call.
 
-    Raises ValueError if the text cannot be run, has a mistake or does not define this kind, KeyError for a law without
-    a text that is not shipped.
+    Raises ValueError if the text cannot be run, has a mistake or does not define this kind; KeyError if the law has no
+    text and is not shipped.
     """
     if law.text:
         announce(law.kind, law.file)
@@ -146,7 +146,7 @@ def law_class(law: LawReference) -> type[Law]:
 
 
 def law_layout(laws: Sequence[LawReference]) -> Layout:
-    """Return the record types of a loop with these laws. Raises ValueError and KeyError as `law_class` does."""
+    """Return the record types of a loop with these laws. Raises the errors of `law_class`."""
     return _layout(tuple(laws))
 
 

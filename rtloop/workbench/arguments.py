@@ -22,7 +22,9 @@ FileName = str | Path
 
 
 def as_path(value: object, argument: str) -> Path:
-    """Return a file's name as a path. Raises RtloopError, which begins with `argument`, for another or empty value."""
+    """Return a file's name as a path. Raises RtloopError, which begins with `argument`, for a value that is no text or
+    Path, is empty or contains a NUL character.
+    """
     if not isinstance(value, str | Path) or "\0" in str(value) or not str(value):
         raise RtloopError(f"{argument}: value is {value!r}; allowed: the name of a file")
     return Path(value)
@@ -41,9 +43,10 @@ def as_paths(value: object, argument: str) -> list[Path]:
 
 
 def load_configuration(configuration: FileName | Configuration, argument: str) -> Configuration:
-    """Return a configuration, read from its file if `configuration` is a name; `argument` is the function in messages.
+    """Return a configuration, read from its file if `configuration` is a name.
 
-    Raises InputFileError, ConfigError with all faults, RtloopError for another value.
+    `argument` is the name of the calling function, for messages. Raises InputFileError for a file that cannot be read,
+    ConfigError with all faults of its contents, RtloopError for a value that is neither a configuration nor a name.
     """
     from rtloop.configuration.file import Configuration, load
 

@@ -38,7 +38,7 @@ class AxisJudgement:
 
     @property
     def running(self) -> LoopAnalysis | None:
-        """Margins and step figures of the loop as it will run; None without a model or a linear law."""
+        """Margins and step figures of the loop as it will run; None without a model or a linear controller."""
         return self.check.running
 
     @property
@@ -51,18 +51,20 @@ class AxisJudgement:
 
     @property
     def meets_specification(self) -> bool | None:
-        """Whether the loop meets the axis's specification; None without a specification or a loop.
+        """Whether the loop meets the axis's specification; None without a specification or a known loop.
 
-        It must do so on the simulated rig and within this host's delay margin too: False with an empty `missed` is
-        possible.
+        The loop must be stable, meet each requirement on the model, in the specification's scenarios and on the
+        simulated rig, and bear this host's measured delay; without a rig, no key may contradict the driver. False with
+        an empty `missed` is therefore possible.
         """
         return None if self.verification is None else self.verification.meets_specification
 
     @property
     def missed(self) -> list[str] | None:
-        """Labels of the requirements that the running loop misses, [] if none; None without a specification or a loop.
+        """Labels of the requirements that the running loop misses, [] if none; None without a specification or a known
+        loop.
 
-        They are those on the simulated rig where the axis contradicts the rig.
+        The requirements are judged on the model or, if the loop on the simulated rig was judged too, on the rig alone.
         """
         if self.verification is None:
             return None
@@ -91,7 +93,8 @@ def judge_axis(prepared: Prepared, axis: AxisOptions, check: AxisCheck, host: Ho
 
     `host` is the measured delay of this host, None without a measurement.
 
-    Raises ConfigError, InputFileError for a specification that is invalid or cannot be read.
+    Raises ConfigError for an invalid specification, and where neither axis nor specification has a model of the plant;
+    InputFileError for a specification that cannot be read.
     """
     return AxisJudgement(
         axis=axis,
@@ -107,7 +110,8 @@ def _verify_axis(prepared: Prepared, axis: AxisOptions, check: AxisCheck) -> Ver
     """Judge an axis by its specification. Returns None without a specification or a known linear loop.
 
     No loop is known without a linear law, and for a shared controller without the models of all its axes. Raises
-    ConfigError without a model or for an invalid specification, InputFileError for one that cannot be read.
+    ConfigError for an invalid specification, and where neither axis nor specification has a model of the plant;
+    InputFileError for a specification that cannot be read.
     """
     if axis.specification is None or not check.is_known:
         return None

@@ -62,7 +62,7 @@ class CheckResult(Result):
         )
 
     def print_text(self, out: Console) -> None:
-        """Print the plan, then limits, law, analyses and verdict of each axis; no warnings."""
+        """Print the plan, then limits, law, analyses and verdict of each axis; the warnings are not printed."""
         print_plan(out, self.prepared)
         inputs, channels = self.prepared.facts.inputs, self.prepared.configuration.channels
         for name, judgement in self.axes.items():
@@ -86,9 +86,9 @@ class CheckResult(Result):
 def check(configuration: FileName | Configuration, *, strict: bool = False) -> CheckResult:
     """Judge the loops of a configuration: limits, C(z) against C(s), margins on the model, verdict by specification.
 
-    Touches no hardware. `strict` treats warnings as faults, and compares the figures with those of python-control.
-    Raises InputFileError for a file that cannot be read, ConfigError with all faults, UnavailableError for a driver
-    whose library is missing.
+    Touches no hardware. `strict` treats as faults also the warnings, and each pole, margin or step for which
+    python-control computes another value. Raises InputFileError for a file that cannot be read, ConfigError with all
+    faults, UnavailableError for a driver whose library is missing.
 
     >>> result = rtloop.check("deploy/paper.toml")
     >>> round(result.axes["x"].running.phase_margin_deg, 1), result.axes["x"].meets_specification
@@ -121,8 +121,9 @@ def _second_opinion_faults(prepared: Prepared) -> list[str]:
 
 
 def _loops(check: AxisCheck) -> dict[str, Loop]:
-    """Return the loops of an axis, "continuous C(s)" on the model, if there is a C(s), then "as it runs"; {} without
-    one.
+    """Return the loops of an axis on its model by label: "continuous C(s)", if there is a C(s), then "as it runs".
+
+    {} if the loop on the model is not known.
     """
     if check.on_model is None:
         return {}

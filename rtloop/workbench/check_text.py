@@ -27,7 +27,7 @@ ROWS = (
     ("static error", lambda loop: f"{loop.static_error_percent:.4f} %"),
     ("settling (5 %)", lambda loop: format_figure(1e3 * loop.settling_time_s, 2, " ms")),
     ("overshoot", lambda loop: format_figure(loop.overshoot_percent, 2, " %")),
-    ("peak of v per unit step", lambda loop: f"{loop.peak_command:.4f}"),
+    ("peak command, µm per µm", lambda loop: f"{loop.peak_command:.4f}"),
 )
 
 
@@ -42,7 +42,10 @@ def print_plan(out: Console, prepared: Prepared) -> None:
 
 
 def print_axis(out: Console, judgement: AxisJudgement, sensor: Channel) -> None:
-    """Print limits, law, analyses and verdict of one axis; `sensor` is the driver's input of its position sensor."""
+    """Print limits, law, analyses, this host's delay and verdict of one axis.
+
+    `sensor` is the driver's input channel to which the axis's position sensor is wired.
+    """
     from rtloop.design.verification.text import answer
 
     axis = judgement.axis
@@ -77,7 +80,7 @@ def _command_text(axis: AxisOptions) -> str:
 def _sensor_text(interlocks: InterlockOptions, sensor: Channel) -> str:
     """Return the voltages at which the sensor interlock trips, as the end of a sentence on the position interlock.
 
-    A limit outside the input's range never trips; then the text also has this range.
+    A limit outside the input's range never trips: it is left out, and the text states the input's range.
     """
     low_v, high_v = interlocks.sensor_min_v, interlocks.sensor_max_v
     has_low, has_high = low_v > sensor.minimum_v, high_v < sensor.maximum_v
@@ -85,16 +88,19 @@ def _sensor_text(interlocks: InterlockOptions, sensor: Channel) -> str:
         return f" or outside {low_v:g} … {high_v:g} V at the sensor"
     ends = f"whose input reads {sensor.minimum_v:g} … {sensor.maximum_v:g} V"
     if not has_low and not has_high:
-        return f", at no voltage of the sensor, {ends}"
+        return f", but at no voltage of the sensor, {ends}"
     return f" or {f'below {low_v:g}' if has_low else f'above {high_v:g}'} V at the sensor, {ends}"
 
 
 def _print_law(out: Console, check: AxisCheck) -> None:
-    """Print the kind and the order of an axis's controller, and each notch or resonance that C(z) shifts."""
+    """Print kind and order of an axis's controller, and the frequencies in C(s) and C(z) of each notch and resonance.
+
+    A further axis of a shared controller gets one line with the axis whose controller it shares.
+    """
     linear = check.linear if check.together is None else check.together.linear
     order = "" if linear is None else f", linear near its rest state, of order {linear.order}"
     if check.law is None:
-        out.print("no controller; possible modes: feedforward, raw and off")
+        out.print("no controller; allowed modes: feedforward, raw and off")
     elif check.together is not None:
         axes = check.together.axes
         shares = f"shares the controller of axis {axes[0]}"
@@ -102,9 +108,9 @@ def _print_law(out: Console, check: AxisCheck) -> None:
             shares if check.together.place else f"law {check.together.law.kind!r} of axes {', '.join(axes)}{order}"
         )
     elif check.discrete is not None and check.comparison is not None:
-        out.print(f"C(z) by {check.discrete.method}, order {check.discrete.order}")
+        out.print(f"C(z) by the method {check.discrete.method!r}, of order {check.discrete.order}")
         for shift in check.comparison.shifts:
-            out.print(f"  {shift.kind} at {shift.frequency_hz:.1f} Hz is at {shift.discrete_hz:.1f} Hz in C(z)")
+            out.print(f"  {shift.kind} of C(s) at {shift.frequency_hz:.1f} Hz: at {shift.discrete_hz:.1f} Hz in C(z)")
     else:
         out.print(f"law {check.law.kind!r}{order}")
 

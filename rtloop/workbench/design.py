@@ -54,12 +54,12 @@ class DesignResult(Result):
 
     @property
     def gamma(self) -> float:
-        """γ for which the controller of full order was made."""
+        """γ, bound on the norm of the weighted closed loop, for which the controller of full order was made."""
         return self.synthesis.hinf.gamma
 
     @property
     def gamma_opt(self) -> float:
-        """Least γ that a controller can reach."""
+        """Least γ, bound on the norm of the weighted closed loop, that a controller can reach."""
         return self.synthesis.hinf.gamma_opt
 
     @property
@@ -87,7 +87,7 @@ class DesignResult(Result):
 
     @property
     def headline(self) -> str:
-        """Order and norms of the controller."""
+        """The controller's order, its order before reduction, γ_opt and ‖F_l(P, C)‖∞, in one line."""
         order = f"controller of order {self.order} ({self.full_order} before reduction)"
         return f"{order}, γ_opt {self.gamma_opt:.6g}, ‖F_l(P, C)‖∞ {self.achieved:.6g}"
 
@@ -98,7 +98,8 @@ class DesignResult(Result):
         """
         hinf, lines = self.synthesis.hinf, list[str]()
         lines.append(
-            f"γ_opt {hinf.gamma_opt:.6g} is the smallest γ that a controller reaches; with a smaller γ: {hinf.limiting}"
+            f"γ_opt {hinf.gamma_opt:.6g} is the smallest γ that a controller reaches, γ being the bound on the norm of "
+            f"the weighted closed loop; with a smaller γ, a condition is not met: {hinf.limiting}"
         )
         if self.slicot_gamma is not None:
             deviation_percent = 100 * (self.slicot_gamma / hinf.gamma_opt - 1)
@@ -144,7 +145,7 @@ class DesignResult(Result):
             out.print(line, markup=False)
 
     def plot(self) -> Figure:
-        """Return a picture of the loop of C(s) and the specification's plant, without sampling or delay.
+        """Return a picture of the loop of C(s) and the plant of the design, without sampling or delay.
 
         Raises MissingExtra without matplotlib.
         """
@@ -154,10 +155,10 @@ class DesignResult(Result):
         return draw_loops({self.specification.path.stem: {"continuous C(s)": continuous_loop(self.controller, plant)}})
 
     def write(self, path: FileName, axis: str = "x") -> Path:
-        """Write a configuration with the controller and a simulated rig of its plant. Returns its path.
+        """Write a configuration with the controller and a simulated rig of the design's plant. Returns the file's path.
 
         The path is also stored as `output`. An existing file is replaced. `axis` is the name of the axis. Raises
-        ConfigError for a configuration that cannot run, with nothing written; OutputError if the system refuses.
+        ConfigError for a configuration that cannot run, and then writes no file; OutputError if the system refuses.
         """
         target = as_path(path, "write: path")
         source, text, design = self.specification
@@ -171,7 +172,7 @@ class DesignResult(Result):
     def verdict(self) -> str:
         """The sentence of `rtloop check` on the loop of the plant and the sampled controller, by the specification.
 
-        "not judged: " and the faults if their configuration is invalid.
+        "not judged: " and the faults if a configuration of plant and controller is invalid.
         """
         from rtloop.design.verification.axes import verify_axis  # half a second of import
         from rtloop.design.verification.text import answer

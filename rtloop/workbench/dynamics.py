@@ -76,7 +76,8 @@ class DynamicsResult(IdentifiedModel):
 
     @property
     def section(self) -> str:
-        """The dynamics as [axis.model]; before it, with an `actuator`, [axis.feedforward] times the static gain.
+        """The dynamics as [axis.model]; before it, with an `actuator`, its plays as [axis.feedforward], with weights
+        times the static gain.
 
         For the input "drive" [axis.feedforward] is the static gain alone, left out if the gain is not above 0.
 
@@ -86,7 +87,7 @@ class DynamicsResult(IdentifiedModel):
 
     @property
     def headline(self) -> str:
-        """Order, modes, delay and fit."""
+        """Order, frequency (Hz) and damping of each mode, delay in samples and fit in percent, in one line."""
         modes = ", ".join(f"{mode.frequency_hz:.1f} Hz (ζ {mode.damping:.4f})" for mode in self.fit.modes)
         delay = count_text(self.delay_ticks, "sample")
         return f"order {self.order}: {modes}; delay {delay}, fit {self.fit.fit_percent:.2f} %"
@@ -178,7 +179,7 @@ def fit_dynamics(
 def _section_text(fit: DynamicsFit, run: AxisRecording, input_kind: Input, actuator: PlayModel | None) -> str:
     """Return [axis.model] as TOML; before it, where the input is not the command, [axis.feedforward].
 
-    [axis.feedforward] is `actuator` scaled by the static gain; for the input "drive", the static gain without
+    [axis.feedforward] is `actuator` with weights times the static gain; for the input "drive", the static gain without
     hysteresis, left out if it is not above 0. Raises UnsuitableData for scaled hysteresis without an inverse.
     """
     content = model_section(fit, dynamics_provenance(fit, run, input_kind))

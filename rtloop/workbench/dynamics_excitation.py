@@ -23,9 +23,9 @@ def dynamics_excitation(
     """Return the input to D and its output from a recording; `feedforward` is the actuator's model, for "hysteresis".
 
     The input is the recorded command for `input_kind` "command", the drive for "drive", and the drive through the model
-    for "hysteresis". A closed `loop` limits both to its ticks in closed loop, and adds its external signals. Raises
-    UnsuitableData for ticks that are missing or late, and for a command that was not recorded or, in a closed loop, not
-    obeyed.
+    for "hysteresis". A closed `loop` limits input and output to its ticks in closed loop, and adds its external
+    signals; None for a recording in open loop. Raises UnsuitableData for ticks that are missing or late and, for
+    "command", if the command was not recorded or a limit or ramp changed it in a closed loop.
     """
     if not run.is_even:
         raise UnsuitableData(
@@ -48,10 +48,10 @@ def dynamics_excitation(
 
 
 def load_actuator(run: AxisRecording, hysteresis: Path | None, axis: str | None) -> PlayModel:
-    """Return the actuator's model from `hysteresis`, or for None from the recorded configuration.
+    """Return the actuator's model from the file `hysteresis`, or for None from the recorded configuration.
 
-    Raises UnsuitableData for an imported recording without a file, RecordingError for a file that cannot be read,
-    ConfigError for one without [axis.feedforward].
+    `axis` names one of several axes; None: the first. Raises UnsuitableData for an imported recording if `hysteresis`
+    is None, RecordingError for a file that cannot be read, ConfigError if [axis.feedforward] is missing or invalid.
     """
     if hysteresis is not None:
         return read_feedforward(hysteresis, axis).actuator()

@@ -43,9 +43,9 @@ def print_dynamics(out: Console, report: Mapping[str, Any]) -> None:
     out.print(f"D(0) = 1; {static_gain_text(report['static_gain'], report['input'], spread)}", markup=False)
     out.print(f"delay {count_text(report['delay_ticks'], 'sample')}; fit {report['fit_percent']:.2f} %")
     out.print(
-        f"prediction error, one step ahead: {report['rms_error_um']:.5f} µm rms over the whole recording. The column "
-        '"validation" shows the error in the part that was held out of the fit; it has no number if the input is '
-        "constant there"
+        f"prediction error, one step ahead: {report['rms_error_um']:.5f} µm rms over the whole recording. In the table "
+        'of orders, "error" is the error in the part of the recording that was held out of the fit, or in the whole '
+        'recording if no part was; "validation" is the error on the other recordings, – without any'
     )
     if report["free_motion_s"]:
         out.print(

@@ -61,7 +61,7 @@ class HysteresisResult(IdentifiedModel):
 
     @property
     def error_um(self) -> float:
-        """Error of the model on all fitted recordings, µm rms, each held out of the fit; NaN if none can be judged."""
+        """Rms error in µm over all fitted recordings, each judged by a model fitted without it; NaN if none can be."""
         return combine_errors([judgement.rms_um for judgement in self.judgements[0]]).rms_um
 
     @property
@@ -176,8 +176,9 @@ def _parts_fields(fit: PartsFit) -> dict[str, object]:
     """Return the fields of the report that only recordings with unknown memory have.
 
     `terms` are the effects that were fitted beside the plays and left out of the model, such as creep; `creep_um` is
-    the range of creep. `tried_um` has the held-out error (µm rms) of each trial. The model is valid for strokes up to
-    `stroke_v`; `missing` names the drive that would show larger plays, or is "".
+    the range of creep, 0 if creep was not fitted. `tried_um` has the held-out error (µm rms) of each set of effects
+    that was tried. The model is valid for strokes up to `stroke_v`; `missing` names the drive that would show larger
+    plays, or is "".
     """
     return {
         "terms": fit.terms,

@@ -46,7 +46,7 @@ def print_hysteresis(out: Console, report: Mapping[str, Any]) -> None:
 
 
 def _print_held_out(out: Console, report: Mapping[str, Any]) -> None:
-    """Print the model's error on each held-out recording and over all of them.
+    """Print the model's error on each held-out recording and, if two or more can be judged, over all fitted ones.
 
     After a fit of recordings whose state of the hysteresis at the start is unknown (`tried_um` in the report), it also
     prints the error with each set of effects beside the plays, such as creep, the chosen set, and the strokes for which
@@ -74,7 +74,7 @@ def _print_held_out(out: Console, report: Mapping[str, Any]) -> None:
     error, written = combined["error"], combined["as_written"]
     if error["std_um"] is not None:
         out.print(
-            f"held-out error over all recordings: {_rms_text(error)} µm rms; with the plays alone: "
+            f"held-out error over all fitted recordings: {_rms_text(error)} µm rms; with the plays alone: "
             f"{_rms_text(written)} µm rms"
         )
     if "tried_um" in report:

@@ -14,9 +14,10 @@ def judgement_row(judgement: Judgement, fitted: bool) -> dict[str, object]:
     """Return the report's row on the model's held-out error in one recording, which is `fitted` or validates only.
 
     Keys: recording (name), fitted, rms_error_um, as_written_rms_um (of the plays alone), max_error_um, range_um (of the
-    position), max_error_percent (of this range), offset_um, drift_um, memory ("rest" or "unknown"), known_from_s (time
-    from which the memory of the hysteresis is known, None: never), unsettled, unsettled_um, judged_percent (part with
-    known memory), early_max_error_percent (of the other part). Errors are NaN where their part is empty.
+    position), max_error_percent (of this range), offset_um (in its last stretch), drift_um (over its duration), memory
+    ("rest" or "unknown"), known_from_s (time from which the memory of the hysteresis is known, None: never), unsettled
+    (whether its beginning departs from a periodic loop), unsettled_um (by how much), judged_percent (part with known
+    memory), early_max_error_percent (of the other part). Errors are NaN where their part is empty.
     """
     return {
         "recording": judgement.name,
@@ -48,8 +49,8 @@ def validation_comments(rows: Sequence[Mapping[str, Any]], extra: Mapping[str, A
     name, memory = Path(worst_row["recording"]).name, worst_row["memory"]
     lines = [
         f"largest held-out error, in {name}: {worst_row['rms_error_um']:.3g} µm rms, at most "
-        f"{worst_row['max_error_percent']:.3g} % of the range of {worst_row['range_um']:.4g} µm. Memory at the start: "
-        f"{memory}; {worst_row['judged_percent']:.3g} % of this recording was judged"
+        f"{worst_row['max_error_percent']:.3g} % of the range of {worst_row['range_um']:.4g} µm. Memory of the "
+        f"hysteresis at the start: {memory}; {worst_row['judged_percent']:.3g} % of this recording was judged"
     ]
     play_errors_um = [row["as_written_rms_um"] for row in rows if math.isfinite(row["as_written_rms_um"])]
     if extra.get("terms") and play_errors_um:

@@ -32,8 +32,9 @@ def replay_with_other_law(
 
     Returns {recording, config, ticks, problems, signals: {name: {max, at_tick, rms}}, trip}: `max` and `rms` are those
     of |difference|, in the signal's unit; `trip` is {tick, causes} of the first trip of the law, or None. `progress`
-    receives the number of ticks so far. Raises RecordingError, InputFileError for a file that cannot be read,
-    ConfigError for an invalid one or other axes or another rate, DriverError if its driver's library is missing.
+    receives the number of ticks so far. The schedule of `config` is ignored. Raises RecordingError, InputFileError for
+    a configuration that cannot be read, ConfigError for one that is invalid or has other axes or another rate than the
+    recording, DriverError if the library of its driver is missing.
     """
     recording, configuration = _load_recording(files), load_configuration(config, "replay")
     differences = compare_law(recording, _configured_law(configuration, recording), progress)
@@ -46,13 +47,14 @@ def replay_on_the_rig(
     progress: ReportTicks | None = None,
     trust: TrustedLaws | None = None,
 ) -> dict[str, object]:
-    """Run the recorded reference through law and simulated rig of `config`, or the recorded ones for None.
+    """Run the recorded reference through law and simulated rig of `config`; None: of the recorded configuration.
 
     Returns {recording, config (None: the recorded one), ticks, problems, trips: {recorded, resimulated}, axes: [{name,
     recorded, resimulated}, …]}: `trips` are the first trips {tick, causes} or None, `axes` the tracking figures of
     both runs. `progress` receives the number of ticks so far.
-    `trust` names recorded laws that may run; None: none. Raises RecordingError, also for a recorded law that is not
-    trusted, ConfigError for an invalid configuration or one without the simulated rig.
+    `trust` names recorded laws that may run; None: none but installed ones. Raises RecordingError, also for a recorded
+    law that is not trusted; InputFileError for a configuration that cannot be read; ConfigError for one that is
+    invalid, has other axes or another rate than the recording, or has another driver than the simulated rig.
     """
     recording, trust = _load_recording(files), trust or NO_TRUST
     path = recording.paths[0]
@@ -73,7 +75,8 @@ def make_trust(files: Sequence[Path], trusts_recorded: bool) -> TrustedLaws:
 
     The files run first in the limited process, which is killed if a law does not return. A file without a law adds
     none. Raises InputFileError for an unreadable file, RecordingError for one that cannot be run or has a mistake in a
-    law, ConfigError for a law that does not end, ends the process, prints too much, or leaves a thread or process.
+    law, ConfigError for a law that does not end, ends the process, prints too much, leaves a thread or process, or
+    closes or replaces a standard stream.
     """
     texts = {str(path): read_text(path) for path in files}
     for file, text in texts.items():

@@ -77,7 +77,8 @@ def replay(
     return a Resimulation. `law` are files with recorded laws that are not installed; `trust_recorded_law` runs the
     recorded text of laws. `jobs` processes replay at once, as forks of this process; the other two results use one.
     `progress` receives the number of ticks so far. Raises RecordingError for a recording that cannot be replayed,
-    ConfigError for a configuration that does not fit, InputFileError for a file that cannot be read.
+    ConfigError for a configuration that does not fit, InputFileError for a file that cannot be read, DriverError if the
+    library of the configuration's driver is missing.
 
     >>> result = rtloop.replay("run.mcap")
     >>> result.identical, result.ticks, result.first_difference

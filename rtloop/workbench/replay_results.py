@@ -59,7 +59,8 @@ class ReplayResult(Result):
 
     @property
     def gaps(self) -> list[dict[str, int]]:
-        """Ticks that are missing in the files, without those omitted around events: first_tick and count of each gap.
+        """Gaps of the files, [{first_tick, count}, …]: missing ticks, without the ticks that the recorder omitted on
+        purpose because they lie outside the time around events.
 
         A gap that the recording does not declare as lost is in `not_verified` too.
         """
@@ -77,7 +78,7 @@ class ReplayResult(Result):
 
     @property
     def headline(self) -> str:
-        """Verdict, first difference and number of compared ticks."""
+        """First difference or, without one, the verdict; then the number of compared ticks and the file, in a line."""
         difference = self.first_difference
         verdict = "identical" if self.identical else "not verified as a whole"
         if difference is not None:
@@ -93,7 +94,8 @@ class ReplayResult(Result):
         print_replay(out, self.path, self.report)
 
     def plot(self) -> Figure:
-        """Return a picture of the recording: PLOTTED_S around the first difference, or all of it without one.
+        """Return a picture of the recording, from PLOTTED_S before the first difference to PLOTTED_S after it; of the
+        whole recording if there is no difference.
 
         Raises RecordingError if there is no tick to draw, MissingExtra without matplotlib.
         """
@@ -174,7 +176,7 @@ class Resimulation(Result):
 
     @property
     def headline(self) -> str:
-        """Law, recording and number of ticks."""
+        """File of the configuration, or "the recorded law and rig", then recording and number of ticks."""
         law = self.report["config"] or "the recorded law and rig"
         return f"{law} with the reference of {self.report['recording']}, {count_text(self.ticks, 'tick')}"
 

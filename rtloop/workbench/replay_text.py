@@ -29,7 +29,7 @@ STEP_METRICS = (
 
 
 def print_replay(out: Console, path: Path, report: ReplayReport) -> None:
-    """Print gaps, problems, ticks that are not verified, the verdict, and signals that are not judged."""
+    """Print gaps, problems, ticks that are not verified, the verdict, and contents that no replay can judge."""
     for gap in report.gaps:
         out.print(f"gap: the recording lacks {count_text(gap['count'], 'tick')} from tick {gap['first_tick']} on")
     print_problems(out, report.problems)

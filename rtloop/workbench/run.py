@@ -39,7 +39,7 @@ class RunObserver(Protocol):
     def watch(self, prepared: Prepared) -> AbstractContextManager[Callable[[Supervisor], None] | None]:
         """Return a context for the time in which the loop runs.
 
-        Its value is called with the supervisor every PROGRESS_PERIOD_S; None: there are no calls.
+        The value of the context is a function, called with the supervisor every PROGRESS_PERIOD_S, or None for none.
         """
         ...
 

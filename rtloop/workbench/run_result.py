@@ -52,9 +52,10 @@ class RunResult(Result):
 
     @property
     def exit_code(self) -> int:
-        """Exit code of the command for this run: 0 for a good run, done or stopped, else the code of the failure.
+        """Exit code of the command for this run: 0 if the outcome is done or stopped, without a trip and with a
+        complete recording; else the code of the failure.
 
-        It is LoopFault's, 1, after a trip and for an incomplete recording.
+        The code after a trip and for an incomplete recording is LoopFault's, 1.
         """
         code = 0 if self.supervised is None else self.supervised.exit_code
         return code or (LoopFault.exit_code if self.trips else 0)
@@ -106,7 +107,8 @@ class RunResult(Result):
     def steps(self) -> dict[str, StepMetrics]:
         """Medians and worst cases of overshoot, settling time and static error of the steps of each axis, by its name.
 
-        {} after a trip, and for a recording of more than MAX_STEP_ANALYSIS_TICKS; axes without steps are missing.
+        {} after a trip, without a recording, and for a recording of more than MAX_STEP_ANALYSIS_TICKS; axes without
+        steps are missing.
         """
         if self.recording is None or self.trips or not 0 < self.ticks <= MAX_STEP_ANALYSIS_TICKS:
             return {}

@@ -27,9 +27,9 @@ SPECIFIED_STEP = (
 def print_run(
     out: Console, configuration: Configuration, summary: Summary | None, steps: Mapping[str, StepMetrics]
 ) -> None:
-    """Print the summary of a run, and its `steps` where there are some.
+    """Print the summary of a run, and the figures of its `steps` unless there are none.
 
-    `summary` is None without a recording; then one line says so.
+    `summary` is None without a recording; then one line states this.
     """
     if summary is None:
         out.print("nothing is recorded")
@@ -42,7 +42,7 @@ def print_run(
 def _print_steps(out: Console, configuration: Configuration, steps: Mapping[str, StepMetrics]) -> None:
     """Print overshoot (%), settling time (ms) and static error (%) of each axis's steps, the worst and the median.
 
-    Limits and claims of the axis's specification follow.
+    Limits and claims of the axis's specification follow, and an explanation if a limit is missed.
     """
     is_missed = False
     rows = table("steps", "overshoot %", "settling ms (5 %)", "static error %")

@@ -23,7 +23,11 @@ MAX_NAMES = 8
 
 
 def print_summary(out: Console, summary: Summary) -> None:
-    """Print the summary of a recording as tables."""
+    """Print the summary of a recording as tables: size, ticks, rate, problems and trips; timing; error and drive of
+    each axis.
+
+    An imported recording gets a table of its signals in place of the axes.
+    """
     tick_bytes = summary.bytes_per_tick
     size = f"{summary.size_bytes / 2**20:.1f} MiB" + ("" if tick_bytes is None else f", {tick_bytes:.1f} bytes a tick")
     out.print(f"[bold]{escape(summary.recording)}[/]  {size}")

@@ -10,7 +10,7 @@ from rtloop.errors import output_errors
 
 
 def write_output(path: Path, content: bytes) -> None:
-    """Write a file, and make its folder; an existing file is emptied first, so a failed write leaves a part.
+    """Write a file, and make its folder; an existing file is emptied first, so a failed write leaves an incomplete one.
 
     Raises OutputError if the system refuses.
     """
@@ -25,7 +25,7 @@ def write_output(path: Path, content: bytes) -> None:
 def write_configuration(path: Path, text: str) -> None:
     """Write a configuration once `prepare` accepts it; an existing file is replaced.
 
-    Raises ConfigError for a configuration that cannot run, with nothing written; OutputError if the system refuses.
+    Raises ConfigError for a configuration that cannot run, and then writes no file; OutputError if the system refuses.
     """
     from rtloop.configuration.file import parse
     from rtloop.configuration.prepare import prepare
@@ -40,9 +40,10 @@ def path_from(file: Path, target: Path) -> str:
 
 
 def write_outputs(folder: Path, contents: Mapping[str, bytes]) -> list[Path]:
-    """Write a report's files to `folder`, which is made, by name, also over existing ones. Returns their paths.
+    """Write the files `contents` (bytes by file name) to `folder`, which is made, over existing ones. Returns their
+    paths.
 
-    Raises OutputError if the system refuses one; the files before it are written then.
+    Raises OutputError if the system refuses a file; the files before it are then already written.
     """
     for name, content in contents.items():
         write_output(folder / name, content)

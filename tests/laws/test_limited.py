@@ -34,21 +34,25 @@ ENDED, CORRECT = (
     "the process that runs this code ended",
     "correct the code, which exits, crashes or exhausts the memory",
 )
+STOPPED = (
+    f"the code took longer than {LIMIT_S:g} s and was stopped; make it faster, or correct a loop that does not end"
+)
+CHATTY = f"the code printed more than {MAX_OUTPUT_BYTES >> 10} KiB; let it print less"
 AT_IMPORT = {
-    "never ends": ("while True:\n    pass\n", f"took longer than {LIMIT_S:g} s and was stopped"),
+    "never ends": ("while True:\n    pass\n", STOPPED),
     "exits": ("import sys\nsys.exit(0)\n", "raised SystemExit: 0, in line 2"),
     "is interrupted": ("raise KeyboardInterrupt\n", "raised KeyboardInterrupt, in line 1"),
     "raises what has no words": (NASTY, "raised OSError: no words, in line 3"),
     "ends its process": ("import os\nos._exit(0)\n", f"{ENDED} (exit code 0); {CORRECT}"),
     "reads where nothing is": ("import ctypes\nctypes.string_at(0)\n", f"{ENDED} (SIGSEGV); {CORRECT}"),
-    "prints for ever": ("while True:\n    print('x' * 1000)\n", f"printed more than {MAX_OUTPUT_BYTES >> 10} KiB"),
+    "prints for ever": ("while True:\n    print('x' * 1000)\n", CHATTY),
     "closes stdout": ("import sys\nsys.stdout.close()\n", "closed stdout"),
     "closes the file of stdout": ("import os\nos.close(1)\n", "closed stdout"),
     "replaces stdout": ("import io, sys\nsys.stdout = io.StringIO()\n", "replaced stdout"),
     "leaves a thread": (THREAD, "left 1 thread running"),
 }
 IN_BUILD = {
-    "never ends": ("while True: pass", f"took longer than {LIMIT_S:g} s and was stopped"),
+    "never ends": ("while True: pass", STOPPED),
     "reads where nothing is": ("import ctypes; ctypes.string_at(0)", f"{ENDED} (SIGSEGV); {CORRECT}"),
     "looks for what is not there": ("{}['gain']", "raised KeyError: 'gain'"),
 }

@@ -19,9 +19,9 @@ def write_frame(pipe: IO[bytes], data: bytes) -> None:
 
 
 def read_frame(pipe: IO[bytes]) -> bytes | None:
-    """Return the next message; None at the end of the pipe, also if it cuts off a length.
+    """Return the next message without its length; None at the end of the pipe, even where this end cuts off a length.
 
-    A message that the pipe's end cuts off is returned short.
+    A message that the end of the pipe cuts off is returned incomplete.
     """
     length = pipe.read(LENGTH.size)
     return pipe.read(LENGTH.unpack(length)[0]) if len(length) == LENGTH.size else None

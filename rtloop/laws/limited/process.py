@@ -60,7 +60,7 @@ class LimitedProcess:
 
     @property
     def pid(self) -> int | None:
-        """Process number; None if none runs."""
+        """Number of the process, also after its death; None before its start and after `end`."""
         process = self._process  # Another thread may end it meanwhile.
         return None if process is None else process.pid
 
@@ -76,15 +76,16 @@ class LimitedProcess:
     def run(
         self, function: Callable[..., Result], *arguments: object, compiles: bool = False, show: bool = True
     ) -> Result:
-        """Run a module-level function in the limited process and return its result; `show` forwards its output to
-        stderr.
+        """Run a module-level function in the limited process and return its result.
 
-        With `compiles`, the compiler is loaded first; this time does not count for the limit.
-        Raises the function's ConfigError, DriverError and RtloopError, of a subclass as these three; ConfigError also
-        if a law's code raises another error or leaves a thread or process, and for an ArithmeticError without a law;
-        AbandonedJob if the function does not return, prints too much or ends the process; OSError if the system refuses
-        the process. After AbandonedJob and after a leftover, the process has been killed, and the next job starts
-        another.
+        `show` writes its output to stderr; the output of a job that is abandoned while no law runs is always written.
+        `compiles` loads the compiler first, outside the time limit.
+        Raises ConfigError, DriverError or RtloopError if the function does; a subclass becomes one of these three.
+        Raises ConfigError also if a law's code raises any other error, leaves a thread or process, or closes or
+        replaces a standard stream, and for an ArithmeticError without a law. Raises AbandonedJob if the function does
+        not return, prints too much, ends the process, or raises another error without a law; OSError if the system
+        refuses the process. After AbandonedJob and after a leftover, the process has been killed, and the next job
+        starts another.
         """
         with self._lock:
             self._law = None
@@ -114,7 +115,7 @@ class LimitedProcess:
         raise DriverError(value) if kind == "driver" else RtloopError(value)
 
     def end(self) -> None:
-        """Kill the process and all processes that a law started from it; no effect if none runs.
+        """Kill the process and its process group, in which a law may have started others; no effect if none runs.
 
         May be called from any thread, as at the exit of the program.
         """
@@ -156,7 +157,7 @@ class LimitedProcess:
         self._unanswered += 1
 
     def _send(self, data: bytes) -> None:
-        """Send a message, unless the process has died: then no answer will come."""
+        """Send a message; it is lost if the process has died."""
         with contextlib.suppress(BrokenPipeError):
             write_frame(self._pipes[0], data)
 
@@ -165,13 +166,13 @@ class LimitedProcess:
         """Pipes to stdin and from stdout and stderr. Raises BrokenPipeError if no process runs."""
         process = self._process
         if process is None or process.stdin is None or process.stdout is None or process.stderr is None:
-            raise BrokenPipeError("the separate process that tries user laws before a run has ended; try again")
+            raise BrokenPipeError("the helper process in which rtloop tries user laws has ended; try again")
         return process.stdin, process.stdout, process.stderr
 
     def _outcome(self) -> tuple[str, Any]:
         """Wait for the answer to a job; return its kind and value as `Worker._outcome` describes them.
 
-        The law announced last is stored in `_law`, and output that is left is collected. Raises AbandonedJob if the job
+        Stores the law announced last in `_law`, and collects all output of the job. Raises AbandonedJob if the job
         takes too long, prints too much or ends the process.
         """
         clock = _Clock(self.limit_s, self.pid)
@@ -190,7 +191,10 @@ class LimitedProcess:
         answers, printed = (pipe.fileno() for pipe in self._pipes[1:])
         while len(self._data) < LENGTH.size or len(self._data) < self._end_of_message:
             if (remaining_s := clock.remaining_s) <= 0:
-                raise self._abandonment(f"took longer than {clock.limit_s:g} s and was stopped")
+                raise self._abandonment(
+                    f"the code took longer than {clock.limit_s:g} s and was stopped; make it faster, or correct a loop "
+                    "that does not end"
+                )
             readable = select.select([answers, printed], [], [], remaining_s)[0]
             if printed in readable:
                 self._add_output(os.read(printed, MAX_OUTPUT_BYTES))
@@ -208,7 +212,7 @@ class LimitedProcess:
 
     @property
     def _end_of_message(self) -> int:
-        """End of the first message in the received data, in bytes; needs its length field."""
+        """End of the first message in the received data, in bytes; its length field must have been received."""
         return LENGTH.size + LENGTH.unpack_from(self._data)[0]
 
     def _read_output(self) -> None:
@@ -225,7 +229,7 @@ class LimitedProcess:
         """Append to the collected output. Raises AbandonedJob if it is too much."""
         self._printed += part
         if len(self._printed) > MAX_OUTPUT_BYTES:
-            raise self._abandonment(f"printed more than {MAX_OUTPUT_BYTES >> 10} KiB")
+            raise self._abandonment(f"the code printed more than {MAX_OUTPUT_BYTES >> 10} KiB; let it print less")
 
     def _abandonment(self, reason: str) -> AbandonedJob:
         """Return the error that names the running law and `reason`."""
@@ -233,7 +237,7 @@ class LimitedProcess:
 
     @property
     def _culprit(self) -> str:
-        """Law whose code ran last, as the beginning of a message; empty if there was none."""
+        """Beginning of a message that names the law whose code ran last in the job; "" if no law's code ran."""
         return "" if self._law is None else "law {!r} ({}): ".format(*self._law)
 
     def _exit_text(self) -> str:

@@ -24,8 +24,9 @@ def needs_limited_process(laws: Iterable[LawReference]) -> bool:
 def run_limited(source: str, function: Callable[..., Result], *arguments: object, compiles: bool = False) -> Result:
     """Run `function` in the limited process and return its result; `compiles` says whether it needs the compiler.
 
-    Raises ConfigError of `source` for faults of a law and for every ConfigError of `function`, DriverError and
-    RtloopError as `function` does, and AbandonedJob if the process fails while no law runs.
+    Raises ConfigError, with `source` as its source, for faults of a law and for every ConfigError of `function`;
+    DriverError or RtloopError if `function` does; AbandonedJob if the process fails while no law runs; OSError if the
+    system refuses the process.
     """
     return _run_for_source(source, partial(PROCESS.run, compiles=compiles), function, *arguments)
 
@@ -33,9 +34,10 @@ def run_limited(source: str, function: Callable[..., Result], *arguments: object
 def try_limited(source: str, function: Callable[..., object], *arguments: object) -> None:
     """Run `function` in the limited process before it runs in this one; no effect inside a limited process.
 
-    Raises ConfigError of `source` if a law's code ends the process, does not return, leaves a thread or process, or
-    raises an error other than ValueError, RtloopError and DriverError. These three are ignored here, as they occur
-    again in the caller. Raises AbandonedJob if the process fails while no law runs.
+    Raises ConfigError, with `source` as its source, if a law's code ends the process, does not return, prints too much,
+    leaves a thread or process, closes or replaces a standard stream, or raises an error other than ValueError,
+    RtloopError and DriverError. These three are ignored, as they occur again when the caller runs `function` itself.
+    Raises AbandonedJob if the process fails while no law runs, OSError if the system refuses the process.
     """
     if not is_limited():
         _run_for_source(source, partial(PROCESS.run, show=False), partial(_run_ignoring_errors, function), *arguments)
@@ -44,8 +46,8 @@ def try_limited(source: str, function: Callable[..., object], *arguments: object
 def _run_for_source(
     source: str, run: Callable[..., Result], function: Callable[..., object], *arguments: object
 ) -> Result:
-    """Return `run(function, *arguments)`; its ConfigError, and AbandonedJob caused by a law, become ConfigError of
-    `source`.
+    """Return `run(function, *arguments)`; raise its ConfigError, and its AbandonedJob caused by a law, as ConfigError
+    with `source` as source.
 
     Other errors, also AbandonedJob without a law, pass through.
     """

@@ -1,9 +1,9 @@
 """Child side of the limited process: runs one function after the other, reports which law's code runs, and the outcome.
 
 A job is two messages: the preparation (function, imports, compiler), which is acknowledged; then the arguments, with
-which the code of a law may begin to run. A preparation may come ahead of an expected job. Every exception of a job,
-also SystemExit and KeyboardInterrupt, becomes an answer, unless neither rtloop nor a law caused it. Output goes to
-stderr, which the parent reads."""
+which the code of a law may begin to run. A preparation may come ahead of an expected job. Every exception of a job
+becomes an answer if a law was announced before it, also SystemExit and KeyboardInterrupt; without a law, only rtloop's
+errors and ArithmeticError do, and any other ends the process. Output goes to stderr, which the parent reads."""
 
 from __future__ import annotations
 
@@ -81,7 +81,7 @@ class Worker:
     def _outcome(self, function: Callable[..., object], arguments: bytes) -> tuple[str, object]:
         """Run the function; return kind and value of the answer: "done" with the pickled result, or as `_failure` does.
 
-        "leftover" with a message if a law's code left a thread or process, or replaced a stream.
+        "leftover" with a message if a law's code left a thread or process, or replaced or closed a standard stream.
         """
         threads = _thread._count()
         streams = _streams()
@@ -114,7 +114,10 @@ class Worker:
         if isinstance(error, ArithmeticError):
             return "faults", (
                 "",
-                [f"a computation fails with the numbers of the configuration ({error})"],
+                [
+                    f"a computation fails with the numbers of the configuration ({error}); look for a number that is "
+                    "0, very small or very large"
+                ],
             )
         raise error
 
@@ -160,7 +163,9 @@ def _error_text(error: BaseException) -> str:
 
 
 def _suggestion(error: BaseException) -> str:
-    """Return "; did you mean NAME?" for an AttributeError if the object has an attribute of similar name, else ""."""
+    """Return "; did you mean NAME?" for an AttributeError if the object has a public attribute whose name resembles or
+    continues the wrong one, else "".
+    """
     if not isinstance(error, AttributeError) or not error.name:
         return ""
     names = [name for name in dir(error.obj) if not name.startswith("_")]

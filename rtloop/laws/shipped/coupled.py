@@ -1,8 +1,8 @@
 """Linear controller of several axes: x⁺ = A x + B e, v = W (C x + D e), e and v with an entry for each axis.
 
-W is a decoupling matrix: for a stage whose axes move each other by K, x = D K v, it is K⁻¹, and the loops are
-independent. The states follow the applied commands in the observer form of anti-windup (Åström and Wittenmark,
-Computer-Controlled Systems, 1997), with a column for each command.
+W is a decoupling matrix. If the axes of a stage move each other, position = P K v with the dynamics P of each axis and
+a matrix K, then W = K⁻¹ makes the loops independent. The states follow the applied commands in the observer form of
+anti-windup (Åström and Wittenmark, Computer-Controlled Systems, 1997), with a column for each command.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ STATE = cache_line_record([("x", np.float64, (MAX_ORDER,)), ("scratch", np.float
 
 @jit
 def commands(c, s, told):
-    """Set told.command_um to v = C x + D e, (axes,), from states x and errors e; C and D include the decoupling."""
+    """Set told.command_um to v = C x + D e, (axes,) in µm, from states x and errors e; C and D include W."""
     for i in range(c.count):
         told.command_um[i] = _command(c, s, told, i)
 
@@ -83,9 +83,9 @@ def advance(c, s, told):
 
 @jit
 def continue_from_commands(c, s, told):
-    """Set the state from which the controller continues at the commands in force.
+    """Set the state so that the controller continues from the commands told.command_um, (axes,) in µm.
 
-    It is the steady state for the errors, corrected along the anti-windup matrix `tracking`.
+    The state is the steady state for the errors told.error_um, corrected along the anti-windup matrix `tracking`.
     """
     for j in range(c.order):
         s.x[j] = 0.0

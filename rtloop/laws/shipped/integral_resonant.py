@@ -3,8 +3,8 @@
     C₂(s) = k / (s + k d),    v = C₂ (w + x),    w' = ki e
 
 A. J. Fleming, S. S. Aphale and S. O. R. Moheimani, A new method for robust damping and tracking control of scanning
-probe microscope positioning stages, IEEE Trans. Nanotechnology 9(4), 2010, eqs (10) to (17), with d = −D_f. It wants
-d above the plant's gain at 0 Hz. The lag is held exactly.
+probe microscope positioning stages, IEEE Trans. Nanotechnology 9(4), 2010, eqs (10) to (17), with d = −D_f. d must be
+above the magnitude of the plant's gain at 0 Hz. The lag is discretised exactly, for an input held over each tick.
 """
 
 from __future__ import annotations
@@ -67,7 +67,7 @@ class IntegralResonant(Controller):
 
     @staticmethod
     def update(c: np.record, s: np.record, told: np.record) -> None:
-        """Advance lag and integral; both follow the applied command."""
+        """Advance lag and integral by a tick; both follow the applied command."""
         shortfall_um = told.applied_um - told.command_um
         target_um = (s.integral_um + told.position_um) / c.feedthrough
         s.lag_um = c.decay * s.lag_um + (1.0 - c.decay) * target_um + c.tracking * shortfall_um
@@ -75,6 +75,7 @@ class IntegralResonant(Controller):
 
     @staticmethod
     def enter(c: np.record, s: np.record, told: np.record) -> None:
-        """Set lag and integral at rest with the command in force."""
+        """Set the lag to the command told.command_um, and the integral so that the lag rests there at the position
+        told.position_um."""
         s.lag_um = told.command_um
         s.integral_um = c.feedthrough * told.command_um - told.position_um

@@ -13,6 +13,8 @@ BLOCK = 2 * LANES
 
 @jit
 def sum_lanes(sums, first, second, third, fourth):
-    """Return (first + second) + (third + fourth), after storing the four in `sums`: one vector to the compiler."""
+    """Store the four numbers in `sums`, so that the compiler treats them as one vector; return (first + second) +
+    (third + fourth).
+    """
     sums[0], sums[1], sums[2], sums[3] = first, second, third, fourth
     return (first + second) + (third + fourth)

@@ -44,7 +44,7 @@ class PrandtlIshlinskiiOptions(FeedforwardOptions):
     def actuator(self) -> PlayModel:
         """Return the identified forward model, from V to µm, with its dead band (a first threshold above 0).
 
-        If the options have an inverse in its place, return the forward model that this inverse compensates; it has no
+        If the options have an explicit inverse instead, return the forward model that this inverse compensates, without
         dead band.
         """
         if self.thresholds_v:
@@ -52,15 +52,20 @@ class PrandtlIshlinskiiOptions(FeedforwardOptions):
         return self.models()[0]
 
     def models(self) -> tuple[PlayModel, PlayModel]:
-        """Return forward model and inverse, consistent with each other.
+        """Return forward model (V to µm) and inverse (µm to V), consistent with each other.
 
-        The forward model has its dead band if `dead_band` is "exact", else it is lowered by the first threshold.
+        The forward model has its dead band only if `dead_band` is "exact"; else all its thresholds are lowered by the
+        first one. The inverse never has a dead band.
         """
         return self._models
 
     @cached_property
     def _models(self) -> tuple[PlayModel, PlayModel]:
-        """Forward model and inverse, computed once by the check. Raises ValueError for a model without inverse."""
+        """Forward model and inverse, computed once by the check.
+
+        Raises ValueError if the options give both or neither, if a model has no inverse, and if the first threshold of
+        a given inverse is not 0.
+        """
         if bool(self.thresholds_v) == bool(self.inverse_thresholds_um):
             raise ValueError(
                 "the model of the hysteresis is missing or is given twice; allowed: either thresholds_v with "

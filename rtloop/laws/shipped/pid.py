@@ -71,6 +71,7 @@ class Pid(Controller):
 
     @staticmethod
     def enter(c: np.record, s: np.record, told: np.record) -> None:
-        """Set, in a state of zeros, the integral so that the command continues; the position was constant before."""
+        """Set, in a state of zeros, the integral so that `output` returns told.command_um, as if told.position_um had
+        been constant before."""
         s.last_um = told.position_um
         s.integral_um = told.command_um - c.kp * told.error_um

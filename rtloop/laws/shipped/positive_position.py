@@ -3,7 +3,8 @@
     F(s) = g ω² / (s² + 2 ζ ω s + ω²),    v = I + F x,    I' = ki e
 
 J. L. Fanson and T. K. Caughey, Positive position feedback control for large space structures, AIAA Journal 28(4), 1990,
-eqs (5), (6). The loop through F is stable at 0 Hz as long as g times the plant's gain stays below 1. F is held exactly.
+eqs (5), (6). The loop through F is stable at 0 Hz as long as g times the plant's gain stays below 1. F is discretised
+exactly, for an input held over each tick.
 """
 
 from __future__ import annotations
@@ -74,7 +75,7 @@ class PositivePosition(Controller):
 
     @staticmethod
     def update(c: np.record, s: np.record, told: np.record) -> None:
-        """Advance filter and integral by a tick."""
+        """Advance filter and integral by a tick; the integral follows the applied command."""
         first, second = s.filter[0], s.filter[1]
         s.filter[0] = c.a[0, 0] * first + c.a[0, 1] * second + c.b[0] * told.position_um
         s.filter[1] = c.a[1, 0] * first + c.a[1, 1] * second + c.b[1] * told.position_um
@@ -82,8 +83,8 @@ class PositivePosition(Controller):
 
     @staticmethod
     def enter(c: np.record, s: np.record, told: np.record) -> None:
-        """Set, in a state of zeros, the filter at rest with the position, and the integral so that the command
-        continues.
+        """Set, in a state of zeros, the filter at rest at told.position_um, and the integral so that `output` returns
+        told.command_um.
         """
         s.filter[0] = told.position_um
         s.integral_um = told.command_um - c.gain * told.position_um

@@ -47,7 +47,7 @@ STATE = cache_line_record(
 def play_output(value, threshold, last):
     """Return the output of the play operator of half-width `threshold` ≥ 0 for `value` after the output `last`.
 
-    By comparisons, so that NaN leaves `last`, and −0 is the same on every machine.
+    Comparisons compute it: NaN as `value` gives `last`, and −0 is the same on every machine.
     """
     low = value - threshold
     high = value + threshold
@@ -109,9 +109,9 @@ def move_plays(value, thresholds, plays, count):
 
 @jit
 def inverse_drive(c, s, command_um):
-    """Return the inverse's drive in V for a command in µm, with dead band.
+    """Return the inverse's drive in V for a command in µm, with the dead band added in its direction if there is one.
 
-    The plays do not move; the dead band's direction may change.
+    No play moves; the dead band's direction, in the state, may change.
     """
     drive = plays_sum(
         command_um, c.inverse_thresholds_um, c.inverse_weights_v_per_um, s.inverse_plays_um, c.play_count, s.sums
@@ -127,7 +127,9 @@ def inverse_drive(c, s, command_um):
 
 @jit
 def update_model(c, s, drive_v):
-    """Advance the memory by the drive applied; return the command in µm that the forward model gives for this drive."""
+    """Move the model's plays to the applied drive, and the inverse's plays to the command in µm that the model gives
+    for this drive; return this command.
+    """
     applied_um = move_and_sum_plays(
         drive_v, c.model_thresholds_v, c.model_weights_um_per_v, s.model_plays_v, c.play_count, s.sums
     )
@@ -137,9 +139,9 @@ def update_model(c, s, drive_v):
 
 @jit
 def enter_at_drive(c, s, drive_v):
-    """Set the dead band's direction, −1 … 1, to the place of `drive_v` (V) within the band; the plays do not move.
+    """Set the dead band's direction, −1 … 1, to the place of `drive_v` (V) within the band; no play moves.
 
-    Another mode of the loop may have left the drive anywhere in the band. Without a dead band, the state stays.
+    Another mode of the loop may have left the drive anywhere in the band. The state stays if there is no dead band.
     """
     if c.dead_band_v > 0.0:
         s.dead_band_direction = (drive_v - s.model_plays_v[0]) / c.dead_band_v
@@ -159,7 +161,7 @@ class PrandtlIshlinskii(Feedforward):
         """Return thresholds and weights of the model and of its inverse, `play_count`, `dead_band_v` and
         `dead_band_threshold_v`.
 
-        The former are `model_thresholds_v`, `model_weights_um_per_v`, `inverse_thresholds_um` and
+        Thresholds and weights are `model_thresholds_v`, `model_weights_um_per_v`, `inverse_thresholds_um` and
         `inverse_weights_v_per_um`, each (plays,); the record has zeros behind them. `play_count` is rounded up to a
         multiple of LANES. `dead_band_v` is 0 unless the option `dead_band` is "exact".
         """

@@ -3,12 +3,12 @@
     u_k = e_k + g Σ_j q_j u_{k − N + j},    ê_k = e_k + g Σ_j q_j u_{k − N + L + j},    v' = ki ê
 
 A plug-in internal model u (S. Hara, Y. Yamamoto, T. Omata and M. Nakano, IEEE Trans. Automatic Control 33(7), 1988)
-with a smoothing filter Q of no phase (M. Tomizuka, T.-C. Tsao and K.-K. Chew, J. Dyn. Syst. Meas. Control 111, 1989).
-The lead L lies outside the internal model, which therefore repeats every N ticks. With T the closed loop of the
-integrator alone, it is stable where that is and |g Q (1 − z^L T)| < 1 at every frequency.
+with a smoothing filter Q without phase shift (M. Tomizuka, T.-C. Tsao and K.-K. Chew, J. Dyn. Syst. Meas. Control 111,
+1989). The lead L lies outside the internal model, which therefore repeats every N ticks. T is the closed loop of the
+integrator alone. The loop is stable if T is stable and |g Q (1 − z^L T)| < 1 at every frequency.
 
-u_k is 0 in the memory if the command of tick k was limited: no command could have reduced this error, and it would be
-added to the command a period later.
+u_k is 0 in the memory if the command of tick k was limited: no command could have reduced this error, and the error
+would be added to the command a period later.
 """
 
 from __future__ import annotations
@@ -135,12 +135,12 @@ class Repetitive(Controller):
         s.integral_um += c.ki * (told.error_um + led_um) + told.applied_um - told.command_um
 
     def linear(self) -> SampledController:
-        """Return the transfer of the integrator alone; `build` checks the memory."""
+        """Return the transfer of the integrator alone, from error to command; `build` checks the memory."""
         return SampledController(
             System(np.eye(1), np.array([self.options.ki_per_s * self.period_s]), np.ones(1), 0.0), self.period_s
         )
 
     @staticmethod
     def enter(c: np.record, s: np.record, told: np.record) -> None:
-        """Set, in a state of zeros, the integral to the command in force; the memory of a period stays empty."""
+        """Set, in a state of zeros, the integral to the command told.command_um; the memory of a period stays empty."""
         s.integral_um = told.command_um

@@ -110,9 +110,9 @@ def _next_pair(c, s, i, error_um, shortfall_um):
 
 @jit
 def continue_from_command(c, s, told):
-    """Set the state from which the controller continues at the command in force.
+    """Set the state so that the controller continues from the command told.command_um, in µm.
 
-    It is the steady state for the error, corrected along the anti-windup vector `tracking`.
+    The state is the steady state for the error told.error_um, corrected along the anti-windup vector `tracking`.
     """
     for i in range(c.order):
         s.controller[i] = c.steady_state[i] * told.error_um
