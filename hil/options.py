@@ -34,8 +34,8 @@ class BoucWenOptions(Options):
         """Raise ValueError unless |lean_per_v| ≤ decay_per_v; beyond, h would grow without bound."""
         if abs(self.lean_per_v) > self.decay_per_v:
             raise ValueError(
-                f"lean_per_v: {self.lean_per_v:g}; allowed: -{self.decay_per_v:g} to {self.decay_per_v:g}, the value of "
-                "decay_per_v"
+                f"lean_per_v: {self.lean_per_v:g}; allowed: -{self.decay_per_v:g} to {self.decay_per_v:g}, "
+                "the value of decay_per_v"
             )
         return self
 

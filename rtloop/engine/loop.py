@@ -76,7 +76,8 @@ class Outcome(IntEnum):
     HEARTBEAT_LOST = 3
     """The outputs are safe after the supervisor's heartbeat stopped."""
     LAW_FAILED = 4
-    """A count or an index was beyond its array; the outputs are as the last tick wrote them."""
+    """A count or an index was beyond its array, or an axis had no controller or several; the outputs are as the last
+    tick wrote them."""
 
 
 READ_FAILED, WRITE_FAILED = 1, 2

@@ -54,7 +54,7 @@ class SpentMargin:
 
     @property
     def is_spent(self) -> bool:
-        """Whether the added delay reaches the margin: the loop is then unstable for at least 1 % of its ticks."""
+        """Whether the added delay reaches the margin: in at least 1 % of the ticks, the delay is then too long."""
         return self.more_us >= self.margin_us
 
     @property

@@ -122,8 +122,10 @@ class RecorderKeeper:
             self.failure = error
         finally:
             if self.totals is None:
-                fault = "a fault of rtloop ended the thread that watches the recorder; the recording is incomplete"
-                reason = str(self.failure or fault)
+                reason = str(
+                    self.failure
+                    or "a fault of rtloop ended the thread that watches the recorder; the recording is incomplete"
+                )
                 self.totals = {"path": str(self._path), "paths": [], "complete": False, "error": reason}
 
     def _enforce_quota_when_due(self) -> None:
