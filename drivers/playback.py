@@ -59,7 +59,7 @@ def playback_write(context, values):
 
 
 class Playback:
-    """Rows (deadline, wake, missed, now; status; inputs…, age, observed…) for the loop, one segment at a time."""
+    """Recorded rows, each with the columns that `load` describes, for the loop; one segment at a time."""
 
     def __init__(self) -> None:
         """Begin without rows; `load` sets them."""

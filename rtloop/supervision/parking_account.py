@@ -10,7 +10,7 @@ from rtloop.errors import RtloopError, UnavailableError
 
 
 class ParkingAccount:
-    """Record of one `rtloop park`: name of the service, the outputs' voltages before, and sentences (`remarks`)."""
+    """Record of one `rtloop park`: name of the service, voltages of the outputs before parking, remarks, failures."""
 
     def __init__(self, name: str) -> None:
         """Begin an empty account for the service `name`: no voltages, remarks (sentences for the user) or failures."""

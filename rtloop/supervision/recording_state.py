@@ -50,7 +50,7 @@ def recording_state(block: SharedBlock) -> RecordingState:
 
 
 class GapReporter:
-    """Messages about gaps, in which ticks are not recorded: one at the begin of a gap, one at its end.
+    """Messages about gaps, in which ticks are not recorded: one for each reason of a gap, one at its end.
 
     A gap ends after QUIET_S without a fault: on an overloaded host the recorder is behind, catches up a little and is
     behind again, which is one gap.

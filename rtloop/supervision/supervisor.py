@@ -105,8 +105,9 @@ class Processes:
 class Supervisor:
     """Runner of one plan in `processes`, recorded to the path `recording` (without `.part`).
 
-    Call `start`, then `poll` every few milliseconds until it returns a result, then `close`. No method waits for a
-    disk, a log or a terminal. Without calls of `poll` the heartbeat stops, and the loop parks its outputs.
+    Call `start`, then `poll` every few milliseconds until it returns a result, then `close`. Only `start` waits for a
+    disk, until the recording is open; no method waits for a log or a terminal. Without calls of `poll` the heartbeat
+    stops, and the loop parks its outputs.
     """
 
     def __init__(
