@@ -69,9 +69,9 @@ def starting_outputs_v(driver: Driver, recorded_v: Sequence[float] | Real | None
     the safe value.
 
     The values that the driver reports are limited to the channel's range; a reported NaN counts as safe. If the driver
-    reports None, `recorded_v`, None or a drive for each axis, is used. A recorded value beyond the range, or NaN,
-    counts as safe: a ramp from it could move the output away from safe. Raises DriverError if the outputs cannot be
-    read.
+    reports None, the drives `recorded_v`, one for each axis, are used; outputs without a recorded drive count as safe.
+    So does a recorded drive that is NaN or beyond the range: a ramp from it could move the output away from safe.
+    Raises DriverError if the outputs cannot be read.
     """
     safe_v = safe_outputs_v(driver)
     lowest_v, highest_v = np.array([(channel.minimum_v, channel.maximum_v) for channel in driver.facts.outputs]).T
