@@ -1,7 +1,9 @@
 """The contract of a driver.
 
 The loop calls a driver's C functions `read(context, double *in)`, `write(context, const double *out)` and optionally
-`wait(context, double *timing)`. Each returns an int32: 0 good, > 0 degraded (recorded), < 0 failed (trips the loop).
+`wait(context, double *timing)`. Each returns an int32. A status of `read` or `write` below 0 is a failure: the loop
+ramps its outputs down and ends. The loop records the status of `read`; above 0 means degraded. `wait` returns 0; any
+other value ends the run.
 
 `in` holds the volts of every input channel in the order of the facts, then the age of the sample in µs, then the
 observed signals. `out` holds the volts of every output channel. A card that is itself the clock offers `wait`, with
@@ -98,13 +100,13 @@ class Driver(ABC):
     @property
     @abstractmethod
     def facts(self) -> Facts:
-        """Properties of the driver with its options and wiring."""
+        """Facts about the driver with its options and wiring: channels, observed signals, largest rate, delay."""
 
     @abstractmethod
     def open(self) -> Pointers:
         """Open the hardware and return pointers that are valid until `close`.
 
-        Outputs that the card can read back keep their values; the others are set to their safe values. Raises
+        Each output keeps its voltage or goes to its safe value; `outputs_v` then returns the voltages. Raises
         DriverError if the hardware is missing, is used by another program or fails.
         """
 
@@ -119,10 +121,11 @@ class Driver(ABC):
         return [channel.safe_v for channel in self.facts.outputs]
 
     def measure_exchanges(self, count: int) -> Exchanges | None:
-        """Measure `count` exchanges at the tick rate with the outputs at their safe values.
+        """Return the durations of `count` exchanges (request and answer) with the hardware, one in each tick's period.
 
-        The driver must be closed before; it opens itself and is closed afterwards. The default returns None without a
-        measurement, for hardware that is read without an answer to wait for. Raises DriverError like `open`.
+        The outputs are at their safe values. The method opens the driver, which must be closed before, and closes it
+        at the end. The default returns None without a measurement, for hardware that answers no requests. Raises
+        DriverError like `open`.
         """
         return None
 
@@ -130,15 +133,15 @@ class Driver(ABC):
     def close(self) -> None:
         """Set every output to its safe value and release the hardware.
 
-        Before `open`, and when it is called again, it does nothing. Raises DriverError, after the release, if the
-        outputs cannot be set.
+        A call before `open`, or a second call, does nothing. Raises DriverError, after the release, if the outputs
+        cannot be set.
         """
 
 
 def channel_index(channels: Sequence[Channel], name: str) -> int:
-    """Return the index of the channel `name`.
+    """Return the index in `channels` of the channel with the name `name`.
 
-    Raises ValueError, listing the channels, if there is none of this name.
+    Raises ValueError, which lists the names of all channels, if no channel has this name.
     """
     names = [channel.name for channel in channels]
     if name not in names:
@@ -147,7 +150,9 @@ def channel_index(channels: Sequence[Channel], name: str) -> int:
 
 
 def require_channels(wiring: Mapping[str, Wiring], facts: Facts) -> None:
-    """Raise ValueError, naming the axis, for an input or output in the wiring that is not a channel of the facts."""
+    """Raise ValueError, which names the axis, if its input is not among the inputs of `facts`, or its output not among
+    the outputs.
+    """
     for axis, (source, sink) in wiring.items():
         for name, channels in ((source, facts.inputs), (sink, facts.outputs)):
             try:

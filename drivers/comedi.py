@@ -68,7 +68,7 @@ class ComediOptions(Options):
 
     @model_validator(mode="after")
     def _check(self) -> Self:
-        """Require the lower end of each range before the higher, and `safe_v` within `output_range_v`."""
+        """Raise ValueError for an empty or reversed range, and for `safe_v` outside `output_range_v`."""
         require_ranges(self.input_range_v, self.output_range_v, self.safe_v)
         return self
 
@@ -88,10 +88,11 @@ def _call_in_python(function: int, device: int, line: tuple[int, ...], final_arg
 def _call(
     compiler: ModuleType, function: Type, device: Type, line: Type, final_argument: Type
 ) -> tuple[Signature, Callable[..., Value]]:
-    """Call `int function(comedi_t *, subdevice, channel, range, aref, final_argument)`; return its int.
+    """Compile a call of the C function `int function(comedi_t *, subdevice, channel, range, aref, final_argument)`.
 
-    In kernels: _call(function, device, line, final_argument) with addresses as integers and `line` = (subdevice,
-    channel, range, aref). `final_argument` is a code (uint32) to write, or the address for a code that is read.
+    Kernels write _call(function, device, line, final_argument), with addresses as integers and `line` = (subdevice,
+    channel, range, aref), and get the int. `final_argument` is a code (uint32) to write, or the address for a code that
+    is read. Returned here are Numba's signature and the generator of the LLVM code.
     """
     types, ir = compiler.types, compiler.ir
     last_type = ir.IntType(32) if final_argument == types.uint32 else ir.IntType(64)
@@ -164,9 +165,9 @@ class ComediDriver(Driver):
     example: ClassVar[Wiring] = Wiring("ai0", "ao0")
 
     def __init__(self, options: ComediOptions, wiring: Mapping[str, Wiring], rate_hz: float) -> None:
-        """Check the channels' names; the board is not opened.
+        """Check the names of the channels of the axes and of `more_inputs`; the board is not opened.
 
-        Raises ValueError for a name other than ai<n> or ao<n>, and for an output of two axes.
+        Raises ValueError for an input other than ai<n>, an output other than ao<n>, and an output that two axes use.
         """
         super().__init__(options, wiring, rate_hz)
         self._options = options
@@ -179,7 +180,9 @@ class ComediDriver(Driver):
             _require_name(f"channels.{axis}.output", wire.output, Kind.OUTPUT)
             owner = next(name for name, candidate in wiring.items() if candidate.output == wire.output)
             if owner != axis:
-                raise ValueError(f"channels.{axis}.output: axis {owner} uses {wire.output!r} already")
+                raise ValueError(
+                    f"channels.{axis}.output: axis {owner} uses {wire.output!r} already; choose another output"
+                )
         for name in options.more_inputs:
             _require_name("more_inputs", name, Kind.INPUT)
         self._inputs = tuple(dict.fromkeys([*(wire.input for wire in wiring.values()), *options.more_inputs]))
@@ -187,7 +190,7 @@ class ComediDriver(Driver):
 
     @property
     def facts(self) -> Facts:
-        """Properties of the driver: the wired channels and `more_inputs`, with the configured ranges."""
+        """Facts: the channels of the axes and `more_inputs`, with the configured ranges and `safe_v`."""
         options = self._options
         return Facts(
             inputs=tuple(Channel(name, *options.input_range_v) for name in self._inputs),
@@ -196,7 +199,10 @@ class ComediDriver(Driver):
 
     @property
     def error(self) -> Exception | None:
-        """The board's error, naming the channels at which the loop's reads or writes failed; None without a failure."""
+        """DriverError with libcomedi's message and the channels of the last failed read and the last failed write.
+
+        None without a failure, and while the board is not open.
+        """
         card = self._context[0]
         if self._board is None or max(card["failed_input"], card["failed_output"]) < 0:
             return None
@@ -255,7 +261,7 @@ class ComediDriver(Driver):
     def _fill_context(self, board: Board, inputs: np.ndarray, outputs: np.ndarray) -> None:
         """Store the addresses of the board's functions and of `inputs` and `outputs`, records of LINE, in the context.
 
-        The records are kept alive for the compiled functions; no channel counts as failed.
+        The driver keeps the records alive for the compiled functions. The marks of failed channels are cleared.
         """
         self._arrays = inputs, outputs, np.zeros(1, np.uint32)
         context = self._context
@@ -265,15 +271,16 @@ class ComediDriver(Driver):
         context["failed_input"] = context["failed_output"] = -1
 
     def _park(self) -> None:
-        """Set all outputs to `safe_v`. Raises DriverError if a write fails; the outputs before it are set then."""
+        """Set all outputs to `safe_v`. Raises DriverError if a write fails; the outputs before this one are set."""
         safe = np.full(len(self._outputs), self._options.safe_v)
         if comedi_write(self._context.ctypes.data, safe.ctypes.data) < 0:
             raise DriverError(
-                f"driver 'comedi': the outputs could not be made safe ({self.error}); check the amplifier"
+                f"driver 'comedi': the outputs could not be made safe ({self.error}) and may still carry voltage; "
+                "check the amplifier"
             )
 
     def _close_board(self) -> None:
-        """Release the board if it is open; its outputs stay."""
+        """Release the board if it is open; its outputs keep their voltages."""
         if self._board is not None:
             self._board.close()
             self._board = None

@@ -53,7 +53,8 @@ _FUNCTIONS: dict[str, tuple[type[ctypes._CDataType], list[type[ctypes._CDataType
 _HINTS = {
     errno.ENOENT: "; load the board's kernel module",
     errno.EACCES: "; add this user to the device's group",
-    errno.ENODEV: "; no board is attached to this device",
+    errno.ENODEV: "; no board is attached to this device; load the board's kernel module, or attach the board with "
+    "comedi_config",
     errno.ENOTTY: "; not a comedi device",
 }
 
@@ -64,7 +65,7 @@ class Board:
     def __init__(self, library: str, device: str) -> None:
         """Load libcomedi from `library`, a name or path, and open the board's file `device`.
 
-        Raises MissingLibrary if the library is missing or incomplete, DriverError if the device fails.
+        Raises MissingLibrary if the library is missing or incomplete, DriverError if the device cannot be opened.
         """
         self._device = device
         try:
@@ -90,9 +91,10 @@ class Board:
         return self._library.comedi_strerror(self._library.comedi_errno()).decode()
 
     def reserve_subdevice(self, kind: Kind, number: int | None) -> int:
-        """Lock subdevice `number`, by default the first of its kind, for this process; return its number.
+        """Lock subdevice `number`, or for None the first subdevice of `kind`, for this process; return its number.
 
-        Raises DriverError if there is none of this kind, or it cannot be locked, as when another program has locked it.
+        Raises DriverError if the board has no such subdevice, if subdevice `number` is not of `kind`, and if the lock
+        fails, such as when another program has it.
         """
         subdevice = self._library.comedi_find_subdevice_by_type(self._handle, kind, 0) if number is None else number
         if number is None and subdevice < 0:
@@ -144,12 +146,12 @@ class Board:
         return None if code.value == 0 and lowest_v < 0 else code.value
 
     def close(self) -> None:
-        """Release the board and its subdevices; the outputs stay."""
+        """Release the board and its subdevices; the outputs keep their voltages."""
         self._library.comedi_close(self._handle)
         self._handle = None
 
     def _ranges_v(self, subdevice: int, channel: int) -> dict[int, tuple[float, float]]:
-        """Return the channel's ranges in V by number, rounded to the six decimals of the board's table.
+        """Return the channel's ranges in V by libcomedi's number of the range, rounded to six decimals.
 
         Ranges in other units, such as mA, are left out.
         """

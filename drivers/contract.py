@@ -30,19 +30,19 @@ class DriverCalls:
     def __init__(self, pointers: Pointers, facts: Facts) -> None:
         """Take `read` and `write` at the pointers; `facts` give the number of values that `read` returns.
 
-        AssertionError if `pointers` has another ABI version, or if `read` or `write` is null; `wait` is not called.
+        `wait` is not used. Raises AssertionError if `pointers` has another ABI version, or if `read` or `write` is 0.
         """
         assert pointers.abi_version == ABI_VERSION, f"ABI version {pointers.abi_version}; allowed: {ABI_VERSION}"
         assert 0 not in (pointers.read, pointers.write), (
-            f"addresses: read {pointers.read}, write {pointers.write}; allowed: addresses other than 0"
+            f"addresses of the C functions: read {pointers.read}, write {pointers.write}; allowed: numbers other than 0"
         )
         self._pointers, self._facts = pointers, facts
         self._read, self._write = _FUNCTION(pointers.read), _FUNCTION(pointers.write)
 
     def read(self) -> tuple[int, list[float]]:
-        """Return status and values: inputs in V, age in µs, observed signals.
+        """Call `read`; return its status and its values: inputs in V, age in µs, observed signals.
 
-        AssertionError if `read` writes too many values, or too few with a status of at least 0.
+        Raises AssertionError if `read` writes more values than these, or leaves one out with a status of at least 0.
         """
         count = len(self._facts.inputs) + 1 + len(self._facts.observed)
         values = (ctypes.c_double * (count + _GUARD))(*[_UNTOUCHED] * (count + _GUARD))
@@ -57,7 +57,7 @@ class DriverCalls:
         return status, values[:count]
 
     def write(self, volts: Sequence[float]) -> int:
-        """Write `volts` to all outputs and return the status. AssertionError if `write` changes the loop's values."""
+        """Write `volts` to all outputs and return the status. Raises AssertionError if `write` changes its argument."""
         buffer = (ctypes.c_double * len(volts))(*volts)
         status = self._write(self._pointers.context, buffer)
         assert list(map(str, buffer)) == list(map(str, map(float, volts))), (
@@ -73,11 +73,11 @@ class DriverContract:
     """Largest deviation of an output from the written value, such as its resolution."""
 
     def driver(self) -> Driver:
-        """Return a new driver that is not open; every test calls this method."""
+        """Return a new driver that is not open, for each test. Override it: here it raises NotImplementedError."""
         raise NotImplementedError
 
     def outputs(self, driver: Driver) -> Sequence[float] | None:
-        """Return the volts at the outputs now, in the order of the facts; None if they cannot be observed."""
+        """Return the volts at the outputs now, in the order of the facts; None, as here, if they cannot be observed."""
         return None
 
     @contextmanager
@@ -108,8 +108,10 @@ class DriverContract:
                 f"{channel.minimum_v} … {channel.maximum_v} V"
             )
         for names in ([c.name for c in facts.inputs], [c.name for c in facts.outputs], facts.observed):
-            assert len(set(names)) == len(names), f"two channels have the same name: {names}"
-        assert facts.max_rate_hz > 0, f"max_rate_hz is {facts.max_rate_hz}; allowed: above 0"
+            assert len(set(names)) == len(names), (
+                f"names of inputs, outputs or observed signals: {names}; allowed: each name once"
+            )
+        assert facts.max_rate_hz > 0, f"max_rate_hz is {facts.max_rate_hz} Hz; allowed: above 0"
         assert driver.facts == facts, "two reads of `facts` gave different values; allowed: the same facts at each read"
         assert self.outputs(driver) == before, "reading the facts moved the outputs; facts must not touch the hardware"
 
@@ -121,11 +123,12 @@ class DriverContract:
         kind, model = getattr(driver, "kind", None), driver.options_model
         assert isinstance(kind, str), f"kind is {kind!r}; allowed: a text, the name in a configuration"
         assert not names or kind in names, (
-            f"kind is {kind!r}; the entry point of this driver has the name {', '.join(names)}"
+            f"kind is {kind!r}; the entry point of this driver has the name {', '.join(names)}; allowed: equal names"
         )
         actual_model = type(driver.options)
         assert actual_model is model, (
-            f"the options are of class {actual_model.__name__}; options_model is {model.__name__}"
+            f"the options are of class {actual_model.__name__}; options_model is {model.__name__}; "
+            "allowed: equal classes"
         )
 
     def test_wiring_names_channels(self) -> None:
@@ -143,7 +146,7 @@ class DriverContract:
         driver = self.driver()
         before = self.outputs(driver)
         driver.close()
-        assert self.outputs(driver) == before, "close touched hardware that was never opened"
+        assert self.outputs(driver) == before, "close before open moved the outputs; close must not touch the hardware"
         driver.open()
         driver.close()
 
@@ -261,7 +264,7 @@ class DriverContract:
             assert status >= 0, f"write failed after close and open{_error_suffix(driver)}"
 
     def _require_outputs(self, driver: Driver, expected: Sequence[float], event: str) -> None:
-        """AssertionError if an observable output differs by more than `tolerance_v` from `expected`, in V.
+        """Raise AssertionError if an observable output differs by more than `tolerance_v` from `expected`, in V.
 
         `event` names the preceding call in the message.
         """
@@ -274,7 +277,10 @@ class DriverContract:
 
 
 def _error_suffix(driver: Driver) -> str:
-    """Return ": ", type and message of the driver's `error`, such as a PythonDriver has after a failure; "" without."""
+    """Return ": TYPE: MESSAGE" of the driver's attribute `error`, which a PythonDriver sets when it fails.
+
+    Returns "" if the driver has no such attribute, or if it is None.
+    """
     error = getattr(driver, "error", None)
     return "" if error is None else f": {type(error).__name__}: {error}"
 

@@ -17,9 +17,9 @@ TIMING_COLUMNS = 4
 
 @cfunc(SIGNATURE)
 def playback_wait(context, timing):
-    """Fill `timing` with deadline and wake (ns), missed periods and now (ns) of the next row; return 0.
+    """Fill `timing` with the first TIMING_COLUMNS values of the next row, as `Playback.load` lists them; return 0.
 
-    After the last row return EXHAUSTED, which ends the run.
+    After the last row, return EXHAUSTED, which ends the run.
     """
     tape = carray(context, 1, CONTEXT)[0]
     if tape.row >= tape.rows:
@@ -33,9 +33,9 @@ def playback_wait(context, timing):
 
 @cfunc(SIGNATURE)
 def playback_read(context, values):
-    """Fill `values` with inputs (V), age (µs) and observed signals of the row of the last `playback_wait`.
+    """Fill `values` with inputs (V), age (µs) and observed signals of the row whose times `playback_wait` has given.
 
-    Goes to the next row, and returns the recorded status of the read.
+    Moves to the next row, and returns the recorded status of the read.
     """
     tape = carray(context, 1, CONTEXT)[0]
     data = carray(address_pointer(tape.address), (tape.rows, tape.columns), np.float64)
@@ -59,7 +59,7 @@ def playback_write(context, values):
 
 
 class Playback:
-    """Rows (deadline, wake, missed, now; status; inputs…, age, observed…) for the loop, one segment at a time."""
+    """Recorded rows, each with the columns that `load` describes, for the loop; one segment at a time."""
 
     def __init__(self) -> None:
         """Begin without rows; `load` sets them."""
@@ -68,10 +68,11 @@ class Playback:
         self._refused_writes: npt.NDArray[np.bool_] | None = None
 
     def load(self, rows: npt.NDArray[np.float64], refused_writes: npt.NDArray[np.bool_] | None = None) -> None:
-        """Play `rows` (n, TIMING_COLUMNS + 1 + inputs + 1 + observed) from the first, in place of those loaded before.
+        """Play `rows` (n, TIMING_COLUMNS + 1 + inputs + 1 + observed) from the first, in place of rows loaded before.
 
-        Columns: deadline and wake in ns, number of missed periods, now in ns; status of the read; inputs in V, age in
-        µs, observed signals. `refused_writes` (n,) is True where the recorded write failed; None if none did. Both may
+        Columns: deadline and wake in ns; number of missed periods; the time in ns that the loop compares with its
+        heartbeat (infinity: heartbeat lost, NaN: not lost); status of the read; inputs in V; age in µs; observed
+        signals. `refused_writes` (n,) is True where the recorded write failed; None if no write failed. Both arrays may
         be used without a copy: do not change them while they are played.
         """
         self._rows = np.ascontiguousarray(rows, dtype=np.float64)

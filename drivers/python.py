@@ -35,7 +35,10 @@ class PythonDriver(Driver):
 
     @abstractmethod
     def read(self) -> Sequence[float]:
-        """Return the volts of every input channel, in the order of the facts; `sample_age_us` is read after it."""
+        """Return the volts of every input channel, in the order of the facts; the loop gets `sample_age_us` with them.
+
+        A driver that knows the age of the sample sets `sample_age_us`, in µs, in this method.
+        """
 
     @abstractmethod
     def write(self, volts: Sequence[float]) -> None:
@@ -67,7 +70,10 @@ class PythonDriver(Driver):
         output_count, ranges = len(facts.outputs), [(channel.minimum_v, channel.maximum_v) for channel in facts.outputs]
 
         def read(_: int, values: ctypes.Array[ctypes.c_double]) -> int:
-            """Fill `values` with inputs (V), age (µs) and observed signals; return `status`, FAILED after an error."""
+            """Fill `values` with inputs (V), age (µs) and observed signals; return the driver's `status`.
+
+            An exception is stored in the driver's `error`, if it is the first, and FAILED is returned.
+            """
             try:
                 row = (*self.read(), self.sample_age_us, *self.observe())
                 if len(row) != value_count:
@@ -83,7 +89,11 @@ class PythonDriver(Driver):
                 return FAILED
 
         def write(_: int, values: ctypes.Array[ctypes.c_double]) -> int:
-            """Set all outputs to the volts at `values`; return 0, FAILED after an error or for volts out of range."""
+            """Set all outputs to the volts at `values` and return 0.
+
+            Returns FAILED for an exception, and for NaN or volts outside a channel's range, without a write. The first
+            such error is stored in the driver's `error`.
+            """
             try:
                 volts = values[0:output_count]
                 for value, (minimum_v, maximum_v) in zip(volts, ranges, strict=True):
@@ -112,7 +122,8 @@ class PythonDriver(Driver):
                 self.write([channel.safe_v for channel in self.facts.outputs])
             except Exception as error:
                 raise DriverError(
-                    f"driver {self.kind!r}: the outputs could not be made safe ({error}); check the amplifier"
+                    f"driver {self.kind!r}: the outputs could not be made safe ({error}) and may still carry voltage; "
+                    "check the amplifier"
                 ) from error
             finally:
                 self.stop()

@@ -53,9 +53,10 @@ class ShmOptions(BoardOptions):
 
 @cfunc(SIGNATURE)
 def shm_read(context, values):
-    """Fill `values` with volts and age in µs of the newest sample, or the previous one if the board stalled in a write.
+    """Fill `values` with volts and age in µs of the newest sample, or of the last one read if the board stalls while it
+    writes a sample.
 
-    Returns 0; NO_SAMPLE, with an infinite age and no volts, if no sample could be read yet.
+    Returns 0; NO_SAMPLE, with an infinite age and the volts unchanged, if no sample has been read before the stall.
     """
     card = carray(context, 1, CONTEXT)[0]
     words = carray(address_pointer(card.words), board.WORDS, np.uint64)
@@ -116,7 +117,8 @@ class ShmDriver(Driver):
     def __init__(self, options: ShmOptions, wiring: Mapping[str, Wiring], rate_hz: float) -> None:
         """Check the wiring; the board is not opened.
 
-        Raises ValueError for more axes than MAX_CHANNELS, and for channels that the driver lacks.
+        Raises ValueError for more axes than MAX_CHANNELS, and for a channel in `wiring` other than adc<i> or dac<i>,
+        with i below the number of axes.
         """
         super().__init__(options, wiring, rate_hz)
         self._file = options.file
@@ -138,7 +140,7 @@ class ShmDriver(Driver):
         )
 
     def open(self) -> Pointers:
-        """Attach to a running board; its outputs keep their voltages.
+        """Attach to a running board and return the pointers; the board's outputs keep their voltages.
 
         Raises DriverError if the file cannot be opened, no board runs, the board has another version or too few
         channels, or another controller drives it.
@@ -170,7 +172,7 @@ class ShmDriver(Driver):
         return Pointers(context.ctypes.data, shm_read.address, shm_write.address)
 
     def outputs_v(self) -> list[float]:
-        """Return the volts at the converters of the wired outputs, in the order of the facts.
+        """Return the volts of the newest write to the board, for the outputs of the facts in their order.
 
         Raises DriverError if the driver is not open.
         """
@@ -179,7 +181,7 @@ class ShmDriver(Driver):
         return (self._memory.dac_codes[: len(self.wiring)] * LSB_V).tolist()
 
     def close(self) -> None:
-        """Set all outputs of the board to 0 V, those of no axis too, and release it; if it is not open, do nothing."""
+        """Set all outputs of the board, wired or not, to 0 V and release the board; if it is not open, do nothing."""
         if self._fd is not None and self._memory is not None:
             context, safe = self._arrays[0], np.zeros(MAX_CHANNELS)
             context["channels"] = MAX_CHANNELS
@@ -189,7 +191,7 @@ class ShmDriver(Driver):
             self._fd = None
 
     def _claim_board(self, fd: int) -> None:
-        """Lock the controller's role on the board whose file `fd` is.
+        """Take the controller's role, a lock, on the board whose file is open as `fd`.
 
         Raises DriverError if the file is no board's or its board has ended, if the board has another version or too few
         channels, and if another controller has the role.

@@ -23,9 +23,10 @@ LOOPBACK_RANGE_V = 10.0
 
 @cfunc(SIGNATURE)
 def sim_read(context, values):
-    """Fill `values`: V of plants and loopback channels, age 0, then true position and hysteresis in µm of each plant.
+    """Fill `values`: readings in V of plants and loopback channels, age 0, then for each plant the true position and
+    the displacement by hysteresis and creep, in µm.
 
-    Draws one sample of noise for each plant. Returns 0.
+    Draws one sample of noise for each plant whose sensor has noise. Returns 0.
     """
     rig = carray(context, 1, CONTEXT)[0]
     coefficients = carray(address_pointer(rig.coefficients), rig.count, COEFFICIENTS)
@@ -45,7 +46,10 @@ def sim_read(context, values):
 
 @cfunc(SIGNATURE)
 def sim_write(context, values):
-    """Advance the rig by one period with the outputs at `values`, in V; NaN holds a plant's last value. Returns 0."""
+    """Advance the rig by one period with the outputs at `values`, in V, and return 0.
+
+    NaN holds the last value of a plant's output; a loopback channel stores it.
+    """
     rig = carray(context, 1, CONTEXT)[0]
     coefficients = carray(address_pointer(rig.coefficients), rig.count, COEFFICIENTS)
     state = carray(address_pointer(rig.state), rig.count, STATE)
@@ -93,18 +97,20 @@ class SimDriver(Driver):
             if plant is None or input_name != f"adc{plant}":
                 raise ValueError(
                     f"channels.{axis}: input {input_name!r} with output {output_name!r}; allowed on the "
-                    f"simulated rig: 'adc<i>' with 'dac<i>', i from 0 to {len(self.wiring) - 1}"
+                    f"simulated rig: 'adc<i>' with 'dac<i>', i from 0 to {len(self.wiring) - 1} and equal in both"
                 )
             if plant in names:
-                raise ValueError(f"channels.{axis}: axis {names[plant]} uses {output_name!r} already")
+                raise ValueError(
+                    f"channels.{axis}: axis {names[plant]} uses {output_name!r} already; choose another channel pair"
+                )
             names[plant] = axis
         return [names[i] for i in sorted(names)]
 
     @property
     def facts(self) -> Facts:
-        """Properties of the driver: channel pairs of the axes, with the ranges of their converters, then of loopback.
+        """Facts: the channel pairs of the axes, with the ranges of their converters, then those for loopback, ±10 V.
 
-        Observed are true position and hysteresis of each axis.
+        The observed signals are true position and hysteresis of each axis, in µm.
         """
         axes = self._axes_by_plant()
         plants = [self._rig_options.plants.get(axis, self._rig_options.plant) for axis in axes]
@@ -114,7 +120,7 @@ class SimDriver(Driver):
         return Facts(inputs, outputs, observed, exclusive=False, real=False)
 
     def _channels(self, prefix: str, ranges_v: list[float]) -> tuple[Channel, ...]:
-        """Return the channels `prefix`0, 1, …: the plants' with ± these ranges, then those for loopback with ±10 V."""
+        """Return the channels `prefix`0, 1, …: one per plant with ± its range in V, then those for loopback, ±10 V."""
         all_ranges_v = ranges_v + [LOOPBACK_RANGE_V] * self._loopback_v.size
         return tuple(Channel(f"{prefix}{i}", -range_v, range_v) for i, range_v in enumerate(all_ranges_v))
 

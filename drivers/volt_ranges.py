@@ -11,7 +11,7 @@ Volts = Annotated[tuple[float, float], Field(strict=False)]
 
 
 def require_ranges(input_range_v: Volts, output_range_v: Volts, safe_v: float) -> None:
-    """Raise ValueError, naming the key, for an empty or reversed range, and for `safe_v` outside the output range."""
+    """Raise ValueError, which names the option, for an empty or reversed range or `safe_v` outside the output range."""
     for name, (lowest, highest) in (("input_range_v", input_range_v), ("output_range_v", output_range_v)):
         if lowest >= highest:
             raise ValueError(f"{name}: [{lowest:g}, {highest:g}] V; allowed: the lower end before the higher")

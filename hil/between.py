@@ -35,9 +35,9 @@ class RecordedMotion(NamedTuple):
 def fractions_of_period(coefficients: np.record, period_s: float, points: int) -> npt.NDArray[np.float64]:
     """Return the factors that move each mode of an axis from a tick to `points` instants of the next period.
 
-    Instant i, from 0 on, lies i/points of `period_s` after the tick. The array (modes, PARTS, points) has the real and
-    imaginary part of λᶠ, the factor of the mode's state, then those of (λᶠ − 1)/(λ − 1), the factor of its constant
-    input.
+    Instant i, from 0 on, lies i/points of `period_s` after the tick. The array (modes, PARTS, points) has real and
+    imaginary part of λᶠ, the factor of the mode's state, then real and imaginary part of (λᶠ − 1)/(λ − 1), the factor
+    of its constant input; λ is the mode's factor in one period, f = i/points.
     """
     count = coefficients.mode_count
     exponents = (coefficients.pole_real[:count] + 1j * coefficients.pole_imag[:count])[:, None] * period_s
@@ -52,12 +52,13 @@ def fractions_of_period(coefficients: np.record, period_s: float, points: int) -
 def positions_between_ticks(
     coefficients: np.recarray, state: np.recarray, axis: int, factors: npt.NDArray[np.float64], motion: RecordedMotion
 ) -> npt.NDArray[np.float64]:
-    """Return the true positions of axis number `axis` in µm, (ticks, points), each row from its tick on.
+    """Return the true positions of axis number `axis` in µm, (ticks, points): row k is the period from tick k on.
 
     `coefficients` and `state` (axes,) are the rig's records before the first tick; neither changes. `factors` is a
-    result of `fractions_of_period`. Displacements after the last tick are not recorded, and are taken as unchanged; in
-    the periods without a tick they are taken from the period before the next tick. Raises ValueError for a motion of
-    another number of axes or counts, and for factors of other dynamics.
+    result of `fractions_of_period`. Displacements after the last tick are not recorded, and count as unchanged; in
+    periods without a tick they count as equal to the displacements in the period before the next tick. Raises
+    ValueError for a motion with another number of axes or of counts, for an axis number that does not exist, and for
+    factors whose shape does not fit the axis or that are not stored row by row.
     """
     displacements_um, missed = np.ascontiguousarray(motion.hysteresis_um), np.ascontiguousarray(motion.missed)
     ticks, axes = displacements_um.shape
@@ -112,7 +113,7 @@ def _fill_positions(
 def _input_um(coefficients, state, displacements_um, axis):
     """Return the input (µm) of the dynamics of axis `axis` in a period, and advance its disturbance by a period.
 
-    `displacements_um` (axes,) holds the displacement of each axis; other axes count by their coupling.
+    `displacements_um` (axes,) holds the displacement of each axis; the input contains other axes by their coupling.
     """
     total_um = displacements_um[axis]
     for j in range(coefficients.coupled_count):

@@ -138,13 +138,13 @@ def serve(
     is_stopped: Callable[[], bool],
     on_ready: Callable[[], None] = lambda: None,
 ) -> int:
-    """Run a board in the file `path` until `is_stopped()`, asked every SLICE_S; return the number of samples.
+    """Run a board in the file `path` until `is_stopped()`, called every SLICE_S, is True; return the number of samples.
 
     The memory begins as zeros; `on_ready` is called before the first period. Raises ValueError for too many axes and
     as `build_rig`, BoardConflict if another board serves the file, OSError if it cannot be opened.
     """
     if len(axes) > MAX_CHANNELS:
-        raise ValueError(f"{len(axes)} axes; allowed: at most the {MAX_CHANNELS} channels of a board")
+        raise ValueError(f"channels: {len(axes)} axes; allowed: at most the {MAX_CHANNELS} channels of a board")
     coefficients, state = build_rig(options, axes, 1.0 / rate_hz)
     fd = open_file(path, os.O_RDWR | os.O_CREAT, 0o660, group=True)
     try:
@@ -178,9 +178,10 @@ def serve(
 
 
 def lock_role(fd: int, byte: int) -> bool:
-    """Lock BOARD_BYTE or CONTROLLER_BYTE of the file; return False if the lock fails: another open file has it.
+    """Lock `byte` of the file, BOARD_BYTE or CONTROLLER_BYTE; return whether the lock succeeded.
 
-    The lock belongs to the open file. A lock of the process would end when any descriptor of the file is closed.
+    The lock fails while another opening of the file has it. It belongs to this opening of the file: a lock of the
+    process would end when any descriptor of the file is closed.
     """
     request = struct.pack("hhqqi4x", fcntl.F_WRLCK, os.SEEK_SET, byte, 1, 0)
     try:
@@ -281,7 +282,8 @@ def _observe_outputs(words, fifo, evidence, levels, channels, follows, timespec)
 
 @jit
 def examine_writes(words, fifo, evidence, levels, channels, write_count, now_ns, follows):
-    """Enter all writes up to number `write_count`, not examined before, in the evidence; all were made before `now_ns`.
+    """Add all writes with numbers below `write_count`, if not examined before, to the evidence. All were made before
+    `now_ns`.
 
     `evidence` (channels,), `levels` (channels, MAX_LEVELS) and the number EXAMINED in `words` change. Without `follows`
     the outputs are stuck: they keep their voltages. Writes that the FIFO no longer has, or that come too fast to be

@@ -31,10 +31,11 @@ class BoucWenOptions(Options):
 
     @model_validator(mode="after")
     def _check(self) -> Self:
-        """Require |lean_per_v| ≤ decay_per_v; beyond, h would grow without bound."""
+        """Raise ValueError unless |lean_per_v| ≤ decay_per_v; beyond, h would grow without bound."""
         if abs(self.lean_per_v) > self.decay_per_v:
             raise ValueError(
-                f"lean_per_v: {self.lean_per_v:g}; allowed: -{self.decay_per_v:g} to {self.decay_per_v:g} (decay_per_v)"
+                f"lean_per_v: {self.lean_per_v:g}; allowed: -{self.decay_per_v:g} to {self.decay_per_v:g}, "
+                "the value of decay_per_v"
             )
         return self
 
@@ -56,9 +57,9 @@ class HysteresisOptions(Options):
 
     @model_validator(mode="after")
     def _check(self) -> Self:
-        """Require the numbers that `truth` takes and no others.
+        """Raise ValueError unless the numbers for this `truth` are present, and the numbers for others are absent.
 
-        'bouc-wen' takes `bouc_wen`, 'custom' increasing `thresholds_v` ≥ 0, at most MAX_PLAYS, with as many weights.
+        'bouc-wen' needs `bouc_wen`; 'custom' needs 1 to MAX_PLAYS increasing `thresholds_v` ≥ 0 with as many weights.
         """
         if self.truth != "bouc-wen":
             self._require_unset("truth", "bouc-wen", "bouc_wen")
@@ -107,9 +108,10 @@ class DynamicsOptions(Options):
 
     @model_validator(mode="after")
     def _check(self) -> Self:
-        """Require the numbers that `form` takes and no others, and factors whose first number is not 0.
+        """Raise ValueError for factors, zeros or poles that this `form` does not use, and for a factor whose first
+        number is 0.
 
-        `gain` is needed with 'factors' and 'zpk', and not allowed with 'paper'.
+        Also raise it for a `gain` that is missing with 'factors' or 'zpk', or given with 'paper'.
         """
         if self.form != "factors":
             self._require_unset("form", "factors", "numerator", "denominator")
@@ -122,7 +124,9 @@ class DynamicsOptions(Options):
             )
         for factor in (*self.numerator, *self.denominator):
             if factor[0] == 0:
-                raise ValueError(f"factor: {list(factor)}; allowed: a first number other than 0")
+                raise ValueError(
+                    f"a factor of numerator or denominator is {list(factor)}; allowed: a first number other than 0"
+                )
         return self
 
 
@@ -136,7 +140,9 @@ class CreepOptions(Options):
 
     @model_validator(mode="after")
     def _check(self) -> Self:
-        """Require as many gains as time constants, at most MAX_LAGS, and time constants above 0."""
+        """Raise ValueError for another number of gains than of time constants, for more than MAX_LAGS, and for a time
+        constant of 0 or less.
+        """
         gains, constants = self.gains, self.time_constants_s
         if len(gains) > MAX_LAGS or len(gains) != len(constants):
             raise ValueError(
@@ -165,7 +171,7 @@ class SensorOptions(Options):
     @field_validator("um_per_v")
     @classmethod
     def _check_scale(cls, um_per_v: float) -> float:
-        """Require a scale other than 0: a sensor of 0 µm/V has no output."""
+        """Return the scale. Raises ValueError for 0: a sensor of 0 µm/V has no reading."""
         if um_per_v == 0:
             raise ValueError("value is 0, and a sensor with a scale of 0 has no reading; allowed: numbers other than 0")
         return um_per_v
@@ -252,7 +258,7 @@ class BoardOptions(RigOptions):
 
     @model_validator(mode="after")
     def _check_shares(self) -> Self:
-        """Require a sum of `dropped_share` and `repeated_share` of at most 1."""
+        """Raise ValueError if the sum of `dropped_share` and `repeated_share` is above 1."""
         if self.dropped_share + self.repeated_share > 1:
             raise ValueError(
                 f"dropped_share {self.dropped_share:g} and repeated_share {self.repeated_share:g}; "

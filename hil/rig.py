@@ -54,14 +54,14 @@ STATE = np.dtype(
 def build_rig(options: RigOptions, axes: Sequence[str], period_s: float) -> tuple[np.recarray, np.recarray]:
     """Return coefficients and state, both (len(axes),), of a rig at rest at 0 V, with the memory of `history_v`.
 
-    Raises ValueError, naming the axis and its part, for a period that is not finite or not above 0, repeated axes, an
-    axis in the options that is not one of `axes`, a coupling that is not possible, and a part, such as the dynamics,
-    that cannot be discretised at this period.
+    Raises ValueError for a period that is not finite or not above 0, for repeated axes, for an axis in the options that
+    is not one of `axes`, and for a coupling that is not possible. Raises ValueError, which names axis and part, for
+    dynamics or a disturbance that cannot be discretised at this period.
     """
     if not (math.isfinite(period_s) and period_s > 0):
         raise ValueError(f"period_s: {period_s} s; allowed: a finite number above 0")
     if len(set(axes)) != len(axes):
-        raise ValueError(f"axes: {list(axes)} names an axis twice")
+        raise ValueError(f"axes: {list(axes)} names an axis twice; allowed: each axis once")
     for name in options.plants:
         if name not in axes:
             raise ValueError(f"plants.{name}: there is no such axis; allowed: {', '.join(axes) or 'none'}")
@@ -110,7 +110,7 @@ def _fill_coupling(options: RigOptions, axes: Sequence[str], coefficients: np.re
 
 
 def _settle_history(history_v: Sequence[float], coefficients: np.record, state: np.record) -> None:
-    """Set `state` to that of an actuator after slow moves to each of `history_v` and to 0 V, with its creep ended."""
+    """Set `state` as after slow moves of the actuator to each of `history_v` in turn and to 0 V, with creep ended."""
     displacement_um = 0.0
     for drive_v in (*history_v, 0.0):
         displacement_um = _displacement_um(coefficients, state, drive_v)
@@ -177,10 +177,10 @@ def play_parameters(options: HysteresisOptions) -> tuple[Sequence[float], Sequen
 
 
 def zeros_poles_gain(options: DynamicsOptions) -> tuple[np.ndarray, np.ndarray, float]:
-    """Return zeros and poles [rad/s] and gain of D(s), with its changes of resonance, damping and gain.
+    """Return zeros and poles [rad/s] and gain of D(s), after the options' changes of resonance, damping and gain.
 
-    Raises ValueError for a changed resonance of dynamics without a complex pole pair or with repeated poles, and for a
-    damping ratio of 1 or more.
+    Raises ValueError if resonance or damping is changed for dynamics without a complex pole pair, with repeated poles
+    or with more zeros than poles, and if the changed damping ratio is 1 or more.
     """
     if options.form == "zpk":
         zeros, poles = (np.array([complex(*root) for root in roots]) for roots in (options.zeros, options.poles))
@@ -228,7 +228,7 @@ def advance(coefficients, state, dac_v):
 def _displacement_um(coefficients, state, actuator_v):
     """Move the actuator's hysteresis to `actuator_v` [V] and return its displacement [µm] before creep.
 
-    It is Bouc-Wen's where the axis has such an actuator, else the sum of plays.
+    The Bouc-Wen model gives the displacement of a Bouc-Wen actuator, the sum of plays that of any other.
     """
     if coefficients.bw_um_per_v != 0.0:
         return bouc_wen.step(coefficients, state, actuator_v)
@@ -237,7 +237,7 @@ def _displacement_um(coefficients, state, actuator_v):
 
 @jit
 def _coupled_displacement_um(coefficients, state, i):
-    """Return the displacement of axis `i` plus the coupling k_ij times that of each axis j [µm]."""
+    """Return the displacement [µm] of axis `i` plus, for each axis j, the coupling k_ij times j's displacement."""
     total_um = state[i].hysteresis_um
     for j in range(coefficients[i].coupled_count):
         total_um += coefficients[i].coupling[j] * state[j].hysteresis_um

@@ -17,7 +17,8 @@ from rtloop.foundation.native.compiled import jit
 
 WINDOW_NS = 1_000_000
 MAX_LEVELS = 1024
-"""Stored voltages of an output. Further writes within one window are not judged but counted in `MISSED_WRITES`."""
+"""Number of stored voltages of an output. A write that comes when the window has more voltages is compared with the
+stored ones alone, and counted in `MISSED_WRITES`."""
 EVIDENCE = np.dtype(
     [("lowest_v", np.float64), ("highest_v", np.float64), ("written_v", np.float64), ("largest_step_v", np.float64),
      ("largest_window_v", np.float64), ("levels", np.int64), ("last_v", np.float64), ("moved_ns", np.int64),
@@ -62,7 +63,8 @@ def judge_write(evidence, levels, volts, written_ns, follows):
 def _compare_with_window(evidence, levels, volts, written_ns):
     """Raise the evidence's largest step and largest change within WINDOW_NS by a write of `volts` at `written_ns`.
 
-    `levels` are the last MAX_LEVELS voltages, as in `judge_write`. Returns 1 if it lacks some of the window, else 0.
+    `levels` has the last MAX_LEVELS voltages, as in `judge_write`. Returns 1 if they do not reach back to the beginning
+    of the window, else 0.
     """
     evidence.largest_step_v = max(evidence.largest_step_v, abs(volts - evidence.written_v))
     i, first = evidence.levels, max(evidence.levels - MAX_LEVELS + 1, 0)

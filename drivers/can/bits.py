@@ -26,7 +26,7 @@ def max_stuff_bits(bits: int) -> int:
 def classic_frame_bits(length: int) -> int:
     """Return the largest number of bits on the wire of a classic frame with `length` data bytes.
 
-    Its identifier has 11 bits; the space after the frame counts.
+    The frame has an 11-bit identifier; the 3 bits of space after it count.
     """
     stuffable_bits = _CLASSIC_STUFFED + 8 * length
     return stuffable_bits + max_stuff_bits(stuffable_bits) + _CLASSIC_UNSTUFFED

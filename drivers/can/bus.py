@@ -20,9 +20,10 @@ def require_interface(options: BusOptions) -> None:
 
 
 def open_bus(options: BusOptions) -> can.BusABC:
-    """Open the bus of the options, without python-can's configuration files, and silence python-can's log.
+    """Open and return the bus that `options` describe, without python-can's configuration files.
 
-    Raises DriverError, naming the bus, if python-can cannot open it: hardware, library or settings.
+    python-can then logs critical errors only. Raises DriverError, which names the bus, if python-can cannot open it
+    because of hardware, library or settings.
     """
     logging.getLogger("can").setLevel(logging.CRITICAL)  # python-can's log only repeats its errors.
     try:
@@ -32,9 +33,10 @@ def open_bus(options: BusOptions) -> can.BusABC:
 
 
 def error_text(error: BaseException) -> str:
-    """Return the messages of an error and of its cause (python-can may hide the reason there), joined by ": ".
+    """Return the messages of an error and of the error that caused it, joined by ": ".
 
-    An error without a message is named by its type; equal messages appear once.
+    python-can may put the reason into the message of the cause. The type stands for an error without a message; equal
+    messages appear once.
     """
     cause = error.__cause__ or error.__context__
     texts = [str(part) or type(part).__name__ for part in (error, cause) if part is not None]

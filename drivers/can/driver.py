@@ -37,10 +37,10 @@ class CanDriver(PythonDriver):
     options_model = CanOptions
 
     def __init__(self, options: CanOptions, wiring: Mapping[str, Wiring], rate_hz: float) -> None:
-        """Read the DBC and choose the frames; the bus is not opened.
+        """Read the DBC file and choose its frames of drives and samples; the bus is not opened.
 
-        Raises ValueError for an unknown interface, a DBC that cannot be used or has no frames for so many axes, and for
-        a channel that the node lacks.
+        Raises ValueError for an interface that python-can lacks, for a DBC file that cannot be used or has no frames
+        for so many axes, and for a channel in `wiring` other than adc<i> or dac<i>, with i below the number of axes.
         """
         super().__init__(options, wiring, rate_hz)
         self._options = options
@@ -51,7 +51,9 @@ class CanDriver(PythonDriver):
 
     @property
     def facts(self) -> Facts:
-        """Properties of the driver: a channel pair per axis with the DBC's ranges, and the rate that fills the bus."""
+        """Facts: a channel pair adc<i>, dac<i> per axis with the DBC's ranges; the largest rate is that at which the
+        frames fill the bus.
+        """
         drive, sample = self._exchange.drive.signals, self._exchange.sample.signals
         count = self._exchange.channels
         return Facts(
@@ -64,7 +66,8 @@ class CanDriver(PythonDriver):
         )
 
     def start(self) -> None:
-        """Open the bus, listen for LISTEN_S, then send the safe values until the node answers; reset all counts.
+        """Open the bus, listen for at most LISTEN_S to find another controller, then send the safe values until the
+        node answers; reset all counts.
 
         Raises DriverError, with the bus closed, if the bus fails, if another controller drives the node, and if no node
         answers within `wait_s`.
@@ -89,13 +92,14 @@ class CanDriver(PythonDriver):
             raise
 
     def read(self) -> Sequence[float]:
-        """Process the received frames and return the newest sample, the volts of each input channel.
+        """Process up to MAX_FRAMES_PER_TICK received frames and return the newest sample, in V for each input channel.
 
-        Sets `sample_age_us`, the time since the drive frame of this sample was sent, plus the node's own, and `status`:
-        0, or STATUS_HELD while the last drive frame is not answered and the previous sample is held. After more than
-        `hold_ticks` such ticks the age is infinite. Until the first `write`, a call first discards older frames, sends
-        the safe values and waits up to RETRY_S for the answer. Raises DriverError if another controller drives the node
-        or the driver is not open; python-can's errors pass through.
+        Sets `sample_age_us`, the time since the drive frame of this sample was sent, plus the age that the node
+        reports. Sets `status` to 0, or to STATUS_HELD while the node has not answered the last drive frame and the
+        previous sample is held; after more than `hold_ticks` such ticks in sequence the age is infinite. Each call
+        before the first `write` first discards older frames, sends the safe values and waits up to RETRY_S for the
+        answer. Raises DriverError if another controller drives the node or the driver is not open; python-can's errors
+        pass through.
         """
         if self._stream.sent == 0:  # Much time may pass between `open` and the first tick.
             while self._receive(0.0) is not None:
@@ -117,24 +121,27 @@ class CanDriver(PythonDriver):
         return self._volts
 
     def observe(self) -> Sequence[float]:
-        """Return the counts of OBSERVED since `start`: lost, reordered, duplicated and invalid frames, held ticks."""
+        """Return the counts since `start`, in the order of OBSERVED: lost, reordered and duplicated samples, invalid
+        frames, ticks with a held sample.
+        """
         stream = self._stream
         return stream.lost, stream.reordered, stream.duplicated, stream.invalid, self._total_held_ticks
 
     def write(self, volts: Sequence[float]) -> None:
         """Send `volts`, one per output channel, with the next sequence number; do not wait for the answer.
 
-        Volts are clipped to the range of the DBC's integers. Raises ValueError for NaN or another number of values,
-        OverflowError for infinity, DriverError after the bus was closed; python-can's errors pass through. Call `open`
-        before.
+        A value that its integer in the frame cannot hold is clipped. Call `open` before. Raises ValueError for NaN or
+        another number of values, OverflowError for infinity, DriverError after the bus was closed; python-can's errors
+        pass through.
         """
         self._send(self._stream.next_sequence(), volts)
 
     def stop(self) -> None:
         """Wait until the node answers the last drive frame, in which `close` sent the safe values; then close the bus.
 
-        Without an answer within CONFIRM_S, the safe values are sent again, CONFIRMATIONS times at most. Raises
-        DriverError, with the bus closed, if no answer comes or the bus fails. Without an open bus it does nothing.
+        Without an answer within CONFIRM_S, the driver sends the safe values again, CONFIRMATIONS times at most. Without
+        an open bus, a call does nothing. Raises DriverError, with the bus closed, if no answer comes, if the bus fails,
+        and if another controller drives the node.
         """
         if self._bus is None:
             return
@@ -151,8 +158,8 @@ class CanDriver(PythonDriver):
                         return
                 self.write([channel.safe_v for channel in self.facts.outputs])
             raise DriverError(
-                f"{self._options.label}: the node does not confirm that its outputs are safe; "
-                "only the node's watchdog can make them safe"
+                f"{self._options.label}: the node does not confirm that its outputs are at their safe values; they may "
+                "carry voltage until the node's watchdog parks them; check the amplifier"
             )
         except BUS_ERRORS as error:
             raise DriverError(f"{self._options.label}: {error_text(error)}") from error
@@ -160,7 +167,7 @@ class CanDriver(PythonDriver):
             self._close_bus()
 
     def _close_bus(self) -> None:
-        """Close the bus if it is open. An error of closing is ignored: no frame depends on it any more."""
+        """Close the bus if it is open. An error while closing is ignored: no more frames will be sent."""
         bus, self._bus = self._bus, None
         if bus is not None:
             with contextlib.suppress(*BUS_ERRORS):
@@ -169,7 +176,8 @@ class CanDriver(PythonDriver):
     def _await_node(self) -> None:
         """Send the safe values every RETRY_S until the node answers.
 
-        Raises DriverError if it does not within `wait_s`, and if another controller drives it.
+        Raises DriverError if no answer comes within `wait_s`, and if another controller drives the node; python-can's
+        errors pass through.
         """
         deadline_s = time.monotonic() + self._options.wait_s
         while time.monotonic() < deadline_s:
@@ -178,7 +186,7 @@ class CanDriver(PythonDriver):
                 return
         raise DriverError(
             f"{self._options.label}: no node has answered within {self._options.wait_s:g} s; "
-            "start a simulated node with `rtloop hil serve CONFIG --can`"
+            "switch the node on, or start a simulated node with `rtloop hil serve CONFIG --can`"
         )
 
     def _send_opening_frame(self) -> None:
@@ -198,7 +206,7 @@ class CanDriver(PythonDriver):
         return False
 
     def _send(self, sequence: int, volts: Sequence[float]) -> None:
-        """Send a drive frame with `volts`; its bytes and the time are stored at index `sequence` before.
+        """Store the bytes of a drive frame with `volts`, and the time in ns, at index `sequence`; then send the frame.
 
         Raises DriverError if the bus is not open; python-can's errors pass through.
         """
@@ -222,11 +230,11 @@ class CanDriver(PythonDriver):
         return self._bus
 
     def _process_frame(self, message: can.Message) -> bool:
-        """Store a new sample, or count a lost, late, repeated or invalid frame; return whether it was a new sample.
+        """Store a new sample, or count a late, repeated or invalid frame; return whether `message` was a new sample.
 
-        Frames of other identifiers are ignored. A sample is new if it is newer than all earlier ones; the answer to an
-        opening frame is new until the first `write`. Raises DriverError for a drive frame that this driver did not
-        send: another controller drives the node.
+        Frames of other identifiers are ignored. A sample is new if it is newer than all earlier ones; samples that it
+        skips count as lost. The answer to an opening frame is new until the first `write`, and ignored later. Raises
+        DriverError for a drive frame that this driver did not send: another controller drives the node.
         """
         drive, sample = self._exchange.drive, self._exchange.sample
         if message.arbitration_id == drive.identifier and drive.fits(message):

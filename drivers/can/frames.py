@@ -54,9 +54,9 @@ class Frame:
         self._scales = [(float(s.scale), float(s.offset), *_raw_range(s)) for s in signals]
 
     def pack(self, values: Sequence[float]) -> bytes:
-        """Return the data bytes of `values`, in the order of the signals' bits.
+        """Return the data bytes of the physical `values`, one for each signal, in the order of the signals' bits.
 
-        A value outside a signal's range is clipped. Raises ValueError for NaN or another number of values,
+        A value that the signal's integer cannot hold is clipped. Raises ValueError for NaN or another number of values,
         OverflowError for infinity.
         """
         raw = []
@@ -74,9 +74,9 @@ class Frame:
         return [number * scale + offset for number, (scale, offset, _, _) in zip(raw, self._scales, strict=True)]
 
     def message(self, options: BusOptions, values: Sequence[float]) -> can.Message:
-        """Return python-can's message of `values`, CAN FD or classic as this frame is in the DBC; raises as `pack`.
+        """Return python-can's message of `values`, CAN FD or classic as this frame is in the DBC.
 
-        The options say only whether a CAN FD message switches the bitrate.
+        `options` decide only whether a CAN FD message switches the bitrate. Raises the errors of `pack`.
         """
         return can.Message(
             arbitration_id=self.identifier,
@@ -87,7 +87,9 @@ class Frame:
         )
 
     def fits(self, message: can.Message) -> bool:
-        """Whether `message` is a data frame of this kind (classic or FD) and length; its identifier is not compared."""
+        """Whether `message` is a data frame with an 11-bit identifier, and of this frame's kind (classic or FD) and
+        length; the number of the identifier is not compared.
+        """
         is_plain = not (message.is_remote_frame or message.is_error_frame or message.is_extended_id)
         return is_plain and message.is_fd == self.fd and len(message.data) == self.length
 
@@ -135,10 +137,11 @@ def load_frames(options: BusOptions) -> dict[str, Frame]:
 
 
 def choose_exchange(frames: dict[str, Frame], channels: int, options: BusOptions) -> Exchange:
-    """Return the pair Drive…, Sample… with the fewest bytes that has room for `channels`, classic or FD by `options`.
+    """Return the shortest pair of frames (fewest data bytes) that has room for `channels` channels.
 
-    A Drive… without its Sample… is left out. Raises ValueError if no pair has room, or if the signals of the pair are
-    not Sequence, Drive_0, … and Sequence, Age, Sample_0, ….
+    The names of a pair are Drive and Sample with the same ending, such as Drive2 and Sample2. The frames are CAN FD if
+    `options.fd`, else classic. Raises ValueError if no pair has room, or if the signals of the chosen pair are not
+    Sequence, Drive_0, … and Sequence, Age, Sample_0, ….
     """
     pairs = [
         Exchange(frame, frames[f"Sample{name.removeprefix('Drive')}"], channels)
@@ -150,7 +153,7 @@ def choose_exchange(frames: dict[str, Frame], channels: int, options: BusOptions
         kind = "CAN FD" if options.fd else "classic CAN"
         raise ValueError(
             f"channels: {channels} axes; the DBC file has no pair of {kind} frames with room for {channels} axes and "
-            "names of the same ending, such as Drive2 and Sample2; add both frames, or set another dbc"
+            "names such as Drive2 and Sample2 (same ending); add both frames to the file, or set driver.dbc to another"
         )
     exchange = min(pairs, key=lambda pair: pair.drive.length + pair.sample.length)
     numbers = range(exchange.channel_capacity)
@@ -160,7 +163,9 @@ def choose_exchange(frames: dict[str, Frame], channels: int, options: BusOptions
 
 
 def require_signals(frame: Frame, names: Sequence[str], options: BusOptions) -> None:
-    """Raise ValueError, with the DBC file of `options`, unless the frame has exactly these signals, in bit order."""
+    """Raise ValueError, which names the DBC file of `options`, unless the signals of `frame` are exactly `names`, in
+    the order of their bits.
+    """
     if [*frame.signals] != [*names]:
         raise ValueError(
             f"dbc: {options.dbc}: {frame.name} has the signals {', '.join(frame.signals)}; "

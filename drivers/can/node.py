@@ -34,13 +34,16 @@ class RigNode:
     def __init__(self, bus: can.BusABC, options: CanOptions, axes: Sequence[str]) -> None:
         """Build the rig at rest and compile it; nothing is sent.
 
-        Raises ValueError if rig, axes and DBC do not fit together, and if the DBC has no frame Node with ANNOUNCED.
+        Raises ValueError if rig, axes and DBC file do not fit together, and if the file has no frame Node with the
+        signals ANNOUNCED.
         """
         self._bus, self._options = bus, options
         frames = load_frames(options)
         self._exchange = choose_exchange(frames, len(axes), options)
         if "Node" not in frames:
-            raise ValueError(f"dbc: {options.dbc}: has no message Node, which this node sends; add it")
+            raise ValueError(
+                f"dbc: {options.dbc}: has no message Node, which the simulated node sends; add the message to this file"
+            )
         self._announcement: Frame = frames["Node"]
         require_signals(self._announcement, ANNOUNCED, options)
         self._rig = FreeRunningRig(options, axes, RIG_RATE_HZ)
@@ -53,7 +56,7 @@ class RigNode:
         self._start_s = self._last_move_s = self._last_frame_s = time.monotonic()
 
     def announce(self) -> None:
-        """Send this node's announcement: number of channels, starting or serving, watchdog time, random identity.
+        """Send this node's announcement: number of channels, starting or serving, watchdog time in ms, random identity.
 
         Raises python-can's errors.
         """
@@ -61,10 +64,10 @@ class RigNode:
         self._bus.send(self._announcement.message(self._options, values))
 
     def require_alone(self) -> None:
-        """Announce this node, listen for LISTEN_S, then count as serving.
+        """Announce this node, listen for LISTEN_S, then mark this node as serving in its later announcements.
 
-        Raises DriverError if a node answers drive frames, or another node's announcement comes, in this time; this node
-        then does not serve. Raises python-can's errors.
+        Raises DriverError, without the mark, if a sample of another node, or another node's announcement, comes in this
+        time. Raises python-can's errors.
         """
         self.announce()
         deadline_s = time.monotonic() + LISTEN_S
@@ -82,7 +85,10 @@ class RigNode:
         self._serving = True
 
     def _foreign_node_state(self, message: can.Message) -> float | None:
-        """Return the state in another node's announcement, STARTING or 1 for serving; None for any other message."""
+        """Return the state in another node's announcement: STARTING, or 1 for serving.
+
+        Returns None for any other message, this node's own announcement included.
+        """
         if message.arbitration_id != self._announcement.identifier or not self._announcement.fits(message):
             return None
         _, serving, _, identity = self._announcement.unpack(message.data)
@@ -92,8 +98,9 @@ class RigNode:
         """Wait for a frame, advance the rig to the present time, and process the frame.
 
         The wait is at most IDLE_S, or RAMP_S while the outputs do not follow drive frames. A drive frame is applied, or
-        counted in `ignored`; a starting node receives an announcement. After `watchdog_ms` without an accepted drive
-        frame, a ramp to 0 V begins, counted in `parked` unless all outputs are at 0 V. Raises python-can's errors.
+        counted in `ignored`. The announcement of another node that starts is answered by this node's own. After
+        `watchdog_ms` without an accepted drive frame, outputs that followed drive frames begin a ramp to 0 V; the ramp
+        is counted in `parked` unless all outputs are at 0 V. Raises python-can's errors.
         """
         message = self._bus.recv(IDLE_S if self._following else RAMP_S)
         now_s = time.monotonic()
@@ -136,7 +143,7 @@ class RigNode:
     def _catch_up(self, now_s: float) -> None:
         """Advance the rig, and a ramp of its outputs, to the time `now_s` of `time.monotonic`.
 
-        From the end of a ramp to a drive frame's volts on, later frames set the outputs at once.
+        When a ramp has reached the volts of a drive frame, later drive frames set the outputs at once.
         """
         self._rig.advance_to(now_s - self._start_s)
         if not self._following:
@@ -152,11 +159,12 @@ def serve(
     is_stopped: Callable[[], bool],
     on_ready: Callable[[], None] = lambda: None,
 ) -> str:
-    """Run a node on the bus of the options until `is_stopped()`; return a sentence with its counts.
+    """Run a node on the bus of the options until `is_stopped()`; return a sentence with the numbers of samples, ignored
+    frames and parkings.
 
-    `on_ready` is called when no other node has answered. Raises ValueError for an unknown interface, if rig, axes and
-    DBC do not fit together, and for a DBC without the frame Node; DriverError if the bus cannot be opened or fails, and
-    for another node on it.
+    `on_ready` is called after LISTEN_S without another node on the bus. Raises ValueError for an interface that
+    python-can lacks, if rig, axes and DBC file do not fit together, and for a DBC file without the frame Node;
+    DriverError if the bus cannot be opened or fails, and for another node on the bus.
     """
     require_interface(options)
     with open_bus(options) as bus:

@@ -32,7 +32,10 @@ class BusOptions(Options):
     def _check_rates(self) -> Self:
         """Raise ValueError for a `data_bitrate` without `fd`, and for one below `bitrate`."""
         if self.data_bitrate is not None and not self.fd:
-            raise ValueError(f"data_bitrate: {self.data_bitrate} bit/s; allowed with fd = true only")
+            raise ValueError(
+                f"data_bitrate: {self.data_bitrate} bit/s; allowed with fd = true only; set fd = true, or remove "
+                "data_bitrate"
+            )
         if self.data_bitrate is not None and self.data_bitrate < self.bitrate:
             raise ValueError(
                 f"data_bitrate: {self.data_bitrate} bit/s; allowed: at least bitrate = {self.bitrate} bit/s"
@@ -46,7 +49,7 @@ class BusOptions(Options):
 
     @property
     def switches_bitrate(self) -> bool:
-        """Whether the data phase has a bitrate other than the arbitration phase."""
+        """Whether the bitrates of data phase and arbitration phase differ."""
         return self.data_phase_bitrate != self.bitrate
 
     @property
@@ -56,7 +59,9 @@ class BusOptions(Options):
 
     @property
     def keywords(self) -> dict[str, Any]:
-        """Keyword arguments of `can.Bus`: interface, channel, bitrate, fd, with CAN FD data_bitrate, and `settings`."""
+        """Keyword arguments of `can.Bus`: interface, channel, bitrate, fd, data_bitrate (CAN FD only), and the entries
+        of `settings`, which replace others of the same name.
+        """
         rates: dict[str, int] = {"bitrate": self.bitrate, "fd": self.fd}
         if self.fd:
             rates["data_bitrate"] = self.data_phase_bitrate

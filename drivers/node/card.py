@@ -104,13 +104,13 @@ def make_card(
 
 
 def _scale_array(scales: tuple[Scale, ...]) -> npt.NDArray[np.void]:
-    """Return the scales as records SCALE (channels,), which have no safe value and no change per ms."""
+    """Return the scales as records SCALE (channels,), without their safe codes and largest changes."""
     rows = [(s.lowest, s.highest, s.volts_per_code, s.offset_v) for s in scales]
     return np.array(rows, SCALE)
 
 
 def crc_table() -> npt.NDArray[np.uint32]:
-    """Return the 256 values, uint32, by which CRC-32 takes a byte at a time (polynomial 0xEDB88320, bits reflected)."""
+    """Return the table (256,), uint32, to compute CRC-32 byte by byte (polynomial 0xEDB88320, bits reflected)."""
     table = np.arange(256, dtype=np.uint32)
     for _ in range(8):
         table = np.where(table & 1, np.uint32(0xEDB88320) ^ (table >> 1), table >> 1).astype(np.uint32)

@@ -25,7 +25,10 @@ from rtloop.drivers.node.options import NodeOptions, SerialOptions, UdpOptions
 RETRY_S, BUSY_S, CONFIRM_S = 0.05, 1.5, 0.02
 LONGEST_PARKING_S = 10.0
 OPENING_HOLD_US = 0xFFFFFFFF
-UNCONFIRMED = "the node does not confirm that its outputs are safe; only the node's watchdog can make them safe"
+UNCONFIRMED = (
+    "the node does not confirm that its outputs are at their safe values; they may carry voltage until the node's "
+    "watchdog parks them; check the amplifier"
+)
 TOLERANCE = 1e-6
 BITS_PER_BYTE = 10
 MEASURING_WAIT_S, ANY_LEVEL = 0.1, 1 << 40
@@ -48,7 +51,9 @@ class NodeDriver(Driver):
 
     @property
     def facts(self) -> Facts:
-        """Properties of the driver: the channels that the options describe, and the delay of the exchange."""
+        """Facts: the channels and ranges that the options describe, the delay of the exchange in ticks, and the largest
+        rate of the line.
+        """
         options = self._options
         analogue_inputs = [Channel(f"adc{i}", *options.input_range_v) for i in range(self._count(options.inputs))]
         outputs = [
@@ -64,7 +69,7 @@ class NodeDriver(Driver):
         )
 
     def _count(self, number: int | None) -> int:
-        """Return `number`; if it is None, the number of axes, at least 1."""
+        """Return `number`, an option's number of channels; if it is None, the number of axes, at least 1."""
         return number or max(len(self.wiring), 1)
 
     def _max_rate_hz(self, inputs: int, outputs: int) -> float:
@@ -81,11 +86,13 @@ class NodeDriver(Driver):
         return DriverError(f"{self._options.label}: {failure_text(failure)}") if failure else None
 
     def open(self) -> Pointers:
-        """Open the line, compare the node with the options, and begin a session; its outputs ramp to safe values.
+        """Open the line, compare the node with the options, and begin a session; the node's outputs ramp to their safe
+        values before the method returns.
 
         Raises DriverError, with the line closed, if no node answers within `wait_s`, if the node has other channels,
-        ranges or safe values, another version, or a largest rate below the loop's, if another controller drives it, if
-        its outputs do not become safe in time, and if the line fails.
+        ranges or safe values, another version, or a largest rate below the loop's, if a serial line is too slow for
+        the loop, if another controller drives the node, if its outputs do not reach their safe values in time, and if
+        the line fails.
         """
         self._link = open_link(self._options)
         try:
@@ -100,7 +107,7 @@ class NodeDriver(Driver):
     def _open_node(self, link: Link) -> Pointers:
         """Compare the node on an open line with the options, begin a session, and make the memory of the exchange.
 
-        Returns the pointers of `open`. Raises DriverError as `open`, and OSError if the line fails; closes no line.
+        Returns the pointers of `open`. Does not close the line. Raises OSError if the line fails, else as `open`.
         """
         options = self._options
         self._session = secrets.randbelow(frames.MAX_SESSION) + 1
@@ -121,11 +128,11 @@ class NodeDriver(Driver):
         return Pointers(self._card.ctypes.data, read, write)
 
     def measure_exchanges(self, count: int) -> Exchanges:
-        """Open the node, whose outputs ramp to safe values, measure `count` exchanges at the tick rate, and close it.
+        """Open the node, whose outputs ramp to their safe values, measure `count` exchanges, and close the node.
 
-        Whatever the option `answer`, an exchange waits for its answer for up to MEASURING_WAIT_S, and is counted as
-        lost without it. Raises DriverError as `open` and `close` do, and, after closing the node, if it ends the
-        session.
+        A pause of one tick's period comes before each exchange. Whatever the option `answer`, an exchange waits for its
+        answer for up to MEASURING_WAIT_S, and counts as lost without it. Raises DriverError as `open` and `close` do,
+        and, after closing the node, if the node ends the session.
         """
         pointers, durations_us, lost = self.open(), list[float](), 0
         try:
@@ -147,7 +154,7 @@ class NodeDriver(Driver):
 
     @property
     def _opened_card(self) -> npt.NDArray[np.void]:
-        """Memory of the open exchange. Raises DriverError if the driver is not open."""
+        """Record CARD of the open exchange, shape (1,). Raises DriverError if the driver is not open."""
         if self._card is None:
             raise DriverError(f"{self._options.label}: the driver is not open; call open() first")
         return self._card
@@ -155,8 +162,9 @@ class NodeDriver(Driver):
     def close(self) -> None:
         """End the session, wait until all outputs have their safe values, and close the line.
 
-        A node whose watchdog has ended the session has parked its outputs. If the driver is not open, do nothing.
-        Raises DriverError, with the line closed, if the node does not answer or the line fails.
+        A refusal by the node counts as success: the node has ended the session before, and parks its outputs itself. If
+        the driver is not open, do nothing. Raises DriverError, with the line closed, if the node does not answer, if
+        its ramp takes longer than LONGEST_PARKING_S, and if the line fails.
         """
         if self._link is None or self._card is None:
             return
@@ -178,7 +186,8 @@ class NodeDriver(Driver):
     def _greet(self, link: Link) -> Welcome:
         """Send a HELLO every RETRY_S until the node describes itself, and return its description.
 
-        Raises DriverError if none comes within `wait_s` or the node speaks another version, OSError if the line fails.
+        Raises DriverError if no description comes within `wait_s`, and if the node speaks another version of the
+        protocol; OSError if the line fails.
         """
         deadline_s, sequence = time.monotonic() + self._options.wait_s, 0
         while time.monotonic() < deadline_s:
@@ -189,13 +198,13 @@ class NodeDriver(Driver):
         command = "--serial" if isinstance(self._options, SerialOptions) else "--udp"
         raise DriverError(
             f"{self._options.label}: no node has answered within {self._options.wait_s:g} s; "
-            f"start a simulated node with `rtloop hil serve CONFIG {command}`"
+            f"switch the node on, or start a simulated node with `rtloop hil serve CONFIG {command}`"
         )
 
     def _await_welcome(self, link: Link, timeout_s: float) -> Welcome | None:
         """Return the node's description if it comes within `timeout_s`, else None.
 
-        Raises DriverError for a node of another version, OSError if the line fails.
+        Raises DriverError if the node speaks another version of the protocol, OSError if the line fails.
         """
         for header, data in _receive_for(link, timeout_s):
             if header.session != self._session:
@@ -251,13 +260,14 @@ class NodeDriver(Driver):
             )
 
     def _require_rate(self, link: Link, welcome: Welcome) -> None:
-        """Accept any line; a subclass whose line may be too slow for the rate measures it, and raises DriverError."""
+        """Do nothing: every line counts as fast enough. A subclass may measure its line, and raise DriverError."""
 
     def _begin_session(self, link: Link, welcome: Welcome) -> int:
-        """Send an OPEN every RETRY_S until the node is ready; return the sequence that it has answered.
+        """Send an OPEN every RETRY_S until the node is ready: it obeys this session, and its outputs are safe.
 
-        Raises DriverError if another loop drives the node for longer than BUSY_S, if the node refuses for another
-        reason, and if it is not ready within `wait_s`; OSError if the line fails.
+        Returns the sequence number of the OPEN that the node answered as ready. Raises DriverError if another loop
+        drives the node for longer than BUSY_S, if the node refuses for another reason, and if the node is not ready
+        within `wait_s`; OSError if the line fails.
         """
         safe = tuple(scale.safe for scale in welcome.outputs)
         start_s, sequence = time.monotonic(), 0
@@ -280,7 +290,8 @@ class NodeDriver(Driver):
     def _await_answer(self, link: Link, sequence: int, timeout_s: float) -> Sample | frames.Refusal | None:
         """Return the sample or refusal that answers this session's DRIVE `sequence`.
 
-        None if none comes within `timeout_s`, or if its content is malformed. Raises OSError if the line fails.
+        Returns None if no answer comes within `timeout_s`, or if its content is malformed. Raises OSError if the line
+        fails.
         """
         for header, data in _receive_for(link, timeout_s):
             if header.session != self._session or header.sequence != sequence:
@@ -292,10 +303,11 @@ class NodeDriver(Driver):
         return None
 
     def _park(self, link: Link, sequence: int) -> None:
-        """Send a PARK every CONFIRM_S until the node says that all outputs are safe, or refuses: the session has ended.
+        """Send a PARK every CONFIRM_S until the node says that all outputs are safe, or refuses: then its session has
+        ended before.
 
-        `sequence` is the number of the last frame sent. Raises DriverError if the node does not answer within `wait_s`,
-        or if its ramp takes longer than LONGEST_PARKING_S, and OSError if the line fails.
+        `sequence` is the number of the last frame sent. Raises DriverError if no answer comes for `wait_s`, or if the
+        node's ramp takes longer than LONGEST_PARKING_S; OSError if the line fails.
         """
         start_s, heard_s = time.monotonic(), time.monotonic()
         codes = tuple(self._arrays["safe"].tolist())
@@ -349,8 +361,8 @@ class SerialDriver(NodeDriver):
     def _require_rate(self, link: Link, welcome: Welcome) -> None:
         """Send HELLO to the node PROBES times, and measure the time to each answer; no output moves.
 
-        `welcome` is not used. Raises DriverError if fewer than half are answered, each within RETRY_S, or if the median
-        time is longer than a period of the loop; OSError if the line fails.
+        `welcome` is not used. Raises DriverError if the node answers fewer than half of them within RETRY_S each, or if
+        the median time is longer than a period of the loop; OSError if the line fails.
         """
         durations_s = []
         for sequence in range(1, self.PROBES + 1):
@@ -360,7 +372,8 @@ class SerialDriver(NodeDriver):
                 durations_s.append(time.monotonic() - start_s)
         if len(durations_s) < self.PROBES / 2:
             raise DriverError(
-                f"{self._options.label}: the node answered {len(durations_s)} of {self.PROBES} frames; check the line"
+                f"{self._options.label}: the node answered {len(durations_s)} of {self.PROBES} frames; "
+                "allowed: at least half; check the line"
             )
         median_s = float(np.median(durations_s))
         if median_s * self.rate_hz > 1:

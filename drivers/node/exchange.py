@@ -2,8 +2,9 @@
 
 A tick ends with DRIVE n. Its answer, SAMPLE n, is used in tick n + 1; with `waits`, a tick begins with a DRIVE without
 codes, and its answer is used in the same tick if it comes within `deadline_ns`. Two checks decide whether the loop can
-go on: a node that refuses, restarts or parks is a failure at once; missing answers raise a level as in LinuxCNC's
-driver hm2_eth, by 2 for a tick without its answer, down by 1 for one with it, and a failure from `error_limit` on.
+continue. A node that refuses, restarts or parks is a failure at once. Each tick without its answer raises an error
+level by 2, each tick with its answer lowers the level by 1, as in LinuxCNC's driver hm2_eth; the level `error_limit` is
+a failure.
 """
 
 from __future__ import annotations
@@ -49,11 +50,12 @@ OBSERVED_COUNT = len(COUNTS)
 
 @cfunc(SIGNATURE)
 def node_read(context, values):
-    """Fill `values` with the newest sample's volts, its age in µs, and the counts of OBSERVED.
+    """Fill `values` with the newest sample's volts, its age in µs, and the values of the signals OBSERVED.
 
-    With `waits`, first asks for a sample and waits for it, at most `deadline_ns`. Returns GOOD; HELD while the last
-    request is not answered: the values are the previous sample's, and after more than `hold_ticks` such ticks the age
-    is infinite; FAILED, with the reason in `failure`, once the exchange has ended.
+    The first call begins the session again. Each later call, with `waits`, asks for a sample and waits for it, at most
+    `deadline_ns`; without `waits`, it takes the frames that have come. Returns GOOD; HELD while the last request is not
+    answered: the values are the previous sample's, and after more than `hold_ticks` such ticks the age is infinite;
+    FAILED, with the reason in `failure`, once the exchange has ended.
     """
     card = carray(context, 1, CARD)[0]
     if card.running == 0:
@@ -82,7 +84,8 @@ def node_read(context, values):
 
 @cfunc(SIGNATURE)
 def node_write(context, values):
-    """Send the codes nearest to the volts of every output, clipped to the node's ranges.
+    """Send the codes nearest to the volts of every analogue output, clipped to the node's ranges, and a bit for every
+    digital output: 1 from THRESHOLD_V on.
 
     Returns GOOD, also for a frame that the system does not take; FAILED for NaN in any output: no frame is sent, and
     the exchange has ended.
@@ -135,7 +138,7 @@ def _send_drive(card, flags):
 
 @jit
 def checksum(card, address, length):
-    """Return CRC-32 of `length` bytes at an address."""
+    """Return the CRC-32 of the `length` bytes at `address`, with the table of `card`."""
     table = carray(address_pointer(card.crc_table), 256, np.uint32)
     data = carray(address_pointer(address), length, np.uint8)
     value = np.uint32(0xFFFFFFFF)
@@ -146,10 +149,10 @@ def checksum(card, address, length):
 
 @jit_rare
 def _open_again(card):
-    """Begin the session once more, as much time may have passed since the driver was opened; wait for the answer.
+    """Begin the session once more, because much time may have passed since the driver was opened; wait for the answer.
 
-    The outputs are at their safe values, and the codes of an OPEN are not applied. Sets `failure` without an answer,
-    and all counts to 0.
+    The outputs stay at their safe values: the node does not apply the codes of an OPEN. Sets all counts to 0, and
+    `failure` if no answer comes within OPEN_TRIES times OPEN_WAIT_NS.
     """
     while receive_frame(card) > GONE:
         pass  # Frames from before the first tick are old.
@@ -177,9 +180,9 @@ def _await_answer(card, duration_ns):
 
 @jit
 def _receive_newest(card):
-    """Receive frames until the last request is answered or none is there, at most MAX_FRAMES_PER_TICK.
+    """Receive frames until the last request is answered or no frame is left, at most MAX_FRAMES_PER_TICK.
 
-    What came behind that answer, such as its double, waits for the next tick.
+    Frames that came after that answer, such as a duplicate, wait for the next tick.
     """
     for _ in range(MAX_FRAMES_PER_TICK):
         if not _receive_one(card) or card.newest == card.sequence:
@@ -214,7 +217,7 @@ def _receive_one(card):
 
 @jit
 def _is_whole(card, length):
-    """Whether the bytes received are a SAMPLE with the node's number of inputs or a REFUSAL, with a correct check."""
+    """Whether the bytes received are a SAMPLE with the node's number of inputs or a REFUSAL, with a correct CRC-32."""
     frame = carray(address_pointer(card.received), 1, SAMPLE)[0]
     if length < REFUSAL_BYTES or frame.magic != MAGIC or frame.batches != BATCHES:
         return False
@@ -229,10 +232,11 @@ def _is_whole(card, length):
 
 @jit
 def _take_sample(card):
-    """Copy the sample received if it is newer than all earlier ones; else count it as reordered, duplicated, invalid.
+    """Copy the sample received if it is newer than all earlier ones; else count it as reordered, duplicated or invalid.
 
-    Requests that a newer sample skips count as lost, until their answers come late. A code outside its channel's range
-    makes the sample invalid. A newer sample of a node that is not ready is not copied, and sets `failure` in a run.
+    Requests that a newer sample skips count as lost, until their answers come late. A late answer to a request from
+    before the first tick is not counted. A code outside its channel's range makes the sample invalid. A newer sample of
+    a node that is not ready is not copied; from the first tick on it sets `failure`.
     """
     frame = carray(address_pointer(card.received), 1, SAMPLE)[0]
     received = carray(address_pointer(card.received + SAMPLE_HEAD), card.inputs, np.int32)

@@ -138,7 +138,7 @@ def _frame(format_number: int, sequence: int, session: int, content: bytes) -> b
 
 
 def hello(sequence: int, session: int) -> bytes:
-    """Return the bytes of a HELLO, with which the loop, which speaks VERSION, asks a node for its description."""
+    """Return the bytes of a HELLO, the loop's request for a node's description; it contains the loop's VERSION."""
     return _frame(HELLO, sequence, session, _HELLO.pack(VERSION, 0))
 
 
@@ -183,12 +183,12 @@ def read_header(data: bytes) -> Header | None:
 
 
 def read_hello(data: bytes) -> int | None:
-    """Return the protocol version of a HELLO whose header was read; None for another length."""
+    """Return the protocol version in a HELLO that `read_header` has accepted; None for a wrong length."""
     return _HELLO.unpack_from(data, _HEADER.size)[0] if len(data) == _HEADER.size + _HELLO.size + CRC_BYTES else None
 
 
 def read_welcome(data: bytes) -> Welcome | None:
-    """Return the content of a WELCOME whose header was read; None for a length that does not fit its counts."""
+    """Return the content of a WELCOME that `read_header` has accepted; None if its length does not fit its counts."""
     start = _HEADER.size + _WELCOME.size
     if len(data) < start:
         return None
@@ -205,7 +205,7 @@ def read_welcome(data: bytes) -> Welcome | None:
 
 
 def read_drive(data: bytes) -> Drive | None:
-    """Return the content of a DRIVE whose header was read; None for a length that does not fit its count."""
+    """Return the content of a DRIVE that `read_header` has accepted; None if its length does not fit its count."""
     start = _HEADER.size + _DRIVE.size
     if len(data) < start:
         return None
@@ -216,7 +216,7 @@ def read_drive(data: bytes) -> Drive | None:
 
 
 def read_sample(data: bytes) -> Sample | None:
-    """Return the content of a SAMPLE whose header was read; None for a length that does not fit its count."""
+    """Return the content of a SAMPLE that `read_header` has accepted; None if its length does not fit its count."""
     start = _HEADER.size + _SAMPLE.size
     if len(data) < start:
         return None
@@ -227,7 +227,7 @@ def read_sample(data: bytes) -> Sample | None:
 
 
 def read_refusal(data: bytes) -> Refusal | None:
-    """Return the content of a REFUSAL whose header was read; None for another length."""
+    """Return the content of a REFUSAL that `read_header` has accepted; None for a wrong length."""
     if len(data) != REFUSAL_BYTES:
         return None
     boot, reason, version, _ = _REFUSAL.unpack_from(data, _HEADER.size)
@@ -241,7 +241,7 @@ def _pack_codes(codes: Sequence[int]) -> bytes:
 
 
 def _unpack_codes(data: bytes, start: int, count: int) -> tuple[int, ...] | None:
-    """Return `count` codes from byte `start` on; None if the frame does not end with its check right behind them."""
+    """Return `count` codes from byte `start` of a frame on; None unless only the frame's CRC-32 follows them."""
     if len(data) != start + 4 * count + CRC_BYTES:
         return None
     return struct.unpack_from(f"<{count}i", data, start)

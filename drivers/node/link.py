@@ -96,7 +96,7 @@ class UdpLink(Link):
             shared.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 0)
 
     def _connect(self) -> None:
-        """Connect the first socket to the node, and discard what it has received from others.
+        """Connect the first socket to the node, and discard the datagrams that others have sent to it.
 
         Raises OSError if the system refuses.
         """
@@ -137,7 +137,7 @@ class SerialLink(Link):
     """A serial line to a node, for this process alone."""
 
     def __init__(self, options: SerialOptions) -> None:
-        """Open the terminal for raw bytes and discard received ones; a missing terminal may come within `wait_s`.
+        """Wait up to `wait_s` for the terminal to exist, open it for raw bytes and discard the bytes received.
 
         Raises DriverError if it cannot be opened, is no terminal, or is locked by another program, and for a `baud`
         that the system does not know.
@@ -164,7 +164,7 @@ class SerialLink(Link):
         self._reader = FrameReader()
 
     def send(self, frame: bytes) -> None:
-        """Send a frame in COBS's code; bytes that the line does not take are lost, and with them the frame.
+        """Send a frame encoded in COBS. If the line does not take all bytes now, the frame is lost.
 
         Raises OSError if the line is gone.
         """

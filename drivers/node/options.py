@@ -51,8 +51,8 @@ class NodeOptions(RigOptions):
 
     @model_validator(mode="after")
     def _check_ranges(self) -> Self:
-        """Require the lower end of each range before the higher, `safe_v` within `output_range_v`, and no more than
-        MAX_CHANNELS inputs and outputs in all.
+        """Raise ValueError for a range whose lower end is not before its higher, for `safe_v` outside `output_range_v`,
+        and for more than MAX_CHANNELS inputs and outputs together, where a number that is None counts as 1.
         """
         require_ranges(self.input_range_v, self.output_range_v, self.safe_v)
         if (self.inputs or 1) + (self.outputs or 1) > MAX_CHANNELS:

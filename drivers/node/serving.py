@@ -97,8 +97,8 @@ class TerminalPort(Port):
             close_descriptor(self._fd)
             close_descriptor(self._end)
             raise DriverError(
-                f"{options.label}: {error.strerror}; allowed: a path at which no file exists, in a folder that you may "
-                "write to"
+                f"{options.label}: {error.strerror}; allowed for driver.device: a path at which no file exists, in a "
+                "folder that you may write to"
             ) from None
 
     def receive(self, timeout_s: float) -> tuple[bytes, Hashable] | None:
@@ -139,14 +139,14 @@ def open_port(options: NodeOptions) -> Iterator[Port]:
 
 
 def _serial(options: NodeOptions) -> SerialOptions:
-    """Return the options of a serial line. Raises TypeError for others."""
+    """Return `options` if they describe a serial line. Raises TypeError for other options."""
     if isinstance(options, SerialOptions):
         return options
     raise TypeError(f"options: the type is {type(options).__name__}; allowed: UdpOptions, SerialOptions")
 
 
 def step(node: SimulatedNode, port: Port, start_s: float) -> None:
-    """Wait for a frame, at most IDLE_S, or RAMP_S in a ramp; advance the node to the present time and answer the frame.
+    """Wait for a frame, at most IDLE_S, or RAMP_S during a ramp; advance the node to the present time; send its answer.
 
     `start_s` is the time of `time.monotonic` at which the node started.
     """
@@ -164,7 +164,8 @@ def serve(
     is_stopped: Callable[[], bool],
     on_ready: Callable[[], None] = lambda: None,
 ) -> str:
-    """Be a node on the options' line until `is_stopped()`; return a sentence with its counts.
+    """Run a simulated node on the options' line until `is_stopped()`; return a sentence with the numbers of samples,
+    refused and ignored frames, and parkings.
 
     `on_ready` is called when the line is open. Raises ValueError if rig and axes do not fit together, DriverError if
     the line cannot be opened.

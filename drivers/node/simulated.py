@@ -30,9 +30,10 @@ class SimulatedNode:
     """
 
     def __init__(self, options: NodeOptions, axes: Sequence[str], boot: int | None = None) -> None:
-        """Build the rig at rest, its outputs at their safe values, and compile it; `boot` is drawn if it is None.
+        """Build the rig at rest, with the outputs at their safe values, and compile it.
 
-        Raises ValueError if rig and axes do not fit together.
+        `boot` is the number of this start in the node's frames; None for a random one. Raises ValueError if rig and
+        axes do not fit together.
         """
         self.boot = secrets.randbits(32) if boot is None else boot
         self._rig = FreeRunningRig(options, axes, RIG_RATE_HZ)
@@ -64,7 +65,7 @@ class SimulatedNode:
     def poll(self, now_us: float) -> None:
         """Advance the rig to `now_us` since its start, and the outputs' ramp by a step if one is due.
 
-        A session without a DRIVE for its hold time is ended first, and the outputs begin to ramp to their safe codes.
+        A session without a DRIVE for its hold time ends, and the outputs begin to ramp to their safe codes.
         """
         self._rig.advance_to(now_us / US_PER_S)
         if self._session and now_us - self._heard_us >= self._hold_us:
@@ -113,7 +114,7 @@ class SimulatedNode:
     def _lack_of_access(self, content: Drive, sender: Hashable) -> int:
         """Return the reason, a key of REFUSALS, for which `sender` may not drive the node now; 0 if it may.
 
-        Judged by session, flags and address alone.
+        Only the DRIVE's session and flags and the address of `sender` decide.
         """
         if self._session:
             return 0 if (content.session, sender) == (self._session, self._sender) else frames.BUSY
@@ -203,7 +204,7 @@ class SimulatedNode:
 
 
 def _scale(range_v: tuple[float, float], safe_v: float | None, change_v: float) -> Scale:
-    """Return a channel of CODE_BITS bits over a range in V; `change_v` is its change in 1 ms of a ramp.
+    """Return the Scale of a channel of CODE_BITS bits over a range in V; `change_v` is its change in 1 ms of a ramp.
 
     `safe_v` is None for an input, whose safe code and change are 0.
     """

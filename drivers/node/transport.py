@@ -106,9 +106,9 @@ def take_strangers(card, largest):
 
 @jit_rare
 def encode_cobs(card, length):
-    """Code the frame at `card.sent` into `card.coded`, with the byte 0 at its end; return the coded length.
+    """Encode the `length` bytes of the frame at `card.sent` in COBS, to `card.coded`, with the byte 0 at the end.
 
-    The shortest frame has more than one byte, and ROOM_BYTES has room for each frame's code.
+    Returns the encoded length. ROOM_BYTES suffice for every frame, and every frame has more than one byte.
     """
     plain = carray(address_pointer(card.sent), ROOM_BYTES, np.uint8)
     coded = carray(address_pointer(card.coded), ROOM_BYTES, np.uint8)
@@ -129,9 +129,10 @@ def encode_cobs(card, length):
 
 @jit_rare
 def _receive_line(card):
-    """Return the length of the next whole frame of a serial line; see `receive_frame`.
+    """Decode the next whole frame of a serial line to `card.received`; return its length, EMPTY, BROKEN or GONE.
 
-    The bytes of a frame's beginning wait for the rest. A frame that is too long is BROKEN, up to the next byte 0.
+    The beginning of an incomplete frame waits for the rest: EMPTY. All bytes of a frame that is too long, up to the
+    next byte 0, give one BROKEN. The serial line has ended: GONE.
     """
     raw = carray(address_pointer(card.raw), RAW_BYTES, np.uint8)
     partial = carray(address_pointer(card.partial), ROOM_BYTES, np.uint8)

@@ -23,8 +23,8 @@ STATE = [("disturbance_um", "f8"), ("disturbance_wait", "i8"), ("sine_um", "f8")
 def discretise(step_um: float, sine_um: float, sine_hz: float, period_s: float) -> dict[str, object]:
     """Return the values of COEFFICIENTS by name.
 
-    The amplitude `sine_um` is not among them, but the initial `cosine_um` of STATE; unless it is 0, ValueError is
-    raised for a `sine_hz` of half the sampling rate or more.
+    The amplitude `sine_um` is no coefficient: it is the initial value of `cosine_um` in STATE, which the caller sets.
+    Raises ValueError for a `sine_hz` of half the sampling rate or more, unless `sine_um` is 0.
     """
     if sine_um and sine_hz >= 0.5 / period_s:
         raise ValueError(f"sine_hz: {sine_hz:g} Hz; allowed: less than {0.5 / period_s:g} Hz, half the rate")

@@ -19,9 +19,9 @@ STATE = [("fault_wait", "i8"), ("fault_reading_v", "f8")]
 def change_reading(coefficients, state, reading_v):
     """Return the reading [V] that the controller gets in place of `reading_v`.
 
-    Until the fault begins, and with a lost drive, it is `reading_v`; then the last reading before the fault if the
-    sensor is stuck, 0 V if it is lost. Each call before the fault stores `reading_v` in `state`; time is counted by
-    `change_drive`.
+    Until the fault begins, it is `reading_v`. Then it is the last reading before the fault if the sensor is stuck, 0 V
+    if the sensor is lost, and still `reading_v` for a lost drive or no fault. Each call before the fault stores
+    `reading_v` in `state`; `change_drive` counts the time.
     """
     if state.fault_wait > 0:
         state.fault_reading_v = reading_v

@@ -29,7 +29,8 @@ _DEVIATION = float(np.sqrt(2.0**32 - 1.0))
 def seed_word(seed: int, stream: str) -> int:
     """Return the first state of the stream named `stream`, never 0 (where xorshift would stay).
 
-    The streams of a seed start far apart on one cycle of length 2⁶⁴ − 1. A stream depends on seed and name only.
+    A stream depends on seed and name only. The streams of a seed start at pseudo-random places (SHA-256) of one cycle
+    of length 2⁶⁴ − 1, so in all likelihood far apart.
     """
     digest = hashlib.sha256(f"{seed}/{stream}".encode()).digest()
     return int.from_bytes(digest[:8], "little") or 1
@@ -45,7 +46,7 @@ def next_word(word):
 
 @jit
 def draw_normal(word):
-    """Return a random number of mean 0 and variance 1, and the generator's state after the state `word`, a uint64."""
+    """Return a random number of mean 0 and variance 1, and the generator's state three steps after `word`, a uint64."""
     lanes = _ZERO
     for _ in range(3):
         word = next_word(word)

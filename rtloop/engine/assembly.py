@@ -44,7 +44,7 @@ def law_at_rest(plan: Plan) -> LawMemory:
 
 @python_entry("int64(intp, int64)")
 def _set_initial_mode(law_address, mode):
-    """Set the first mode of the law at an address. Returns 0."""
+    """Set the mode of the LAW record at an address before its first tick. Returns 0."""
     set_mode(carray(address_pointer(law_address), 1, LAW)[0], mode, True)
     return 0
 
@@ -55,7 +55,7 @@ class Assembly:
     def __init__(
         self, plan: Plan, block: SharedBlock, facts: Facts, pointers: Pointers, clock: Clock, law: LawMemory
     ) -> None:
-        """Fill in the context from the plan, and write the plan's table and the drives at rest to `block`.
+        """Fill in the loop's context from the plan, and write the plan's table and the drives at rest to `block`.
 
         No tick is run. Raises ValueError for a channel that the driver lacks.
         """
@@ -80,7 +80,9 @@ class Assembly:
 
     @property
     def outputs_v(self) -> Real:
-        """Values of the outputs in V after the last successful write, before one those at rest: a copy (outputs,)."""
+        """Copy of the driver's outputs in V, (outputs,): the axes' drives of the last successful write, and the other
+        outputs as the last tick computed them. Before the first tick: drives at rest, safe values.
+        """
         outputs_v = self._arrays["outputs"].copy()
         outputs_v[self._arrays["output_index"]] = self._arrays["last_drive_v"]
         return outputs_v
@@ -98,7 +100,8 @@ class Assembly:
         self._loops[name] = array.ctypes.data
 
     def _wire_channels(self, plan: Plan, facts: Facts) -> None:
-        """Create the buffers and set the channels of axes, extra inputs and outputs, enable and hold input.
+        """Create the buffers of a tick, and set the indices of the channels of axes, extra inputs and outputs, enable
+        switch and hold input.
 
         Raises ValueError for a channel that the driver lacks.
         """

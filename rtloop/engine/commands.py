@@ -51,7 +51,8 @@ class QueueFull(RtloopError):
 def send(block: SharedBlock, command: np.ndarray, urgent: bool = False) -> int:
     """Put one MESSAGE record (1,) into the queue and return its position; only one process may call this.
 
-    Raises QueueFull if COMMAND_SLOTS commands wait for the loop; for `urgent` ones, if all slots are in use.
+    Raises QueueFull if COMMAND_SLOTS commands wait for the loop; for an `urgent` command, if URGENT_SLOTS more than
+    these wait.
     """
     head, tail = block.load(Word.COMMANDS_HEAD), block.load(Word.COMMANDS_TAIL)
     slots = block["commands"]
@@ -64,9 +65,9 @@ def send(block: SharedBlock, command: np.ndarray, urgent: bool = False) -> int:
 
 
 def withdraw(block: SharedBlock, position: int) -> bool:
-    """Withdraw the command at `position`, which `send` returned.
+    """Withdraw the command at `position`, which `send` returned; return True.
 
-    Returns False if the loop has claimed it, or it was withdrawn before.
+    Returns False, without effect, if the loop has claimed the command, or it was withdrawn before.
     """
     return bool(exchanged_word(_mark(block, position), position + 1, int(GONE)))
 
@@ -104,10 +105,7 @@ def _apply_schedule(loop):
 
 @jit_rare_checked
 def _apply_queue(loop):
-    """Take at most COMMANDS_PER_TICK commands from the queue, and apply those that were not withdrawn.
-
-    A command that is refused has an event.
-    """
+    """Take at most COMMANDS_PER_TICK commands from the queue, and apply each one that was not withdrawn."""
     words, queue = control_words(loop), message_array(loop.commands, loop.command_count)
     marks = word_array(loop.commands_marks, loop.command_count)
     tail = words[TAIL]
@@ -197,9 +195,8 @@ def _set_reference(loop, command):
 def _load_law(loop, first, is_new_controller):
     """Activate the staged coefficients of axis `first` and of the axes that share its controller, and order a snapshot.
 
-    Returns False, without a change, for an axis that does not exist, counts that do not fit their records, or another
-    number of axes of the controller. A new controller continues from the applied command (µm), a first pre-filter from
-    the reference in force.
+    Returns False, without a change, for an axis that does not exist, for counts that do not fit their records, and for
+    a controller with another number of axes than before. A new controller continues from the applied command (µm).
     """
     law = law_record(loop)
     size = law.coefficients_bytes
@@ -225,8 +222,8 @@ def _load_law(loop, first, is_new_controller):
 def _load_axis(law, a, staged):
     """Activate the coefficients of one axis from address `staged`.
 
-    The pre-filter continues with new taps; it restarts with the next reference if its sections change or it had no
-    taps.
+    The axis's pre-filter continues with its history if only its taps change. If its sections change, or it had no taps
+    and gets some, it restarts, filled with the next reference.
     """
     before, after = coefficients_record(law, a), carray(address_pointer(staged), 1, COEFFICIENTS)[0]
     needs_refill = (before.tap_count == 0 and after.tap_count != 0) or before.section_count != after.section_count

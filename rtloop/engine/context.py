@@ -80,7 +80,9 @@ def law_record(loop):
 
 @jit
 def tick_conditions(loop):
-    """Return the CONDITIONS record: facts besides the inputs that the interlocks evaluate in this tick."""
+    """Return the CONDITIONS record of this tick, which the interlocks evaluate: status of the read, lost heartbeat,
+    sample age, lateness, enable voltage.
+    """
     return carray(address_pointer(loop.conditions), 1, CONDITIONS)[0]
 
 

@@ -44,11 +44,11 @@ class LoopsInProcess:
     def run(self, plan: Plan, driver: Driver, ticks: int, consume: Callable[[int, Real], None]) -> int:
         """Run `ticks` of a plan on a driver, which is not open yet; return the number of ticks that ran.
 
-        `consume` is called for each full ring of ticks, and at the end, with the number of the first tick and the
-        records, (n, columns) in the order of `plan.columns`; they are overwritten afterwards. At the end the driver is
-        closed, but not after an error. Raises ValueError for a law that cannot be compiled, for a channel that the
+        `consume` is called for each full ring of ticks, and at the end for the rest, with the number of the first tick
+        and the records, (n, columns) in the order of `plan.columns`; later ticks overwrite them. At the end the driver
+        is closed, but not after an error. Raises ValueError for a law that cannot be compiled, for a channel that the
         driver lacks and for a clock that `virtual_clock` refuses, DriverError if the driver cannot be opened or closed,
-        and what `consume` raises.
+        and the errors of `consume`.
         """
         block = self._empty_block(plan.sizes._replace(rate_hz=SMALLEST_RING_RATE_HZ))
         ring, facts, pointers = block.ring("ticks"), driver.facts, driver.open()
@@ -65,10 +65,10 @@ class LoopsInProcess:
         return int(assembly.loop.tick)
 
     def _law_memory(self, plan: Plan) -> LawMemory:
-        """Return the memory of the plan's laws at rest: the present one, restored, or a new one.
+        """Return the memory of the plan's laws at rest: the stored one, restored, or a new one, which is then stored.
 
-        The present one fits plans that share mode, laws and the array of coefficients with the plan that it was made
-        for. Raises ValueError as `law_at_rest`.
+        The stored one fits plans with the mode, laws, extras and the same array of coefficients as the plan for which
+        it was made. Raises ValueError as `law_at_rest`.
         """
         key = plan.mode, plan.laws, plan.extras, id(plan.coefficients)
         if self._law is None or self._law.key != key:
@@ -78,9 +78,9 @@ class LoopsInProcess:
         return self._law.memory
 
     def _empty_block(self, sizes: Sizes) -> SharedBlock:
-        """Return a block of these sizes in which nothing was published: an earlier one, emptied, or a new one.
+        """Return an empty block of these sizes: one of an earlier call, emptied, or a new one.
 
-        The BLOCKS_KEPT sizes that were used first are kept.
+        Blocks of the first BLOCKS_KEPT different sizes are kept for later calls.
         """
         if sizes in self._blocks:
             self._blocks[sizes].clear()
@@ -92,7 +92,7 @@ class LoopsInProcess:
 
 
 def run_in_process(plan: Plan, driver: Driver, ticks: int) -> Real:
-    """Run `ticks` of a plan on a driver, which is not open yet and is closed at the end, unless an error is raised.
+    """Run `ticks` ticks of a plan on a driver, which is not open yet and is closed at the end, but not after an error.
 
     Returns all recorded columns (ticks, columns) in the order of `plan.columns`; fewer rows if the loop ends earlier.
     Raises the errors of `LoopsInProcess.run`.

@@ -62,7 +62,7 @@ def encode_request(pacing: Pacing, ticks: int) -> bytes:
 def decode_results(output: bytes) -> tuple[dict[str, Any], npt.NDArray[np.float64], npt.NDArray[np.float64]]:
     """Return, from the output of the process, the result of `prepare_realtime`, lateness in µs and missed periods.
 
-    Raises ValueError for an output that is incomplete.
+    Raises ValueError for an output without a line of JSON or without two arrays of equal length.
     """
     line, _, data = output.partition(b"\n")
     lateness_us, missed = np.frombuffer(data).reshape(2, -1)

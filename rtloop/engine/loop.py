@@ -76,7 +76,8 @@ class Outcome(IntEnum):
     HEARTBEAT_LOST = 3
     """The outputs are safe after the supervisor's heartbeat stopped."""
     LAW_FAILED = 4
-    """A count or an index was beyond its array; the outputs are as the last tick wrote them."""
+    """A count or an index was beyond its array, or an axis had no controller or several; the outputs are as the last
+    tick wrote them."""
 
 
 READ_FAILED, WRITE_FAILED = 1, 2
@@ -103,8 +104,8 @@ def run_ticks(loop_address, until_tick):
 
     DONE leaves the outputs as they are: a later call continues. A stop, a failed driver and a lost heartbeat ramp the
     outputs down first; GIVE_UP_S of refused writes end the ramp. A failure of the clock and LAW_FAILED end the run at
-    once, without a ramp: the caller brings the outputs down. LAW_FAILED is a count beyond its record or an index beyond
-    its array; the law's memory is then unreliable.
+    once, without a ramp: the caller brings the outputs down. LAW_FAILED means that a count is beyond its record, an
+    index beyond its array, or that an axis has no controller or several; the law's memory is then unreliable.
     """
     loop, outcome = loop_record(loop_address), BROKEN
     try:
@@ -124,9 +125,9 @@ def run_ticks(loop_address, until_tick):
 @jit
 def _run_ticks(loop, until_tick):
     """Execute ticks; return DONE once ticks 0 … `until_tick` − 1 were executed, another Outcome once a run that must
-    end has safe outputs.
+    end has safe outputs or has given them up.
 
-    A clock that ends the run is FAILURE at once.
+    Returns FAILURE at once if the clock ends the run.
     """
     while loop.tick < until_tick:
         _prepare_tick(loop)
@@ -149,8 +150,9 @@ def _run_ticks(loop, until_tick):
 def _prepare_tick(loop):
     """Do the work before a tick's deadline: apply due commands to the loop, begin a stop, publish a snapshot.
 
-    A stop, which ramps the outputs down, begins if one is requested or the last write failed. The snapshot is due once
-    a second, and after new coefficients; with it, an episode of late ticks ends after a second without a missed period.
+    A stop, which ramps the outputs down, begins if a stop is requested, or if the driver's first failure was a write.
+    The snapshot is due once a second, and after new coefficients. With the snapshot, an episode of late ticks ends if
+    no period was missed for a second.
     """
     apply_commands(loop)
     failing = loop.failed == WRITE_FAILED  # the next write may succeed: the ramp is tried
@@ -237,7 +239,10 @@ def _record_outputs(loop, write_status):
 
 @jit_rare
 def _hold_outputs(loop):
-    """Let the law continue from the last drives after a failed write; after GIVE_UP_S the outputs count as settled."""
+    """Let the law continue from the last successfully written drives after a failed write.
+
+    The outputs count as settled only after more than GIVE_UP_S of successive failed writes.
+    """
     law, last_drive_v = law_record(loop), float_array(loop.last_drive_v, loop.axis_count)
     loop.refused += 1
     loop_state(law).settled = 1 if loop.refused * loop.period_s > GIVE_UP_S else 0
@@ -370,7 +375,9 @@ def _publish_events(loop, status, write_status, missed):
 
 @jit_rare
 def _publish_trip(loop, causes):
-    """Publish the event of a trip: all new causes, and the first one of the first axis with its value and limit."""
+    """Publish the event of a trip: all new causes, then the first cause of the first axis with its value, its limit and
+    the number of its law.
+    """
     trip = trip_record(law_record(loop))
     values = (float(causes), trip.value, trip.limit, float(trip.cause), float(trip.law))
     publish_event(loop, TRIPPED, trip.axis, LOOP_ORIGIN, 0, values)
@@ -392,7 +399,7 @@ def _record_lateness(loop, missed):
 
 @jit_rare
 def _end_late_episode(loop):
-    """Publish the totals of an episode of more than one late tick, and clear them."""
+    """Publish the totals of an episode of late ticks if it had more than one, and set them to 0 in any case."""
     if loop.late_ticks > 1:
         values = (float(loop.late_periods), float(loop.late_ticks), float(loop.late_largest))
         publish_event(loop, LATENESS_OVER, ALL_AXES, LOOP_ORIGIN, 0, values)

@@ -129,7 +129,7 @@ class SharedBlock:
     def reserve() -> int:
         """Return the descriptor of a new anonymous file, empty, for a later block.
 
-        It is closed on exec: a child process gets it by `pass_fds` alone, also before the block exists.
+        The descriptor is closed on exec: a child process inherits it by `pass_fds` alone, also before the block exists.
         """
         return os.memfd_create("rtloop")
 
@@ -175,7 +175,7 @@ class SharedBlock:
         return block
 
     def clear(self) -> None:
-        """Empty a block that no other process uses; slots keep their bytes, which heads and marks then guard."""
+        """Set a block that no other process uses to 0, except the slots of its rings, which then count as unwritten."""
         for name, array in self._arrays.items():
             if not name.endswith("_slots"):
                 array.view(np.uint8)[...] = 0
@@ -206,7 +206,8 @@ class SharedBlock:
         self["fault"][len(data) :] = 0
 
     def claim(self) -> None:
-        """Mark the calling process as the driving process for as long as it lives, and store its number in LOOP_PID.
+        """Mark the calling process, for as long as it lives, as the one that drives the outputs; store its number in
+        LOOP_PID.
 
         Waits while another process has the claim. The kernel drops the claim with the first descriptor of the file that
         the process closes: keep the block.

@@ -89,19 +89,24 @@ class Plan:
 
     @property
     def columns(self) -> tuple[str, ...]:
-        """Names of the values of a tick's record, in their order in it."""
+        """Names of the values in a tick's record, in the order of the record."""
         return column_names(self.axes, self.observed, self.extras.columns)
 
     @property
     def sizes(self) -> Sizes:
-        """Dimensions of the shared block: columns, axes, rate, bytes of a snapshot, samples with `spare_samples`."""
+        """Dimensions of the shared block: columns, axes, rate, bytes of a snapshot, samples of `table` plus
+        `spare_samples`.
+        """
         axes = len(self.axes)
         samples = self.table.size + self.spare_samples
         return Sizes(len(self.columns), axes, self.pacing.rate_hz, self.layout.snapshot_bytes(axes), samples)
 
     @property
     def trip_slew_v_per_s(self) -> float:
-        """Slew rate of the ramp after a trip or stop and of parking, in V/s: the lowest of all axes."""
+        """Slew rate in V/s of ramps outside the loop (before and after its ticks, parking): the lowest of all axes.
+
+        In the loop, after a trip or stop, each axis ramps with its own slew rate.
+        """
         return float(np.min(self.coefficients["trip_slew_v_per_tick"])) * self.pacing.rate_hz
 
     def driver(self) -> Driver:
@@ -117,7 +122,7 @@ class Plan:
 def require_facts(driver: Driver, rate_hz: float, paced: bool) -> Facts:
     """Return the driver's facts.
 
-    Raises ValueError for a rate above its limit, and for virtual time (`paced` False) on real hardware.
+    Raises ValueError for a rate above their `max_rate_hz`, and for virtual time (`paced` False) on real hardware.
     """
     facts = driver.facts
     if rate_hz > facts.max_rate_hz:

@@ -45,10 +45,9 @@ GO_POLL_S = 0.001
 
 
 def report(kind: str, **facts: object) -> None:
-    """Write one line of JSON, {"report": `kind`, and the `facts`}, to stdout; nothing happens if the supervisor has
-    ended.
+    """Write one line of JSON, {"report": `kind`, and the `facts`}, to stdout.
 
-    It is unbuffered, so that no write can fail at the exit.
+    Has no effect if the supervisor has ended. The line is not buffered, so that no write can fail at the exit.
     """
     with contextlib.suppress(BrokenPipeError):
         os.write(STDOUT, json.dumps({"report": kind, **facts}).encode() + b"\n")
@@ -116,7 +115,7 @@ def _make_driver(plan: Plan) -> tuple[Driver, Facts]:
 
 
 def _open_driver(driver: Driver) -> Pointers:
-    """Open the driver and return its pointers. Raises DriverError, also for any exception of a third party's driver."""
+    """Open the driver and return its pointers. Raises DriverError, also in place of any other exception of `open`."""
     try:
         return driver.open()
     except DriverError:
@@ -128,9 +127,9 @@ def _open_driver(driver: Driver) -> Pointers:
 def _run_plan(plan: Plan, block: SharedBlock, driver: Driver, facts: Facts) -> Outcome:
     """Open the driver, ramp to safe, wait for GO, run all ticks, ramp down; return why the run ended.
 
-    A stop, or a lost heartbeat, before GO ends it without a tick. Raises HostRefusal if real time is required and
+    A stop, or a lost heartbeat, before GO ends the run without a tick. Raises HostRefusal if real time is required and
     refused, DriverError if the driver cannot be opened or refuses the ramp, ValueError for a law that cannot be
-    compiled and for a channel that the driver lacks.
+    compiled, for a channel that the driver lacks and for a clock that `virtual_clock` refuses.
     """
     context = clock_context(plan.pacing.rate_hz)
     if not plan.pacing.paced:
@@ -177,7 +176,10 @@ def _run_plan(plan: Plan, block: SharedBlock, driver: Driver, facts: Facts) -> O
 
 
 def _fault_text(driver: Driver, loop: np.record) -> str:
-    """Return driver, failed operation, tick and cause as text; the status if the driver has no `error`."""
+    """Return a sentence with driver, failed operation, tick and cause.
+
+    The cause is the driver's `error`, or the status that it returned if it has no `error`.
+    """
     operation = "write" if loop.failed == WRITE_FAILED else "read"
     error = getattr(driver, "error", None)
     reason = f"the driver returned status {loop.failed_status}" if error is None else one_line_error(error)

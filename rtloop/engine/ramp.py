@@ -65,11 +65,13 @@ def unusable_drives(driver: Driver, recorded_v: Sequence[float] | Real) -> list[
 
 
 def starting_outputs_v(driver: Driver, recorded_v: Sequence[float] | Real | None) -> Real:
-    """Return V of each output channel (outputs,) of an opened driver: as it reports, else as recorded, else safe.
+    """Return the V at which a ramp begins for each output (outputs,) of an open driver: reported, else recorded, else
+    the safe value.
 
-    `recorded_v` has a drive for each axis, or is None. A reported value beyond the channel's range is limited to it,
-    and a reported NaN counts as safe. A recorded value beyond the range, or NaN, is ignored: a ramp from it could move
-    the output away from safe. Raises DriverError if the outputs cannot be read.
+    The values that the driver reports are limited to the channel's range; a reported NaN counts as safe. If the driver
+    reports None, the drives `recorded_v`, one for each axis, are used; outputs without a recorded drive count as safe.
+    So does a recorded drive that is NaN or beyond the range: a ramp from it could move the output away from safe.
+    Raises DriverError if the outputs cannot be read.
     """
     safe_v = safe_outputs_v(driver)
     lowest_v, highest_v = np.array([(channel.minimum_v, channel.maximum_v) for channel in driver.facts.outputs]).T
@@ -105,8 +107,8 @@ def ramp_to_safe(
 
     A refused write is repeated each period. Raises DriverError for a card that refuses all writes for GIVE_UP_S.
 
-    `on_step` receives each row after its write. If the process dies between the two, the row before it is recorded, and
-    another ramp from there begins with the same write.
+    `on_step` receives each row after its write. If the process dies after a write and before this call, the caller has
+    recorded the previous row, and another ramp from this row begins with the same write.
     """
     period_s = min(max(1.0 / driver.rate_hz, SHORTEST_PERIOD_S), LONGEST_PERIOD_S)
     write = _WRITE(pointers.write)

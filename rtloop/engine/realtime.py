@@ -18,11 +18,11 @@ _libc = ctypes.CDLL(None, use_errno=True)
 
 
 def prepare_realtime(pacing: Pacing) -> dict[str, Any]:
-    """Request all privileges that keep ticks on time, for the calling thread. Unpaced, none is requested.
+    """Request all privileges that keep ticks on time, for the calling thread and its process; request none if unpaced.
 
-    Returns what is in force: `scheduler` ("SCHED_FIFO" or "SCHED_OTHER"), `priority` (0 for the latter), `mlock` and
-    `pm_qos` (booleans), `affinity` (list of processors), `kernel` (text), `timer_slack_ns` (1, or None if it was not
-    set), and in `refused` a list with a message for each refused one. Raises nothing for a refusal.
+    Returns the settings after that: `scheduler` ("SCHED_FIFO" or "SCHED_OTHER"), `priority` (0 for SCHED_OTHER),
+    `mlock` and `pm_qos` (booleans), `affinity` (list of processors), `kernel` (text), `timer_slack_ns` (1, or None if
+    it was not set), and `refused` (list of messages, one for each refused request). A refusal raises no error.
     """
     report: dict[str, Any] = {
         "scheduler": "SCHED_OTHER",
@@ -64,7 +64,7 @@ def die_with_parent() -> None:
 def _request(report: dict[str, Any], name: str, request: Callable[[], object]) -> None:
     """Call `request` and store its result in `report[name]`.
 
-    An OSError leaves that value, and becomes a message "name: cause" in `report["refused"]`.
+    An OSError leaves the old value, and adds the message "NAME: CAUSE" to the list `report["refused"]`.
     """
     try:
         report[name] = request()

@@ -39,8 +39,9 @@ class Child:
         self._reader.start()
 
     def send(self, data: bytes) -> None:
-        """Write `data` to the child's stdin in a thread, so that a slow child delays nothing. Raises nothing: a child
-        that has ended is noticed by its exit code.
+        """Write `data` to the child's stdin in a separate thread, so that a slow child does not delay the caller.
+
+        Raises no error if the child has ended: `exit_code` shows the end.
         """
         threading.Thread(target=self._write, args=(data,), daemon=True).start()
 
@@ -65,7 +66,7 @@ class Child:
         return self.process.poll()
 
     def wait(self, timeout_s: float) -> int | None:
-        """Wait for the child's end and last reports. Returns its exit code, None if it runs after `timeout_s`."""
+        """Wait for the child's end and last reports. Returns its exit code; None if it still runs after `timeout_s`."""
         try:
             code = self.process.wait(timeout_s)
         except subprocess.TimeoutExpired:

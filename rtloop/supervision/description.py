@@ -71,7 +71,7 @@ def recording_header(prepared: Prepared, realtime: Mapping[str, object]) -> dict
 def _law_description(plan: Plan) -> dict[str, object]:
     """Return the layout of the loop's laws as JSON values: `Layout.description`.
 
-    In its list `laws`, a user's law also has its `sha256`, `text` (for a replay without file) and `file`.
+    In its list `laws`, a user's law also has its `sha256`, its `text`, so that a replay needs no file, and its `file`.
     """
     layout = plan.layout.description()
     for entry, law in zip(layout["laws"], plan.laws, strict=True):

@@ -53,7 +53,7 @@ class Hardware:
 
     @classmethod
     def from_configuration(cls, configuration: Configuration) -> Hardware:
-        """Return the hardware that a configuration drives, with the slowest ramp of its axes."""
+        """Return the hardware that a configuration drives; its slew rate is the lowest of the configuration's axes."""
         return cls(
             configuration.driver_kind,
             configuration.driver_options.model_dump_json(exclude_unset=True),
@@ -64,7 +64,7 @@ class Hardware:
         )
 
     def drives_same_outputs(self, other: Hardware) -> bool:
-        """Whether driver, its options and wiring equal those of `other`; rate and figures of the ramp may differ."""
+        """Whether `other` has the same driver, options and wiring; rate, slew rate and heartbeat timeout may differ."""
         return (self.driver_kind, json.loads(self.driver_options), dict(self.wiring)) == (
             other.driver_kind, json.loads(other.driver_options), dict(other.wiring)
         )  # fmt: skip
@@ -72,8 +72,8 @@ class Hardware:
     def driver(self) -> Driver:
         """Create and return the driver, without opening it.
 
-        Raises ValueError for an unknown driver, invalid options and a channel that the driver lacks, DriverError as for
-        a missing library.
+        Raises ValueError for an unknown driver, invalid options and a channel that the driver lacks; DriverError, for
+        example for a missing library.
         """
         kind = driver_class(self.driver_kind)
         driver = kind(kind.options_model.model_validate_json(self.driver_options), self.wiring, self.rate_hz)
@@ -127,7 +127,7 @@ def read_note(path: Path) -> Hardware | None:
 
 
 def configured_hardware(config: Path) -> Hardware:
-    """Return the hardware of a configuration file, which must be valid as a whole, after its driver was created once.
+    """Return the hardware of a configuration file, which must be valid as a whole; create its driver once as a test.
 
     Raises InputFileError for a file that cannot be read, ConfigError for an invalid one, also if an axis's ramp takes
     too long. An error while the driver is created is raised on if it is a DriverError, such as a missing library; each
@@ -160,8 +160,8 @@ def _wired_outputs(driver: Driver) -> dict[str, Channel]:
 def _require_short_ramp(hardware: Hardware, driver: Driver) -> None:
     """Raise ValueError if the slew rate in the hardware's note is too slow to ramp any output down in time.
 
-    The output with the shortest way from an end of its range to its safe value is judged: the note has one slew rate,
-    the slowest axis's, and does not name this axis.
+    Only one output is judged: the one whose safe value is nearest to the farther end of its range. The note has one
+    slew rate, the slowest axis's, and does not name this axis.
     """
     outputs = _wired_outputs(driver).values()
     nearest = min(outputs, key=lambda output: max(output.maximum_v - output.safe_v, output.safe_v - output.minimum_v))

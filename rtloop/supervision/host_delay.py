@@ -54,7 +54,7 @@ class SpentMargin:
 
     @property
     def is_spent(self) -> bool:
-        """Whether the added delay reaches the margin: the loop is then unstable for at least 1 % of its ticks."""
+        """Whether the added delay reaches the margin: in at least 1 % of the ticks, the delay is then too long."""
         return self.more_us >= self.margin_us
 
     @property
@@ -66,15 +66,15 @@ class SpentMargin:
         return (
             f"measured on this host: {self.more_us:.4g} µs = {self.more_ticks:.3g} ticks of added delay, "
             f"{percent:.3g} % of the {self.margin_us:.4g} µs that the loop tolerates (lateness "
-            f"{self.lateness_us:.4g} µs at p99{exchange_text}{wire_text})"
+            f"of the clock {self.lateness_us:.4g} µs at the 99th percentile{exchange_text}{wire_text})"
         )
 
 
 def store_host_delay(configuration: Configuration, **figures: object) -> None:
-    """Store measured `figures` (fields of HostDelay) for the configuration's rate in the file of `_file_name`.
+    """Store measured `figures` (fields of HostDelay) for the configuration's rate in the file NAME.host.json.
 
-    Other figures stored for this rate stay; those for another rate are replaced. Raises OutputError if the system
-    refuses, HostRefusal for a folder or file that another user owns or may change.
+    Other figures stored for this rate stay; figures stored for another rate are dropped. Raises OutputError if the
+    system refuses, HostRefusal for a folder or file that another user owns or may change.
     """
     rate_hz = configuration.loop.rate_hz
     previous = load_host_delay(configuration)
@@ -115,7 +115,8 @@ def _file_name(configuration: Configuration) -> str:
 def spent_margin(check: AxisCheck, host: HostDelay) -> SpentMargin | None:
     """Return the delay that a host adds to an axis, and the loop's delay margin; None for an unknown or unstable loop.
 
-    For an axis without a measured wire, only lateness and exchange are added, no ticks.
+    The delay is the sum of the clock's lateness, of the exchange with a node, and of ticks from output to input beyond
+    the model's. Without a measurement through the axis's wire, these ticks are 0.
     """
     if check.on_model is None or not check.on_model.is_stable:
         return None
@@ -130,7 +131,7 @@ def spent_margin(check: AxisCheck, host: HostDelay) -> SpentMargin | None:
 
 def require_margins(prepared: Prepared) -> None:
     """Raise one ConfigError with a fault for each axis with `require_margin` whose delay margin the measured delay of
-    this host uses up, or where delay or margin is unknown.
+    this host uses up, or whose delay or margin is unknown.
 
     A run in virtual time, and a configuration without such an axis, pass.
     """
@@ -147,7 +148,10 @@ def require_margins(prepared: Prepared) -> None:
         if host is None:
             faults.append(f"{key}: the delay of this host is unknown; measure it with `rtloop doctor CONFIG`")
         elif spent is None:
-            faults.append(f"{key}: the axis's margin is unknown; use a linear controller and a model")
+            faults.append(
+                f"{key}: the delay margin of the axis is unknown, or its loop is unstable on the model; use a linear "
+                "controller and a model with which the loop is stable"
+            )
         elif spent.is_spent:
             faults.append(
                 f"{key}: {spent.text}; no margin of stability is left; use a slower controller, or reduce the delay as "

@@ -49,7 +49,7 @@ def park_configuration(config: Path, name: str | None = None) -> str:
     Raises with nothing parked: UnavailableError while the service is alive or if its shared block cannot be used,
     HostRefusal for a block that another user may have written, and, if the hardware is unknown, the ConfigError,
     InputFileError or DriverError of the configuration. Raises DriverError or HostRefusal after all boards were tried.
-    Several failures, and one beside parked outputs or remarks, become one RtloopError with all texts.
+    Several failures, or one failure besides parked outputs or remarks, become one RtloopError with all texts.
     """
     account = ParkingAccount(name or config.stem)
     boards = _find_boards(config, account.name, account)

@@ -10,7 +10,7 @@ from rtloop.errors import RtloopError, UnavailableError
 
 
 class ParkingAccount:
-    """Record of one `rtloop park`: name of the service, the outputs' voltages before, and sentences (`remarks`)."""
+    """Record of one `rtloop park`: name of the service, voltages of the outputs before parking, remarks, failures."""
 
     def __init__(self, name: str) -> None:
         """Begin an empty account for the service `name`: no voltages, remarks (sentences for the user) or failures."""
@@ -33,10 +33,11 @@ class ParkingAccount:
             self.failures.append(error)
 
     def result(self) -> str:
-        """Return the message for the user. Raises the failures: a single one without voltages and remarks as it is,
-        else an RtloopError with all texts.
+        """Return the message for the user, with all remarks, if there is no failure.
 
-        The exit code of that is the first failure's, for a DriverError that of UnavailableError.
+        Raises a single failure unchanged if there are no voltages and no remarks; else raises an RtloopError with the
+        message, all failures and all remarks. Its exit code is the first failure's; for a DriverError,
+        UnavailableError's.
         """
         volts = ", ".join(f"{value:.3f} V" for value in self.from_v)
         message = f"{self.name}: {f'parked from {volts}' if volts else 'no output was parked'}"

@@ -158,7 +158,9 @@ class Quota:
                 files.append(FileEntry(match[1], number, entry.name, status.st_size, status.st_mtime_ns))
         if foreign_names:
             foreign_text = f"{count_text(len(foreign_names), 'recording')} of other users, such as {min(foreign_names)}"
-            self.failure = f"{self._folder}: {foreign_text}: these files are not counted and never removed"
+            self.failure = (
+                f"{self._folder}: {foreign_text}: these files do not count for recording.keep_gib and are never removed"
+            )
         return sorted(files)
 
     def _read_new_files(self, entries: list[FileEntry], budget_s: float) -> None:

@@ -76,7 +76,9 @@ class RecorderKeeper:
 
     @property
     def written_state(self) -> dict[str, str | int]:
-        """{file: path of the run's recording, written_ticks: number of ticks in its files plus lost ones before}."""
+        """{file: path of the run's recording, written_ticks: number of the run's ticks, lost ones included, up to the
+        last tick that the recorder has written}.
+        """
         return {"file": str(self._path.resolve()), "written_ticks": self._block.load(Word.FLUSHED_TICKS)}
 
     @property
@@ -120,7 +122,10 @@ class RecorderKeeper:
             self.failure = error
         finally:
             if self.totals is None:
-                reason = str(self.failure or "a fault of rtloop ended the thread that watches the recorder")
+                reason = str(
+                    self.failure
+                    or "a fault of rtloop ended the thread that watches the recorder; the recording is incomplete"
+                )
                 self.totals = {"path": str(self._path), "paths": [], "complete": False, "error": reason}
 
     def _enforce_quota_when_due(self) -> None:
@@ -147,7 +152,7 @@ class RecorderKeeper:
     def _send_removals(self) -> None:
         """Tell the recorder which files were removed; it records each removal as an event.
 
-        Removals stay pending until the recorder has received its orders, and while it is READY or has ended.
+        Removals stay pending until the recorder has received its orders, and while its state is not RUNNING or FAILED.
         """
         if self._unsent_removals and self._has_orders and self.state in (ProcessState.RUNNING, ProcessState.FAILED):
             lines = [json.dumps({"removed": removal.event_details}) + "\n" for removal in self._unsent_removals]
@@ -157,7 +162,7 @@ class RecorderKeeper:
     def _start_recording(self) -> None:
         """Send the recorder its orders and wait, without a time limit, until the file is open.
 
-        Raises OutputError, with the recorder's reason, if the recorder fails or ends before.
+        Raises OutputError, with the recorder's reason, if the recorder fails or ends before the file is open.
         """
         self._send_orders()
         while self.state == ProcessState.READY and self.exit_code is None:
@@ -171,8 +176,8 @@ class RecorderKeeper:
     def _replace_if_dead(self) -> None:
         """Replace a dead or stalled recorder, up to MAX_REPLACEMENTS times; send a new one its orders once it is ready.
 
-        After these, a dead recorder stays dead. A recorder whose process exits after the loop's end is finished, and
-        is not replaced.
+        No recorder is replaced after that, or while its killed process does not end. A recorder whose process exits
+        without a signal after the loop's end has finished, and is not replaced.
         """
         if not self._has_orders:
             if self.state == ProcessState.READY:
@@ -238,7 +243,7 @@ class RecorderKeeper:
             self.notes.append(f"{part}: the recording is recovered, but this file cannot be removed: {error.strerror}")
 
     def _newest_report(self) -> dict[str, object]:
-        """Return the recorder's newest report since the last call, {} without one; older reports are dropped."""
+        """Return the recorder's newest report since the last call, {} if there is none; drop older reports."""
         reports = self._child.reports()
         return reports[-1] if reports else {}
 

@@ -33,7 +33,8 @@ class RecordingState(TypedDict):
 def recording_state(block: SharedBlock) -> RecordingState:
     """Return {state: "recording" or "not recording", reason, since_tick: first tick without record, ticks_lost}.
 
-    `ticks_lost` counts all ticks of the loop that are in no file. `reason` and `since_tick` are None while recording.
+    `ticks_lost` counts the ticks that are in no file although the recorder has passed them: ticks that still wait in
+    the ring do not count. `reason` and `since_tick` are None while recording.
     """
     failure, flushed_ticks, lost_ticks, cursor = (
         block.load(word) for word in (Word.RECORDER_FAILURE, Word.FLUSHED_TICKS, Word.LOST_TICKS, Word.RECORDER_CURSOR)
@@ -49,7 +50,7 @@ def recording_state(block: SharedBlock) -> RecordingState:
 
 
 class GapReporter:
-    """Messages about gaps, in which ticks are not recorded: one at the begin of a gap, one at its end.
+    """Messages about gaps, in which ticks are not recorded: one for each reason of a gap, one at its end.
 
     A gap ends after QUIET_S without a fault: on an overloaded host the recorder is behind, catches up a little and is
     behind again, which is one gap.

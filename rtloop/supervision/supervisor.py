@@ -105,8 +105,9 @@ class Processes:
 class Supervisor:
     """Runner of one plan in `processes`, recorded to the path `recording` (without `.part`).
 
-    Call `start`, then `poll` every few milliseconds until it returns a result, then `close`. No method waits for a
-    disk, a log or a terminal. Without calls of `poll` the heartbeat stops, and the loop parks its outputs.
+    Call `start`, then `poll` every few milliseconds until it returns a result, then `close`. Only `start` waits for a
+    disk, until the recording is open; no method waits for a log or a terminal. Without calls of `poll` the heartbeat
+    stops, and the loop parks its outputs.
     """
 
     def __init__(
@@ -144,7 +145,7 @@ class Supervisor:
 
     @property
     def ticks(self) -> int:
-        """Number of executed ticks."""
+        """Number of ticks that the loop has published; a ramp after the last planned tick adds none."""
         return int(self.block["ticks_head"][0])
 
     def latest(self) -> Real | None:
@@ -174,7 +175,7 @@ class Supervisor:
         return trip_reason(trips[-1], plan.axes, laws) if trips else None
 
     def run(self, on_progress: Callable[[Supervisor], None] | None = None) -> RunResult:
-        """Start both processes, watch them until the end, close, and return the result.
+        """Let both processes begin the run, watch them until its end, close, and return the result.
 
         `on_progress` is called every PROGRESS_PERIOD_S in a separate thread: a blocked terminal delays nothing. Raises
         RtloopError if the run could not start; a loop that dies later is in the result.
@@ -201,10 +202,10 @@ class Supervisor:
     def start(self) -> None:
         """Send both processes their orders, wait until both are ready and the recording is open; let the loop begin.
 
-        Sets `realtime`, and `startup_s`, the age of this process then. Raises RtloopError with the failure that the
-        loop's process reports, LoopFault if a process ends without report, UnavailableError after START_TIMEOUT_S in
-        which nothing was compiled or the recording is not open, OutputError if it cannot be opened: the loop has
-        executed no tick then.
+        Sets `realtime`, and `startup_s`, the age of this process at the end of the start. If it raises an error, the
+        loop has executed no tick: RtloopError with the failure that the loop's process reports, LoopFault if a process
+        ends without report, UnavailableError after START_TIMEOUT_S in which no function was compiled or the recording
+        was not open, OutputError if the recording cannot be opened.
         """
         self.newest(0)  # Compile or load the function before it is needed in time.
         self._loop.send(pickle.dumps(self.prepared.plan))
@@ -217,7 +218,8 @@ class Supervisor:
                 raise self.recorder.failure
             if self._watched_s > deadline:
                 raise UnavailableError(
-                    f"the recording was not open within {START_TIMEOUT_S:g} s; its file system may not answer"
+                    f"the recording was not open within {START_TIMEOUT_S:g} s; its file system may not answer; check "
+                    "the disk of recording.folder"
                 )
             time.sleep(START_POLL_S)
         self.block.store(Word.GO, 1)
@@ -266,7 +268,7 @@ class Supervisor:
             self._reports[report["report"]] = report
 
     def _kill_stalled_loop(self) -> bool:
-        """Kill a paced loop whose ticks stand still. Returns whether it was killed."""
+        """Kill a paced loop whose ticks stand still between its first and its last. Returns whether it was killed."""
         is_running = self.block.load(Word.LOOP_STATE) == ProcessState.RUNNING
         if not (
             is_running and self.prepared.plan.pacing.paced and self.ticks and not self.block.load(Word.FINISHED_TICKS)
@@ -282,7 +284,7 @@ class Supervisor:
         """Wait until both processes are ready, and store the real-time settings in `realtime`.
 
         Raises RtloopError with the failure that the loop's process reports, LoopFault if a process ended without
-        report, UnavailableError after START_TIMEOUT_S in which nothing was compiled.
+        report, UnavailableError after START_TIMEOUT_S in which no function was compiled.
         """
         deadline, compiled = time.monotonic() + START_TIMEOUT_S, stored_file_count()
         while True:
@@ -299,7 +301,8 @@ class Supervisor:
                 continue  # The loop was ready, and was stopped before this check.
             if self.recorder.exit_code is not None:
                 raise LoopFault(
-                    f"the recorder's process ended with exit code {self.recorder.exit_code} before the run began"
+                    f"the recorder's process ended with exit code {self.recorder.exit_code} before the run began; its "
+                    "error output, if any, says why"
                 )
             if time.monotonic() > deadline:
                 before, compiled = compiled, stored_file_count()
@@ -312,13 +315,16 @@ class Supervisor:
             time.sleep(START_POLL_S)
 
     def _raise_failure(self, exit_code: int) -> None:
-        """Raise RtloopError with the message and exit code that the loop's process reported.
+        """Raise RtloopError with the message and exit code in the report "failed" of the loop's process.
 
-        Without such a report, raise LoopFault, which names `exit_code`, the code of the process.
+        Without such a report, raise LoopFault with `exit_code`, the exit code of the loop's process, in its message.
         """
         failure = self._reports.get("failed")
         if failure is None:
-            raise LoopFault(f"the loop's process ended ({_ending_text(exit_code)}) before the run began")
+            raise LoopFault(
+                f"the loop's process ended ({_ending_text(exit_code)}) before the run began; its error output, if any, "
+                "says why"
+            )
         error = RtloopError(failure["message"])
         error.exit_code = failure["exit_code"]
         raise error
@@ -363,7 +369,10 @@ class Supervisor:
 
 
 def process_age_s() -> float:
-    """Return the age of this process, s, with interpreter start and imports. Raises OSError if /proc cannot be read."""
+    """Return the age of this process in s, interpreter start and imports included.
+
+    Raises OSError if /proc cannot be read.
+    """
     fields = Path("/proc/self/stat").read_text().rpartition(")")[2].split()
     started_s = int(fields[START_TIME_FIELD]) / os.sysconf("SC_CLK_TCK")
     return time.clock_gettime(time.CLOCK_BOOTTIME) - started_s

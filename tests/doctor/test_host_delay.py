@@ -116,7 +116,7 @@ def test_a_required_margin_needs_a_known_delay_that_leaves_some() -> None:
         ConfigError, match=r"require_margin: measured on this host: 215\d µs = .* no margin of stability is left"
     ):
         require_margins(prepared)
-    with pytest.raises(ConfigError, match="the axis's margin is unknown"):
+    with pytest.raises(ConfigError, match="require_margin: the delay margin of the axis is unknown, or its loop is"):
         require_margins(replace(prepared, checks=(replace(prepared.checks[0], on_model=None),)))
 
 

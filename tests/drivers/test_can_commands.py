@@ -137,7 +137,8 @@ def test_without_a_node_the_message_names_the_command_that_starts_one(config):
     replace_text(config, "wait_s = 60", "wait_s = 0.2")
     code, _, err = run_command("run", config, "--duration", "1")
     assert code == 69
-    assert "no node has answered within 0.2 s; start a simulated node with `rtloop hil serve CONFIG --can`" in err
+    advice = "switch the node on, or start a simulated node with `rtloop hil serve CONFIG --can`"
+    assert f"no node has answered within 0.2 s; {advice}" in err
 
 
 def test_a_node_of_another_kind_is_refused(config):

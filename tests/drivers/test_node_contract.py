@@ -124,7 +124,9 @@ def test_a_restarted_node_ends_the_exchange(node):
     assert "restarted" in str(driver.error)
     assert abs(node.settled_output_v()) < 1e-5
     ending = (
-        contextlib.nullcontext() if node.kind == "udp" else pytest.raises(DriverError, match="only the node's watchdog")
+        contextlib.nullcontext()
+        if node.kind == "udp"
+        else pytest.raises(DriverError, match="until the node's watchdog")
     )
     with ending:  # The serial terminal ended with the first process.
         driver.close()

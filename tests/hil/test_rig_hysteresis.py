@@ -181,7 +181,7 @@ def test_bouc_wen_does_not_move_on_nan(run, ideal):
         ({"bouc_wen": BOUC_WEN}, "bouc_wen is set, but truth is 'residual'"),
         (
             {"truth": "bouc-wen", "bouc_wen": BOUC_WEN | {"lean_per_v": -0.4}},
-            r"lean_per_v: -0.4; allowed: -0.3 to 0.3 \(decay_per_v\)",
+            r"lean_per_v: -0.4; allowed: -0.3 to 0.3, the value of decay_per_v",
         ),
     ],
 )

@@ -107,7 +107,7 @@ def test_defaults_are_the_papers():
         (
             'plant.dynamics = {form="factors", gain=1, denominator=[[0, 1]]}',
             "plant.dynamics",
-            r"factor: \[0.0, 1.0\]; allowed: a first number other than 0",
+            r"a factor of numerator or denominator is \[0.0, 1.0\]; allowed: a first number other than 0",
         ),
         ("plant.creep.gains = [0.1]", "plant.creep", "gains has 1 numbers, time_constants_s has 0"),
         (
