@@ -172,11 +172,11 @@ class Connection:
         return self._client.post("/preview", {"axis": axis, "section": section, "values": values})
 
     def undo(self, axis: str) -> dict[str, Any]:
-        """Undo the newest `tune`, `controller` or `swap` of an axis, or of the axis that owns its shared controller,
-        bumplessly; the next call undoes the change before that. A `swap` counts as one change for each of its steps.
+        """Undo the newest `tune`, `controller` or `swap` of an axis, or of the controller that it shares, bumplessly;
+        the next call undoes the change before that. A `swap` counts as one change for each of its steps.
 
         Returns {tick, undone: the change in words}. Refused if no change is left since the start of the loop or the
-        last reload.
+        last reload, or if the axis that owns the shared controller has a newer change of another section.
         """
         return self._client.post("/undo", {"axis": axis})
 

@@ -57,8 +57,9 @@ def _settled_response(
     Raises ValueError if they still change after MOST_TICKS and at least three windows.
     """
     window = max(LEAST_TICKS, math.ceil(LEAST_PERIODS / (frequency_hz * period_s)))
+    most_ticks = max(MOST_TICKS, 3 * window)
     previous = np.full(amplitudes_um.size, np.inf + 0j)
-    for first in range(0, max(MOST_TICKS, 3 * window), window):
+    for first in range(0, most_ticks, window):
         ticks = first + np.arange(window)
         phase = 2 * np.pi * frequency_hz * period_s * ticks
         commands_um = np.array([tick(amplitudes_um * value).copy() for value in np.sin(phase)])
@@ -70,4 +71,4 @@ def _settled_response(
         if np.all(np.abs(amplitudes - previous) <= AGREEMENT * np.abs(amplitudes).max() + negligible_um):
             return amplitudes
         previous = amplitudes
-    raise ValueError(f"the response at {frequency_hz:g} Hz has not settled after {MOST_TICKS} ticks")
+    raise ValueError(f"the response at {frequency_hz:g} Hz has not settled after {most_ticks:,} ticks")

@@ -77,6 +77,11 @@ def test_json(tmp_path: Path, schema: Any, compression: CompressionType):
     require_truth(path, "/imu")
 
 
+def test_a_bare_number_that_is_missing_is_nan_in_the_same_column(tmp_path: Path):
+    table = read_mcap(write_messages(tmp_path / "a.mcap", [1.5, None, "NaN", 2.5]))
+    assert np.array_equal(table.columns["value"], [1.5, np.nan, np.nan, 2.5], equal_nan=True)
+
+
 def imu_class() -> Any:
     """Return a class of protobuf messages with a nested, a repeated and a Timestamp field."""
     file = FileDescriptorProto(name="imu.proto", package="lab", syntax="proto3")

@@ -126,7 +126,7 @@ def test_a_frequency_that_no_sample_shows_is_refused(frequency_hz: float) -> Non
 
 def test_what_does_not_settle_and_what_has_no_error_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("rtloop.laws.measured_response.MOST_TICKS", 5000)
-    with pytest.raises(ValueError, match="the response at 100 Hz has not settled after 5000 ticks"):
+    with pytest.raises(ValueError, match="the response at 100 Hz has not settled after 5,000 ticks"):
         make_suite(make_law(ChangingGain)).frequency_response(100.0)
     feedforward = PrandtlIshlinskii(PrandtlIshlinskiiOptions.model_validate(EQ_4), PERIOD_S, None)
     with pytest.raises(ValueError, match="a feedforward; only a controller has a frequency response from error"):

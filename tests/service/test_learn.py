@@ -7,8 +7,10 @@ import signal
 import socket
 import subprocess
 import sys
+import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -154,4 +156,24 @@ ENDINGS: dict[str, Callable[[Bench, Path], object]] = {
 def test_learning_ends_with_its_client_and_the_held_reference_comes_back(running: Bench, tmp_path: Path, ending: str):
     hold_setpoint(running)
     ENDINGS[ending](running, tmp_path)
+    assert_reference_returns(running)
+
+
+def test_a_learning_that_trips_leaves_the_setpoint_as_reference(running: Bench):
+    """After a reset the stage returns to its setpoint, and does not scan."""
+    hold_setpoint(running)
+    answers: list[tuple[int, Any]] = []
+    request = REQUEST | {"cycles": LONG_CYCLES}
+    learning = threading.Thread(target=lambda: answers.append(answer(running, "POST", "/learn", request)))
+    learning.start()
+    await_tables(running)
+    running.client.post("/tune", {"axis": "x", "section": "interlocks", "values": {"position_um": 3.0}})
+    learning.join()
+    ((code, text),) = answers
+    assert (code, "the loop tripped (position" in text["error"]) == (409, True), text
+    assert reference_um(running) == SETPOINT_UM
+    running.client.post("/undo", {"axis": "x"})
+    running.client.post("/reset")
+    running.client.post("/start")
+    running.await_state("running")
     assert_reference_returns(running)

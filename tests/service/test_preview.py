@@ -81,18 +81,36 @@ def test_changes_to_and_fro_are_taken_back_in_their_order():
     axis = prepare(parse(TEXT, "paper", PAPER.parent, "paper.toml")).configuration.axes[0]
     changed_axis = axis.model_copy(update={"name": "other"})
     versions = (axis, changed_axis, axis, changed_axis, axis)
-    history, changes = ChangeHistory(), [Change(0, version, "to and fro") for version in versions]
+    history, changes = ChangeHistory(), [Change(0, "model", version, "to and fro") for version in versions]
     for change in changes:
         history.add(change)
-    history.add(Change(1, axis, "of another axis"))
+    history.add(Change(1, "limits", axis, "of another axis"))
     undone = []
-    while (change := history.newest((0,))) is not None:
+    while (change := history.newest(0, 0)) is not None:
         undone.append(change.before.name)
         history.remove(change)
     assert undone == ["x", "other", "x", "other", "x"]
-    assert history.newest((0, 1)) is not None
+    assert history.newest(1, 1) is not None
     history.remove()
-    assert history.newest((0, 1)) is None
+    assert history.newest(1, 1) is None
+
+
+def test_an_axis_undoes_its_own_changes_and_those_of_the_controller_that_it_shares():
+    """Axis 1 uses the controller of axis 0. The limits of axis 0 are not axis 1's, and stay until axis 0 undoes them."""
+    axis = prepare(parse(TEXT, "paper", PAPER.parent, "paper.toml")).configuration.axes[0]
+    history = ChangeHistory()
+    for number, section in ((1, "limits"), (0, "controller"), (1, "model"), (0, "limits"), (2, "controller")):
+        history.add(Change(number, section, axis, f"{section} of {number}"))
+
+    def undo(number: int) -> str | None:
+        change = history.newest(number, owner=0)
+        if change is not None:
+            history.remove(change)
+        return change and change.text
+
+    assert [undo(1), undo(0), undo(1), undo(1), undo(1)] == [
+        "model of 1", "limits of 0", "controller of 0", "limits of 1", None,
+    ]  # fmt: skip
 
 
 def test_a_refused_change_is_none_to_undo(running: Bench):

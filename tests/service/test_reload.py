@@ -9,6 +9,7 @@ import pytest
 
 from rtloop.configuration.file import parse
 from rtloop.configuration.prepare import Prepared, prepare
+from rtloop.engine.commands import QueueFull
 from rtloop.engine.memory import SharedBlock
 from rtloop.engine.messages import Kind
 from rtloop.errors import ConfigError
@@ -21,14 +22,19 @@ FIRST, SECOND = (axis.name for axis in parse(TEXT, "lab", DEPLOY, "lab.toml").ax
 
 
 class FakeDesk:
-    """Desk that accepts commands, refuses those in `refuses`, and does not confirm the kinds in `unconfirmed`."""
+    """Desk that accepts commands, refuses those in `refuses` and all if `is_full`, and does not confirm the kinds in
+    `unconfirmed`.
+    """
 
     def __init__(self) -> None:
         self.refuses: set[tuple[Kind, int]] = set()
         self.unconfirmed: set[Kind] = set()
+        self.is_full = False
         self.accepted: list[tuple[Kind, int]] = []
 
     def submit(self, kind: Kind, *, axis: int, values=(), change: str | None = None) -> int:
+        if self.is_full:
+            raise QueueFull("256 commands wait for the loop already; try again")
         if (kind, axis) in self.refuses:
             raise Refusal(f"{kind.name.lower()}: refused at tick 7, because the loop is tripped or is stopping")
         if kind in self.unconfirmed:
@@ -217,6 +223,10 @@ def test_a_refused_tare_does_not_come_with_the_next_change(live):
     with pytest.raises(Refusal):
         live.tare(0, 0.5)
     desk.refuses.clear()
+    desk.is_full = True
+    with pytest.raises(QueueFull):
+        live.tare(0, 0.6)
+    desk.is_full = False
     live.replace_all(prepare_changed(TIGHTER))
     assert loaded_offsets_v() == [0.25, 0.0]
     desk.unconfirmed.add(Kind.LOAD_LAW)

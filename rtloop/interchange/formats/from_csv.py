@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import csv
 import io
+import itertools
 import os
 import re
 from collections.abc import Iterator
@@ -145,7 +146,7 @@ def _require_even_rows(path: Path, dialect: CsvDialect, without_last: npt.NDArra
     """
     checked_count, short_row = 0, None
     with contextlib.closing(_NumberLines(path, dialect)) as lines:
-        for row, line in enumerate(lines):
+        for row, (number, line) in enumerate(_number_rows(lines, dialect)):
             if short_row is not None:
                 raise UnreadableData(f"{path}: {_uneven_row_message(*short_row, dialect)}")
             if checked_count == without_last.size:
@@ -154,7 +155,20 @@ def _require_even_rows(path: Path, dialect: CsvDialect, without_last: npt.NDArra
                 checked_count += 1
                 delimiter = dialect.delimiter
                 fields = line.split() if delimiter is None else next(csv.reader([line], delimiter=delimiter), [])
-                short_row = (dialect.first + row + 1, len(fields)) if 0 < len(fields) < len(dialect.names) else None
+                short_row = (number, len(fields)) if 0 < len(fields) < len(dialect.names) else None
+
+
+def _number_rows(lines: _NumberLines, dialect: CsvDialect) -> Iterator[tuple[int, str]]:
+    """Yield number, from 1, and text of each line with a row of numbers; pandas skips blank lines, too."""
+    for number, line in enumerate(lines, start=dialect.first + 1):
+        if line.strip() or (dialect.delimiter is not None and dialect.delimiter in line):
+            yield number, line
+
+
+def _line_number(path: Path, dialect: CsvDialect, row: int) -> int:
+    """Return the number, from 1, of the line with a row of numbers; the first row has index 0."""
+    with contextlib.closing(_NumberLines(path, dialect)) as lines:
+        return next(itertools.islice(_number_rows(lines, dialect), row, None))[0]
 
 
 def _uneven_row_message(line: int, columns: int, dialect: CsvDialect) -> str:
@@ -181,7 +195,7 @@ def _column_numbers(path: Path, dialect: CsvDialect, values: Any) -> Real:
         row = int(values.index[invalid_rows[0]])
         raise UnreadableData(
             f"{path}: column {dialect.names[values.name]!r}: {str(values.iloc[invalid_rows[0]])[:60]!r} is not a "
-            f"number (row {row + 1} of the numbers, about line {dialect.first + row + 1})"
+            f"number (line {_line_number(path, dialect, row)})"
         )
     return numbers
 
@@ -196,9 +210,8 @@ def _dates_ns(path: Path, dialect: CsvDialect, values: Any) -> npt.NDArray[np.in
     dates = pandas.to_datetime(values.astype(str).str.replace(",", "."), format="ISO8601", utc=True, errors="coerce")
     if dates.isna().any():
         row = int(values.index[int(np.argmax(dates.isna()))])
-        raise UnreadableData(
-            f"{path}: column {dialect.names[values.name]!r}: line {dialect.first + row + 1} has no date"
-        )
+        line = _line_number(path, dialect, row)
+        raise UnreadableData(f"{path}: column {dialect.names[values.name]!r}: line {line} has no date")
     return dates.dt.tz_localize(None).to_numpy("datetime64[ns]").astype(np.int64)
 
 

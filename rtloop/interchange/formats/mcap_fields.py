@@ -71,7 +71,7 @@ def _flat(value: object, children: Callable[[object], Iterator[tuple[str, object
         elif isinstance(node, bool | int | float):
             fields[name or "value"] = _double(node)
         elif node is None or (isinstance(node, str) and node in WORDS):
-            fields[name] = float(WORDS[node] if node else "nan")
+            fields[name or "value"] = float(WORDS[node] if node else "nan")
         if len(fields) + len(pending) > MOST_FIELDS:
             raise DecodingError(f"too many fields; allowed: up to {MOST_FIELDS}")
     return fields

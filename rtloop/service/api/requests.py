@@ -170,9 +170,9 @@ def _measure_response(service: Service, body: ResponseBody) -> dict[str, object]
 
     Raises Refusal unless the loop runs, and as `measure_response`.
     """
-    request = ResponseRequest(**body.model_dump(exclude={"axis"}))
+    request, running_loop = ResponseRequest(**body.model_dump(exclude={"axis"})), _require_running(service, "response")
     with service.current_measurement.begin("response", body.axis):
-        measurement = measure_response(*_require_running(service, "response"), body.axis, request)
+        measurement = measure_response(*running_loop, body.axis, request)
     service.measurements.setdefault(body.axis, MeasurementHistory()).add(measurement)
     return measurement.for_json()
 

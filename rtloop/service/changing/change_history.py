@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Collection
 from typing import NamedTuple
 
 from rtloop.configuration.axis import AxisOptions
@@ -12,9 +11,10 @@ MAX_CHANGES = 100
 
 
 class Change(NamedTuple):
-    """A change: number of the axis, its options before, and the change in words."""
+    """A change: number of the axis, its changed section, its options before, and the change in words."""
 
     number: int
+    section: str
     before: AxisOptions
     text: str
 
@@ -30,9 +30,18 @@ class ChangeHistory:
         """Add a change as the newest one; beyond MAX_CHANGES the oldest one is removed."""
         self._changes.append(change)
 
-    def newest(self, axis_numbers: Collection[int]) -> Change | None:
-        """Return the newest change of any of the axes `axis_numbers`, which stays in the history; None without one."""
-        return next((change for change in reversed(self._changes) if change.number in axis_numbers), None)
+    def newest(self, number: int, owner: int) -> Change | None:
+        """Return the newest change of axis `number`, or of the controller that it shares, of axis `owner`.
+
+        The change stays in the history. None without one; a change of the controller does not count if `owner`, another
+        axis, has a newer change of another section, because its options before include that section.
+        """
+        for change in reversed(self._changes):
+            if change.number == number or (change.number == owner and change.section == "controller"):
+                return change
+            if change.number == owner:
+                owner = number
+        return None
 
     def remove(self, change: Change | None = None) -> None:
         """Remove `change`, which must be an object that the history holds; None removes all changes."""

@@ -93,7 +93,8 @@ class LiveLaw:
         may still load it.
         """
         with self._build_lock:
-            return self._apply_change(*self._axis_with_keys(axis, section, changes), f"{section}: {', '.join(changes)}")
+            number, options = self._axis_with_keys(axis, section, changes)
+            return self._apply_change(number, options, section, f"{section}: {', '.join(changes)}")
 
     def load_controller(self, axis: str, controller: Mapping[str, object]) -> int:
         """Replace [axis.controller] as a whole: build, verify and load it. Returns the tick of the load.
@@ -102,9 +103,8 @@ class LiveLaw:
         also for invalid keys.
         """
         with self._build_lock:
-            return self._apply_change(
-                *self._axis_with_controller(self.axis_number(axis), controller, keep_other_keys=False), "controller"
-            )
+            owner, options = self._axis_with_controller(self.axis_number(axis), controller, keep_other_keys=False)
+            return self._apply_change(owner, options, "controller", "controller")
 
     def preview(self, axis: str, section: str, changes: Mapping[str, object]) -> dict[str, Figures]:
         """Return {before, after}: `loop_figures` without and with a `tune`, with steps of equal length.
@@ -121,15 +121,16 @@ class LiveLaw:
             return {"before": before, "after": after}
 
     def undo(self, axis: str) -> tuple[int, str]:
-        """Undo the newest change of an axis, or of the axis that owns its shared controller: load the options that this
-        axis had before the change.
+        """Undo the newest change of an axis or of its controller: load the options that the changed axis had before.
+
+        A later change of something else of the axis that owns a shared controller must be undone there first.
 
         The reference stays; the change leaves the history, except after an error. Returns the tick of the load, and the
         undone change in words. Raises ConfigError for an unknown axis, Refusal if there is no change, and as `tune`.
         """
         with self._build_lock:
             number, configuration = self.axis_number(axis), self.prepared.configuration
-            change = self._history.newest((number, configuration.owners[number]))
+            change = self._history.newest(number, configuration.owners[number])
             if change is None:
                 raise Refusal(f"undo: axis {axis} has no change since the loop started or was reloaded")
             reference = configuration.axes[change.number].reference
@@ -137,12 +138,12 @@ class LiveLaw:
             self._history.remove(change)
             return tick, change.text
 
-    def _apply_change(self, number: int, axis: AxisOptions, change_text: str) -> int:
-        """Load changed options of axis `number`, add the change to the history, and return the tick. Raises as `_swap`.
+    def _apply_change(self, number: int, axis: AxisOptions, section: str, change_text: str) -> int:
+        """Load options of axis `number` with a changed section, add the change to the history, and return the tick.
 
-        The history also gets a change that was not confirmed: the loop may still load it.
+        The history also gets a change that was not confirmed: the loop may still load it. Raises as `_swap`.
         """
-        change = Change(number, self.prepared.configuration.axes[number], change_text)
+        change = Change(number, section, self.prepared.configuration.axes[number], change_text)
         try:
             tick = self._swap(number, axis)
         except UnconfirmedCommand:
@@ -186,8 +187,8 @@ class LiveLaw:
         """Make `offset_v` the reading at position 0 of axis `number`, now and after later changes.
 
         Returns the tick at which the offset took effect. Raises Refusal if the loop refuses, or an earlier change is
-        unconfirmed; the earlier offset then stays. Raises UnconfirmedCommand if the loop took the command and stands
-        still: it may still load the new offset, so later changes carry it. Raises QueueFull as `Desk.submit`.
+        unconfirmed, QueueFull as `Desk.submit`; the earlier offset then stays. Raises UnconfirmedCommand if the loop
+        took the command and stands still: it may still load the new offset, so later changes carry it.
         """
         with self._staging.lock:
             axis, earlier_v = self.prepared.configuration.axes[number], self.offsets_v.get(number)
@@ -196,7 +197,9 @@ class LiveLaw:
                 return self._stage(
                     number, self.prepared, axis, f"position 0 µm is now at a reading of {offset_v:.4g} V"
                 )
-            except Refusal:
+            except UnconfirmedCommand:
+                raise
+            except RtloopError:
                 if earlier_v is None:
                     del self.offsets_v[number]
                 else:

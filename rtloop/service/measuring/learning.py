@@ -85,8 +85,9 @@ def learn(
 
     Raises ConfigError for an invalid request and for a loop in which learning would not converge, Refusal if the state
     does not allow the learning or the learning was aborted. After an abort the reference becomes the best table if
-    `keep` is true and a cycle was judged, else the setpoint, unless a client has set another one. Raises
-    ClientDisconnected if the client disconnects before the end; the loop then returns to its setpoint.
+    `keep` is true, a cycle was judged and the loop is still in closed loop without a trip; else the setpoint. It stays
+    if a client has set another one. Raises ClientDisconnected if the client disconnects before the end; the loop then
+    returns to its setpoint.
     """
     number = live.axis_number(axis)
     rate_hz = live.prepared.configuration.loop.rate_hz
@@ -109,7 +110,7 @@ def learn(
     except Exception:
         if player.owns_reference:
             with suppress(RtloopError):
-                _set_final_reference(player, trials, request.keep)
+                _set_final_reference(player, trials, request.keep and player.is_in_closed_loop)
         raise
     return LearnResult(trials.cycles, trials.best_table, end_reason)
 

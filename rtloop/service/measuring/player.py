@@ -55,6 +55,13 @@ class Player:
         return self._supervisor.ticks
 
     @property
+    def is_in_closed_loop(self) -> bool:
+        """Whether the newest tick ran in closed loop and without a latched trip."""
+        newest = self._supervisor.newest(1)
+        flags = newest[:, signals.FLAGS].astype(np.int64)
+        return bool(np.all(newest[:, signals.MODE] == Mode.CLOSED_LOOP)) and not any(map(signals.trip_causes, flags))
+
+    @property
     def owns_reference(self) -> bool:
         """Whether no other client has set a reference of the axis since this player's last one, or since its start.
 
