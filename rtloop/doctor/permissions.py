@@ -112,7 +112,8 @@ def real_time_groups(host: Host, pacing: Pacing) -> Finding:
         False,
         100_000.0,
         "the control group has no real-time runtime, so SCHED_FIFO is refused",
-        "echo 950000 | sudo tee /sys/fs/cgroup/cpu/GROUP/cpu.rt_runtime_us, where GROUP is the loop's control group",
+        "echo 950000 | sudo tee /sys/fs/cgroup/cpu/GROUP/cpu.rt_runtime_us; GROUP is the path in the line with cpu of "
+        "/proc/PID/cgroup, and PID the number of the loop's process",
     )
 
 

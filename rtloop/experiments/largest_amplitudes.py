@@ -120,7 +120,7 @@ def largest_part_of_drive(setting: Setting) -> Bound:
         Bound(1.0, f"limits.drive_v = {drive_v:g}"),
         Bound(
             setting.trip_um / overshoot_um,
-            f"{setting.trip.reason} (a step of the whole drive moves the stage by up to {overshoot_um:.4g} µm)",
+            f"{setting.trip.reason} (a step from 0 to {drive_v:g} V moves the stage by up to {overshoot_um:.4g} µm)",
         ),
     )
 

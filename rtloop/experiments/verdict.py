@@ -60,10 +60,10 @@ class Row:
     def verdict(self) -> str:
         """Whether the requirement, the claim and the model are met, as text; a difference to the model is named.
 
-        "" without any of these; "not shown by this run" for a value that is not finite.
+        "" without any of these; "no value in this run" for a value that is not finite.
         """
         if not math.isfinite(self.run):
-            return "not shown by this run"
+            return "no value in this run"
         difference = "" if self.model is None else f"{self.run - self.model:+.3g} {self.unit.removeprefix('1')}".strip()
         answers = (
             (self.is_met, "meets the requirement", "MISSES the requirement"),

@@ -143,7 +143,7 @@ def test_parameters_and_names() -> None:
         (5.0, None, (None, None), 9.0, "off the model by -4 V", "mixed"),
         (5.0, None, None, 5.1, "as the model", "good"),
         (5.0, None, None, np.nan, "", ""),
-        (np.nan, 6.0, (4.0, 6.0), 5.0, "not shown by this run", ""),
+        (np.nan, 6.0, (4.0, 6.0), 5.0, "no value in this run", ""),
         (5.0, None, None, None, "", ""),
     ],
 )

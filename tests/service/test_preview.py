@@ -96,7 +96,7 @@ def test_changes_to_and_fro_are_taken_back_in_their_order():
 
 
 def test_an_axis_undoes_its_own_changes_and_those_of_the_controller_that_it_shares():
-    """Axis 1 uses the controller of axis 0; the limits of axis 0 are not axis 1's, and stay until axis 0 undoes them."""
+    """Axis 1 uses the controller of axis 0; the limits of axis 0 stay until axis 0 itself undoes them."""
     axis = prepare(parse(TEXT, "paper", PAPER.parent, "paper.toml")).configuration.axes[0]
     history = ChangeHistory()
     for number, section in ((1, "limits"), (0, "controller"), (1, "model"), (0, "limits"), (2, "controller")):

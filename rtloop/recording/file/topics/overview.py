@@ -119,10 +119,10 @@ class OverviewLayout:
     def require_overview(self, payload: bytes) -> None:
         """Raise ValueError for a payload whose length or fields do not match these columns."""
         if len(payload) != self._dtype.itemsize:
-            raise ValueError("a summary of ticks that were left out is damaged: it has a wrong length")
+            raise ValueError("the overview of ticks that were not recorded is damaged: it has a wrong length")
         if not np.array_equal(np.frombuffer(payload, np.uint8)[self._fixed], self._tags):
             raise ValueError(
-                "a summary of ticks that were left out is damaged: its fields are not those of the recording"
+                "the overview of ticks that were not recorded is damaged: its fields are not those of the recording"
             )
 
     def parse_intervals(self, payloads: Sequence[bytes]) -> Intervals:
