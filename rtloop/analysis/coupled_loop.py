@@ -238,9 +238,10 @@ def _structured_singular_value(matrices: Complex) -> Real:
     """Return an upper bound (k,) of the structured singular value μ of `matrices` (k, m, m), for one complex change per
     axis (a diagonal); exact for two axes.
 
-    The bound is σ̄ after a scaling that makes the norms of each row and column off the diagonal equal (Osborne,
-    1960): the Frobenius norm is then least, and with it, for two axes, the largest singular value, as their product
-    does not depend on the scaling.
+    The bound is σ̄ after a scaling that makes, for each axis, the norms of its row and its column off the diagonal equal
+    (Osborne, 1960): the Frobenius norm is then least, and with it, for two axes, the largest singular value, as the
+    product of both singular values does not depend on the scaling. An axis that only acts on others, or on which
+    only others act, counts as uncoupled: scaling makes such a coupling as small as one likes.
     """
     balanced = matrices.copy()
     axes = np.arange(balanced.shape[1])
@@ -249,7 +250,10 @@ def _structured_singular_value(matrices: Complex) -> Real:
             is_other_axis = axes != i
             row = np.linalg.norm(balanced[:, i, is_other_axis], axis=1)
             column = np.linalg.norm(balanced[:, is_other_axis, i], axis=1)
-            scale = np.sqrt(np.where((row > 0) & (column > 0), column / np.where(row > 0, row, 1.0), 1.0))
+            is_coupled = (row > 0) & (column > 0)
+            balanced[:, i, is_other_axis] *= is_coupled[:, None]
+            balanced[:, is_other_axis, i] *= is_coupled[:, None]
+            scale = np.sqrt(np.where(is_coupled, column, 1.0) / np.where(is_coupled, row, 1.0))
             balanced[:, i, :] *= scale[:, None]
             balanced[:, :, i] /= scale[:, None]
     return _largest_singular_value(balanced)
