@@ -154,9 +154,10 @@ def _open_again(card):
     The outputs stay at their safe values: the node does not apply the codes of an OPEN. Sets all counts to 0, and
     `failure` if no answer comes within OPEN_TRIES times OPEN_WAIT_NS.
     """
-    while receive_frame(card) > GONE:
+    deadline_ns = monotonic_ns(card.timespec) + OPEN_WAIT_NS
+    while receive_frame(card) > GONE and monotonic_ns(card.timespec) < deadline_ns:
         pass  # Frames from before the first tick are old.
-    while take_strangers(card, MAX_FRAMES_PER_TICK) > 0:
+    while take_strangers(card, MAX_FRAMES_PER_TICK) > 0 and monotonic_ns(card.timespec) < deadline_ns:
         pass
     for _ in range(OPEN_TRIES):
         _send_drive(card, OPEN | ANSWER)
@@ -171,11 +172,17 @@ def _open_again(card):
 
 @jit
 def _await_answer(card, duration_ns):
-    """Receive frames until the last request is answered, or the exchange fails, for at most `duration_ns`."""
-    deadline_ns = monotonic_ns(card.timespec) + duration_ns
+    """Receive frames until the last request is answered, or the exchange fails, for at most `duration_ns`.
+
+    Of the frames that have come by then, up to MAX_FRAMES_PER_TICK are received, for the process may have been stopped.
+    """
+    deadline_ns, frames_after = monotonic_ns(card.timespec) + duration_ns, 0
     while card.newest != card.sequence and card.failure == 0:
-        if not _receive_one(card) and monotonic_ns(card.timespec) > deadline_ns:
-            break
+        has_frame = _receive_one(card)
+        if monotonic_ns(card.timespec) > deadline_ns:
+            frames_after += 1
+            if not has_frame or frames_after == MAX_FRAMES_PER_TICK:
+                break
 
 
 @jit

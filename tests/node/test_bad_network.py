@@ -231,6 +231,22 @@ def test_datagrams_beyond_those_of_a_tick_wait_for_the_next_one():
     assert run.column("node_lost_samples")[-1] == 0
 
 
+def test_a_flood_does_not_lengthen_the_wait_for_an_answer():
+    """After its deadline a read takes 64 more datagrams, not all that have come; the later reads take the others."""
+    with relayed(PythonNode()) as relay, opened(relay, answer="same tick", hold_ticks=5) as (driver, calls):
+        relay.floods = {4: 200}  # each tick has two slots: its drive and its request
+        relay.begin(Script())
+        invalid = []
+        for tick in range(8):
+            handled = relay.handled
+            assert calls.write([0.0]) == 0
+            relay.wait_handled(handled + 1)
+            driver._opened_card["deadline_ns"] = 0 if 2 <= tick < 6 else 10**10
+            invalid.append(calls.read()[1][2 + COUNTS.index("node_invalid_frames")])
+            relay.wait_handled(handled + 2)
+    assert invalid == [0, 0, 64, 128, 192, 200, 200, 200]
+
+
 def test_a_node_that_restarts_between_two_datagrams_ends_the_exchange(node, request):
     first = node
     with relayed(first) as relay, opened(relay) as (driver, calls):
