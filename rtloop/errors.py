@@ -95,7 +95,7 @@ class MissingExtra(RtloopError):
     exit_code = 78
 
     def __init__(self, message: str) -> None:
-        """Store the message; if it tells to run pip install 'rtloop[NAME]', add the command for a wheel's file.
+        """Store the message; if it names an extra to install, add the command for a wheel's file.
 
         No command is added if the message has it already.
         """

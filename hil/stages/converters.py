@@ -38,7 +38,7 @@ def lsb_and_range(range_v: float, bits: int) -> tuple[float, float, float]:
 
 @jit
 def quantise(lsb_v, lowest_v, highest_v, value_v):
-    """Return the converter's voltage nearest to `value_v` [V], within its range. NaN stays NaN.
+    """Return the converter's voltage, a multiple of `lsb_v`, nearest to `value_v` [V], within its range. NaN stays NaN.
 
     An ideal converter, with `lsb_v` 0, only clips the value to its range.
     """

@@ -29,7 +29,7 @@ SEED_KEY = "driver.seed"
 NOMINAL = 0
 """Number of the nominal rig, whose keys have the configured values."""
 LOOP_ENDED = "the loop ended early"
-"""Cause of a failure where a law raised an error in a tick."""
+"""Cause of a failure where the driver, the clock or the record of a law failed in a tick."""
 SHARES_FOR_EFFECT = (0.25, 0.75)
 """Shares of a distribution at which two rigs must have different records, coefficients or plans."""
 
@@ -176,7 +176,8 @@ class CaseRunner:
     def _run_loop(self, plan: Plan, driver: SimDriver, ticks: int) -> dict[str, Real]:
         """Run a plan for `ticks`; return by name the recorded columns that figures and verdict need.
 
-        Each column is (n,): n is `ticks`, or less if a law raised an error, which ends the loop early.
+        Each column is (n,): n is `ticks`, or less if the driver, the clock or the record of a law fails, which ends
+        the loop early. A law that raises an error trips; the loop then runs on.
         """
         names = (
             "flags",

@@ -219,10 +219,11 @@ def _print_listing(report: Mapping[str, Any]) -> None:
 
 
 def _suggest_mapping(columns: Sequence[Column], time: str | None) -> list[tuple[str, str]]:
-    """Return (signal, `COLUMN [UNIT]`) for each of EXAMPLE_SIGNALS, with another column each; fewer without columns.
+    """Return (signal, "COLUMN [UNIT]") for each of EXAMPLE_SIGNALS, with another column each; fewer without columns.
 
-    The column is the first whose unit converts to the signal's unit, else the first that is left; the column `time` and
-    other clocks are left out. `columns` is the value of this key in a `ColumnListing`.
+    COLUMN is the column's name without its unit, UNIT its unit or, if that does not convert, the signal's. The column
+    is the first whose unit converts to the signal's unit, else the first that is left; the column `time` and other
+    clocks are left out. `columns` is the value of this key in a `ColumnListing`.
     """
     from rtloop.interchange.mapping import name_without_unit
 

@@ -91,11 +91,11 @@ def robust(spec: Path, config: Path | None, out: Path | None, axis: str, as_json
 def shape(config: Path, spec: Path | None, out: Path | None, axis: str, plot: Path | None, as_json: bool) -> None:
     """Make taps for the fastest steps that the drive allows.
 
-    Computes both rows of [axis.prefilter] by linear programming over [shape.scenarios]: the least settling time with
-    which overshoot, undershoot and v stay within their limits, then the least variation of v.
+    Computes both rows of [axis.prefilter] by linear programming over [shape.scenarios]: the least settling time, or
+    shape.settling_ms if it is set, with which overshoot, undershoot and the command v stay within their limits, then
+    the least variation of v.
 
-    Exit 1 where no taps meet the limits; the message names the binding constraint and the least possible settling
-    time.
+    Exit 1 where no taps meet the limits; the message names a limit to relax, or the settling time that is possible.
     """
     from rtloop.configuration.file import load
     from rtloop.configuration.text_files import read_text

@@ -43,7 +43,8 @@ def cautions(prepared: Prepared) -> list[str]:
 
 def option_cautions(prepared: Prepared) -> list[str]:
     """Return warnings, a line each, about options, references, contradictions between axis and hardware, and loops that
-    do not control the simulated rig; no margin is computed.
+    are unstable on the simulated rig or, where axis and rig contradict each other, do not follow their reference on it.
+    No margin is computed.
     """
     configuration = prepared.configuration
     warnings = [f"loop.{line}" for line in _pacing(configuration)] + list(_service(configuration))

@@ -284,7 +284,7 @@ def describe(error: ValidationError, prefix: str, raw: object, known_keys: set[s
     """Return a line for each fault in `error`, raised for `raw`, the value of key `prefix`; `raw` None: not available.
 
     Beyond MAX_FAULTS, a last line says how many more there are. `known_keys` are suggested for an unknown key that
-    resembles one; None: no suggestion.
+    resembles one; with None, only missing required keys beside it are.
     """
     errors = error.errors(include_url=False)
     # A list that is too short only because entries are faulty is reported by the faults of its entries.

@@ -167,7 +167,8 @@ def _configuration_name(run: RecordedRun) -> str:
 
 
 def _require_distinct(runs: Sequence[RecordedRun]) -> None:
-    """Raise RecordingError if two recordings are of the same run: same experiment, run label and configuration."""
+    """Raise RecordingError if two recordings have the same experiment and run label, and both are of the first
+    configuration or both of the second one (`--beside`)."""
     run_by_key: dict[tuple[str, str, bool], RecordedRun] = {}
     for run in runs:
         key = run.experiment, run.label, run.is_comparison

@@ -283,7 +283,7 @@ def _open_parent(path: Path) -> Iterator[int]:
 def _walk_path(
     path: Path, mode: int | None, *, trusts_grants: bool = False, checks_trust: bool = True
 ) -> tuple[int, set[int], bool]:
-    """Resolve a path; return the folder's descriptor, the trusted user ids, and whether the folder is sticky.
+    """Resolve a path; return its descriptor, the trusted user ids, and whether it is sticky and others may write to it.
 
     Missing folders are made with `mode`, unless it is None. With `trusts_grants`, the owner of a folder counts as
     trusted if root owns all folders above it and they are not sticky. Without `checks_trust`, any folder is accepted,

@@ -28,7 +28,7 @@ def excitation_values(
     """Return the values of the templates of sine and step by name, for a position interlock at ±`position_um`.
 
     Values are numbers, or texts with the digits to print. `noise_um` is the sensor's noise, rms; `rate_hz` is the rate
-    of the step's loop, in whose ticks the times of the step are given.
+    of the step's loop: the times between the steps are in its ticks, the duration of the step is in s.
     """
     noise_um *= NOISE_DEVIATIONS
     lowest_v, highest_v = map(_shorten, actuator.drives_within(SINE_SHARE * position_um - noise_um))

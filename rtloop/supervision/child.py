@@ -100,7 +100,7 @@ class Child:
                 self.process.stdin.close()
 
     def _read(self) -> None:
-        """Queue the child's JSON lines until its stdout ends; other lines are dropped."""
+        """Queue the JSON objects, one a line, that the child prints, until its stdout ends; other lines are dropped."""
         for line in self.process.stdout or ():
             try:
                 report = json.loads(line)

@@ -384,8 +384,8 @@ def test_a_command_of_one_axis_that_is_no_number_lets_the_other_axis_ramp_in_the
     [
         (CONTROLLER, '[axis.controller]\nkind = "coupled"\naxes = ["x"]\nd = [[1]]\n', "1 axes; allowed for law"),
         ('axes = ["x", "y"]', 'axes = ["x"]', "2 loops for 1 axes; allowed: one loop for each axis"),
-        ('axes = ["x", "y"]', 'axes = ["y", "x"]', "axis.x.controller.axes: y, x; allowed: x, y, in this order"),
-        ('axes = ["x", "y"]', 'axes = ["x", "z"]', "axis.x.controller.axes: x, z; allowed: x, y, in this order"),
+        ('axes = ["x", "y"]', 'axes = ["y", "x"]', "controller.axes: y, x; allowed: x, y, in the order of the file"),
+        ('axes = ["x", "y"]', 'axes = ["x", "z"]', "controller.axes: x, z; allowed: x, y, in the order of the file"),
         (CONTROLLER, PID + 'axes = ["x", "y"]\n', "axes: 2 axes; allowed for law 'pid': 1"),
         ("coupling = { y = 0.15 }", "coupling = { z = 0.15 }", "unknown; allowed: the controller's other axes .y."),
         (DECOUPLING, "decoupling = [[1, 1], [1, 1]]", "depend on each"),

@@ -29,7 +29,8 @@ def robust_configuration(
 ) -> str:
     """Return TOML: the controller on axis `axis`, and a simulated rig of the plant of `design`.
 
-    `source` is the specification's name, `text` its content, `specification` its path relative to the configuration.
+    `source` is the specification's name, `text` its content, for its SHA-256 in a comment, `specification` its path
+    relative to the configuration.
     """
     written_design = design.model_copy(update={"controller": _output(design)})
     lines = provenance(robust, design, source, text)

@@ -366,7 +366,7 @@ class Reader:
         return valid
 
     def _report_chunk(self, entry: ChunkEntry, reason: DamagedChunk) -> None:
-        """List a damaged chunk, by its offset, in `problems`. Raises RecordingError unless the reader is tolerant."""
+        """List a damaged chunk, by its offset, in `problems`; raise RecordingError unless the reader is tolerant."""
         self._report(f"the chunk at byte {entry.offset} is damaged ({reason})")
 
     def _check_count(self, account: TickAccount) -> None:

@@ -76,7 +76,7 @@ class Writer:
 
     @contextlib.contextmanager
     def packing(self, rows: Real) -> Iterator[None]:
-        """Pack rows (n, columns) of ticks on all processors, while the block writes them by `write`, chunk by chunk.
+        """Pack rows (n, columns) of ticks by several threads, while the block writes them by `write`, chunk by chunk.
 
         Each `write` in the block must have the next `format.chunk_rows` rows, and the last one the rest;
         `start_unix_ns` must not change.

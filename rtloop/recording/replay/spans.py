@@ -117,8 +117,8 @@ def _is_plain(recording: Recording) -> bool:
 def _find_spans(recording: Recording, jobs: int, snapshot_ticks: Sequence[int]) -> list[Span]:
     """Return up to `jobs` spans of about equally many chunks, at least LEAST_CHUNKS each.
 
-    [] for fewer chunks, a damaged chunk, or a first tick without a snapshot. `snapshot_ticks` are the ticks of the
-    snapshots, ascending, without a snapshot that follows the last tick.
+    [] for fewer chunks in all, a damaged chunk in which a span would begin, or a first tick without a snapshot.
+    `snapshot_ticks` are the ticks of the snapshots, ascending, without a snapshot that follows the last tick.
     """
     starts: list[tuple[int, int]] = []
     with open_run(recording.paths) as readers:

@@ -47,7 +47,10 @@ def builder_lifetime() -> Iterator[None]:
 
 
 def _prepare_figures(configuration: Configuration, number: int, least_step_ms: float) -> Figures:
-    """Build a configuration and return `loop_figures` of axis `number`; runs in the limited process."""
+    """Build a configuration and return `loop_figures` of axis `number`, from 0; runs in the limited process.
+
+    The step response of the figures lasts at least `least_step_ms`.
+    """
     return loop_figures(prepare(configuration), number, least_step_ms)
 
 
