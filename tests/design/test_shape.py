@@ -283,7 +283,7 @@ def test_a_linear_programme_that_no_solver_finishes_is_refused_in_a_sentence(tmp
             {"overshoot": 0.02},
             "fail the proof on 9 plants: .* overshoot up to 2 %, and the command v stays within its limits",
         ),
-        ({"excess": 0.01}, "fail the proof on 9 plants: .* and the command v exceeds its limits by 1 % of a step"),
+        ({"excess": 0.01}, "fail the proof on 9 plants: .* the command v exceeds its limits by 1 % of the height"),
     ],
 )
 def test_taps_that_their_proof_does_not_bear_out_are_refused(monkeypatch, figures, message) -> None:

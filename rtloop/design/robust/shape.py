@@ -291,7 +291,8 @@ def _proof_failure(subject: Subject, settling_ms: float, proof: StepMeasures, pl
     It states the largest settling time and overshoot of `proof`, how far the command exceeds its limits, and a remedy.
     """
     is_beyond = proof.excess > ALLOWED_EXCESS
-    excess = f"exceeds its limits by {100 * proof.excess:.2g} % of a step" if is_beyond else "stays within its limits"
+    excess_text = f"exceeds its limits by {100 * proof.excess:.2g} % of the height of the step"
+    excess = excess_text if is_beyond else "stays within its limits"
     return (
         f"shape: the taps for a settling time of {settling_ms:.4g} ms and overshoot ≤ {100 * subject.overshoot:g} % "
         f"fail the proof on {plants} plants: the settling time is up to {proof.settling_ms:.4g} ms, the overshoot up "
