@@ -106,6 +106,7 @@ def test_dates_are_times(tmp_path: Path):
         ),
         ("t,u,w\n0,1,2\n\n" + "0,1,2\n" * 200 + "0,1,\n0,1\n0,1,2\n", "line 205 has 2 columns; allowed: 3"),
         ("t\tu\tw\n0\t1\t2\n\n" + "0\t1\t2\n" * 200 + "\t\t\n0\t1\n0\t1\t2\n", "line 205 has 2 columns; allowed: 3"),
+        ("t\tu\tw\n0\t1\t2\n\t\t\n" + "0\t1\t2\n" * 200 + "0\t1\n0\t1\t2\n", "line 204 has 2 columns; allowed: 3"),
         ("t,u\n" + "0,1\n" * 100 + "\n" + "0,1\n" * 100 + "0,1,2\n", "line 203 has 3 columns; allowed: 2"),
         ("2024-03-01 23:59:59,1\n" * 200 + "yesterday,1\n", "line 201 has no date"),
         ("2024-03-01 23:59:59,1\n" * 200 + "\nyesterday,1\n", "line 202 has no date"),
