@@ -252,6 +252,7 @@ def _structured_singular_value(matrices: Complex) -> Real:
             column = np.linalg.norm(balanced[:, is_other_axis, i], axis=1)
             is_coupled = (row > 0) & (column > 0)
             balanced[:, i, is_other_axis] *= is_coupled[:, None]
+            balanced[:, is_other_axis, i] *= is_coupled[:, None]
             scale = np.sqrt(np.where(is_coupled, column, 1.0) / np.where(is_coupled, row, 1.0))
             balanced[:, i, :] *= scale[:, None]
             balanced[:, :, i] /= scale[:, None]

@@ -301,6 +301,40 @@ def test_a_replacement_recorder_retains_as_many_ticks_as_after_an_event(tmp_path
     assert replay(recording).identical
 
 
+def test_a_long_overview_is_written_in_chunks_of_usual_size(tmp_path: Path):
+    """All intervals wait until the end of the run, because an event may still come that retains their ticks."""
+    settings = around_settings("x_drive_v > 100", before_s=20.0, every_s=0.001)
+    run = SelectiveRun(tmp_path / "run.mcap", settings)
+    totals = run.end(4 * SECOND)
+    assert (totals["ticks_lost"], totals["complete"]) == (0, True)
+    with run.path.open("rb") as file:
+        summary = make_reader(file).get_summary()
+    assert summary is not None
+    chunks = summary.chunk_indexes
+    assert sum(chunk.uncompressed_size for chunk in chunks) > 4 << 20
+    assert max(chunk.uncompressed_size for chunk in chunks) < 1.2 * (1 << 20)
+    with Reader(run.path) as reader:
+        intervals = reader.overview[:, 0, :2]
+        omitted = sum(count for _, count in reader.skipped_ranges)
+    assert np.array_equal(intervals[1:, 0], intervals[:-1, 1] + 1)
+    assert omitted + len(load(run.path)["tick"]) == 4 * SECOND
+
+
+def test_an_overview_of_many_chunks_is_written_as_early_as_one_of_a_single_chunk(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    flushed = []
+    for name in ("single", "many"):
+        run = SelectiveRun(tmp_path / f"{name}.mcap", around_settings("x_drive_v > 100", before_s=0.5, every_s=0.5))
+        run.run_to(16 * SECOND)
+        flushed.append(run.loop.block.load(Word.FLUSHED_TICKS))
+        run.end(17 * SECOND)
+        monkeypatch.setattr("rtloop.recording.capture.segment_buffer.most_intervals", lambda _: 2)
+    assert flushed[0] == flushed[1] > 10 * SECOND
+    with Reader(tmp_path / "single.mcap") as single, Reader(tmp_path / "many.mcap") as many:
+        assert np.array_equal(single.overview, many.overview, equal_nan=True)
+
+
 def test_the_mean_of_an_interval_ignores_nan():
     rows = np.zeros((6, 3))
     rows[:, 0] = np.arange(6)
@@ -308,6 +342,6 @@ def test_the_mean_of_an_interval_ignores_nan():
     rows[:, 2] = [1.0, 2.0, 6.0, 5.0, np.nan, 7.0]
     decimation = Decimation(columns=3, every=3)
     decimation.add_rows(rows)
-    first, second = decimation.take_intervals()
+    first, second = decimation.take_intervals(10)
     np.testing.assert_array_equal(first, [[0.0, 2.0, 1.0], [4.0, 8.0, 6.0], [1.0, 6.0, 3.0]])
     np.testing.assert_array_equal(second, [[3.0, 5.0, 4.0], [np.nan] * 3, [5.0, 7.0, 6.0]])

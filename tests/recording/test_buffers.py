@@ -61,7 +61,7 @@ def test_a_missing_tick_ends_an_interval_and_no_other_does() -> None:
     decimation.add_rows(rows[3:])
     assert decimation.pending_count == 3
     assert decimation.first_tick == 0
-    intervals = decimation.take_intervals()
+    intervals = decimation.take_intervals(10)
     assert intervals[:, TICK, :2].tolist() == [[0, 6], [8, 17], [18, 24]]
     for interval, part in zip(intervals, (rows[:7], rows[7:17], rows[17:]), strict=True):
         np.testing.assert_array_equal(interval[:, 0], part.min(axis=0))

@@ -194,6 +194,20 @@ def test_after_a_play_that_fails_the_player_returns_to_the_setpoint(bench: Bench
     assert bench.setpoint_of_loop() == SETPOINT_UM
 
 
+def test_in_raw_mode_the_player_does_not_send_its_setpoint_as_volts(bench: Bench) -> None:
+    """The mode changes during a measurement: the loop holds its drive, which 5 µm taken for 5 V would move."""
+    player = bench.player()
+    with player.return_to_hold():
+        player.play(np.full((10, 1), 6.0))
+        bench.set_mode(Mode.RAW)
+    held_v = bench.loop.column(bench.loop.run(1), "x_reference_um")[0]
+    drives_v = bench.loop.column(bench.loop.run(100), "x_drive_v")
+    assert np.ptp(drives_v) == 0.0
+    assert drives_v[0] == held_v != SETPOINT_UM
+    with pytest.raises(Refusal, match="the earlier reference is in µm; references in mode raw are in V"):
+        player.hold(SETPOINT_UM)
+
+
 def test_a_refused_reference_of_another_client_leaves_the_axis_to_the_player(bench: Bench) -> None:
     player = bench.player()
     bench.desk.failures = [WITHDRAWN]

@@ -21,7 +21,7 @@ from tests.design.measured_loops import compute_margins
 from tests.faults.bench import Bench
 from tests.faults.evidence import wait_for
 from tests.service.http import answer
-from tests.service.test_response import CONFIGURATION, LOOP, OMEGA, QUICK_REQUEST, SETPOINT_UM
+from tests.service.test_response import CONFIGURATION, LOOP, OMEGA, QUICK_REQUEST, RATE_HZ, SETPOINT_UM
 from tests.stage_text import resonance
 
 MODEL = f"""
@@ -176,4 +176,23 @@ def test_a_learning_that_trips_leaves_the_setpoint_as_reference(running: Bench):
     running.client.post("/reset")
     running.client.post("/start")
     running.await_state("running")
+    assert_reference_returns(running)
+
+
+def test_a_learning_in_which_the_mode_becomes_raw_leaves_the_drive_as_it_is(running: Bench):
+    hold_setpoint(running)
+    answers: list[tuple[int, Any]] = []
+    request = REQUEST | {"cycles": LONG_CYCLES}
+    learning = threading.Thread(target=lambda: answers.append(answer(running, "POST", "/learn", request)))
+    learning.start()
+    await_tables(running)
+    tick = running.client.post("/mode", {"mode": "raw"})["tick"]
+    learning.join()
+    ((code, text),) = answers
+    assert (code, "the mode is not closed_loop" in text["error"]) == (409, True), text
+    wait_for(lambda: running.ticks > tick + RATE_HZ, "a second in raw mode")
+    axis = running.client.get("/status")["axes"]["x"]
+    assert axis["drive_v"] == axis["reference_um"] != SETPOINT_UM
+    running.client.post("/mode", {"mode": "closed_loop"})
+    hold_setpoint(running)
     assert_reference_returns(running)

@@ -86,13 +86,13 @@ def test_changes_to_and_fro_are_taken_back_in_their_order():
         history.add(change)
     history.add(Change(1, "limits", axis, "of another axis"))
     undone = []
-    while (change := history.newest(0, 0)) is not None:
+    while (change := history.newest(0, 0)[0]) is not None:
         undone.append(change.before.name)
         history.remove(change)
     assert undone == ["x", "other", "x", "other", "x"]
-    assert history.newest(1, 1) is not None
+    assert history.newest(1, 1)[0] is not None
     history.remove()
-    assert history.newest(1, 1) is None
+    assert history.newest(1, 1) == (None, None)
 
 
 def test_an_axis_undoes_its_own_changes_and_those_of_the_controller_that_it_shares():
@@ -103,13 +103,16 @@ def test_an_axis_undoes_its_own_changes_and_those_of_the_controller_that_it_shar
         history.add(Change(number, section, axis, f"{section} of {number}"))
 
     def undo(number: int) -> str | None:
-        change = history.newest(number, owner=0)
+        change, blocker = history.newest(number, owner=0)
+        if blocker is not None:
+            return f"first {blocker.text}"
         if change is not None:
             history.remove(change)
         return change and change.text
 
-    assert [undo(1), undo(1), undo(1)] == ["model of 1", "limits of 1", None]  # axis 0 has changed its limits since
-    assert [undo(0), undo(1), undo(1)] == ["limits of 0", "controller of 0", None]
+    assert [undo(1), undo(1), undo(1)] == ["model of 1", "first limits of 0", "first limits of 0"]
+    assert [undo(0), undo(1), undo(1), undo(1)] == ["limits of 0", "controller of 0", "limits of 1", None]
+    assert undo(2) == "controller of 2"
 
 
 def test_a_refused_change_is_none_to_undo(running: Bench):

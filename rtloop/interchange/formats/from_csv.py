@@ -159,16 +159,20 @@ def _require_even_rows(path: Path, dialect: CsvDialect, without_last: npt.NDArra
 
 
 def _number_rows(lines: _NumberLines, dialect: CsvDialect) -> Iterator[tuple[int, str]]:
-    """Yield number, from 1, and text of each line with a row of numbers; pandas skips blank lines, too."""
+    """Yield number, from 1, and text of each line with a row of numbers; pandas skips lines of blanks and tabs, too."""
     for number, line in enumerate(lines, start=dialect.first + 1):
-        if line.strip() or (dialect.delimiter is not None and dialect.delimiter in line):
+        if line.strip(" \t\r\n") or (dialect.delimiter is not None and dialect.delimiter in line):
             yield number, line
 
 
 def _line_number(path: Path, dialect: CsvDialect, row: int) -> int:
-    """Return the number, from 1, of the line with a row of numbers; the first row has index 0."""
+    """Return the number, from 1, of the line with a row of numbers; the first row has index 0.
+
+    A quoted text with line breaks above it makes the number too small.
+    """
     with contextlib.closing(_NumberLines(path, dialect)) as lines:
-        return next(itertools.islice(_number_rows(lines, dialect), row, None))[0]
+        number, _ = next(itertools.islice(_number_rows(lines, dialect), row, None), (dialect.first + row + 1, ""))
+        return number
 
 
 def _uneven_row_message(line: int, columns: int, dialect: CsvDialect) -> str:
@@ -195,7 +199,7 @@ def _column_numbers(path: Path, dialect: CsvDialect, values: Any) -> Real:
         row = int(values.index[invalid_rows[0]])
         raise UnreadableData(
             f"{path}: column {dialect.names[values.name]!r}: {str(values.iloc[invalid_rows[0]])[:60]!r} is not a "
-            f"number (line {_line_number(path, dialect, row)})"
+            f"number (about line {_line_number(path, dialect, row)})"
         )
     return numbers
 
@@ -211,7 +215,7 @@ def _dates_ns(path: Path, dialect: CsvDialect, values: Any) -> npt.NDArray[np.in
     if dates.isna().any():
         row = int(values.index[int(np.argmax(dates.isna()))])
         line = _line_number(path, dialect, row)
-        raise UnreadableData(f"{path}: column {dialect.names[values.name]!r}: line {line} has no date")
+        raise UnreadableData(f"{path}: column {dialect.names[values.name]!r}: no date (about line {line})")
     return dates.dt.tz_localize(None).to_numpy("datetime64[ns]").astype(np.int64)
 
 

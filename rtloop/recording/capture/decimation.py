@@ -39,10 +39,13 @@ class Decimation:
                 self._end_interval()
             self._add_run(run)
 
-    def take_intervals(self) -> Intervals:
-        """Remove and return all intervals (n ≥ 0, columns, 3: minimum, maximum, mean), also the unfinished one."""
-        self._end_interval()
-        intervals, self._intervals = self._intervals, []
+    def take_intervals(self, most: int) -> Intervals:
+        """Remove and return the first intervals (0 ≤ n ≤ `most`, columns, 3: minimum, maximum, mean), also the
+        unfinished one if there are fewer.
+        """
+        if len(self._intervals) < most:
+            self._end_interval()
+        intervals, self._intervals = self._intervals[:most], self._intervals[most:]
         return np.stack(intervals) if intervals else np.empty((0, self._columns, len(STATISTICS)))
 
     def requeue(self, intervals: Intervals) -> None:

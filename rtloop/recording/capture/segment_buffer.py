@@ -21,7 +21,7 @@ from rtloop.recording.capture.decimation import Decimation
 from rtloop.recording.capture.pending import MAX_PENDING_EVENTS, PendingEntry, count_pending
 from rtloop.recording.file.event_window import OVERVIEW_BATCH_S, SNAPSHOT_S, EventWindow
 from rtloop.recording.file.topics import format
-from rtloop.recording.file.topics.overview import Intervals
+from rtloop.recording.file.topics.overview import Intervals, most_intervals
 from rtloop.signals import TICK
 
 MAX_WAITING_BYTES = 512 << 20
@@ -76,6 +76,7 @@ class SegmentBuffer:
         self._ticks_before, self._ticks_after = round(window.before_s * rate_hz), round(window.after_s * rate_hz)
         self._overview_ticks = round(max(window.every_s, OVERVIEW_BATCH_S) * rate_hz)
         self._decimation = Decimation(len(columns), max(round(window.every_s * rate_hz), 1))
+        self._most_intervals = most_intervals(len(columns))
         self._skipped_entries: list[PendingEntry] = []
         self._skipped_ticks = 0
         self._segments = deque([Segment(begin, retain=True, file_decided=True)])
@@ -234,9 +235,15 @@ class SegmentBuffer:
         self._skipped_ticks += len(batch.rows)
 
     def _take_skipped(self) -> WriteBatch:
-        """Remove and return minimum, maximum and mean per interval of the omitted ticks, with the ticks' events."""
-        entries, self._skipped_entries, self._skipped_ticks = self._skipped_entries, [], 0
-        return WriteBatch(entries, self._empty_arrays[0], self._decimation.take_intervals())
+        """Remove and return minimum, maximum and mean per interval of the omitted ticks, with the ticks' events.
+
+        What does not fit into one chunk waits for the next call.
+        """
+        entries, self._skipped_entries = self._skipped_entries, []
+        intervals = self._decimation.take_intervals(self._most_intervals)
+        if not self._decimation.pending_count:
+            self._skipped_ticks = 0
+        return WriteBatch(entries, self._empty_arrays[0], intervals)
 
 
 def _event_kind(entry: PendingEntry) -> str | None:

@@ -30,18 +30,22 @@ class ChangeHistory:
         """Add a change as the newest one; beyond MAX_CHANGES the oldest one is removed."""
         self._changes.append(change)
 
-    def newest(self, number: int, owner: int) -> Change | None:
-        """Return the newest change of axis `number`, or of the controller that it shares, of axis `owner`.
+    def newest(self, number: int, owner: int) -> tuple[Change | None, Change | None]:
+        """Return the newest change of axis `number` or of the controller that it shares, of axis `owner`, and the
+        change to undo before it; None without one.
 
-        The change stays in the history. None without one; a change of the controller does not count if `owner`, another
-        axis, has a newer change of another section, because its options before include that section.
+        Before a change of the controller, the newest change of another section of `owner`, if it is another axis, must
+        be undone: the options before the change of the controller include that section. Both stay in the history.
         """
+        blocker = None
         for change in reversed(self._changes):
-            if change.number == number or (change.number == owner and change.section == "controller"):
-                return change
-            if change.number == owner:
-                owner = number
-        return None
+            if change.number == number:
+                return change, None
+            if change.number == owner and change.section == "controller":
+                return change, blocker
+            if change.number == owner and blocker is None:
+                blocker = change
+        return None, None
 
     def remove(self, change: Change | None = None) -> None:
         """Remove `change`, which must be an object that the history holds; None removes all changes."""

@@ -123,16 +123,22 @@ class LiveLaw:
     def undo(self, axis: str) -> tuple[int, str]:
         """Undo the newest change of an axis or of its controller: load the options that the changed axis had before.
 
-        A later change of something else of the axis that owns a shared controller must be undone there first.
-
         The reference stays; the change leaves the history, except after an error. Returns the tick of the load, and the
-        undone change in words. Raises ConfigError for an unknown axis, Refusal if there is no change, and as `tune`.
+        undone change in words. Raises ConfigError for an unknown axis, Refusal if there is no change, Refusal for a
+        change of a shared controller if its owner, another axis, has a newer change of another section, and as `tune`.
         """
         with self._build_lock:
             number, configuration = self.axis_number(axis), self.prepared.configuration
-            change = self._history.newest(number, configuration.owners[number])
+            owner = configuration.owners[number]
+            change, blocker = self._history.newest(number, owner)
             if change is None:
                 raise Refusal(f"undo: axis {axis} has no change since the loop started or was reloaded")
+            if blocker is not None:
+                name = configuration.axes[owner].name
+                raise Refusal(
+                    f"undo: axis {axis} shares the controller of axis {name}, which has a newer change "
+                    f"({blocker.text}); undo that change of axis {name} first"
+                )
             reference = configuration.axes[change.number].reference
             tick = self._swap(change.number, change.before.model_copy(update={"reference": reference}))
             self._history.remove(change)

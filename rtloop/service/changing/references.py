@@ -74,10 +74,10 @@ class LiveReferences:
     def set(self, axis: str, reference: Mapping[str, object], *, restores: bool = False) -> int:
         """Start a generator, {kind, …} as in [axis.reference], on the axis of this name. Returns its first tick.
 
-        Its values are in µm, in raw mode in V. `restores`: the reference was active before, so a constant one is not
-        refused beyond the position interlock, which may have been narrowed since. Raises ConfigError for an unknown
-        axis, invalid keys, a table that cannot be read and values beyond the limits; Refusal within `reserved`, and as
-        `Desk.submit`.
+        Its values are in µm, in raw mode in V. `restores`: the reference, in µm, was active before, so a constant one
+        is not refused beyond the position interlock, which may have been narrowed since. Raises ConfigError for an
+        unknown axis, invalid keys, a table that cannot be read and values beyond the limits; Refusal within `reserved`,
+        with `restores` in raw mode, and as `Desk.submit`.
         """
         try:
             options = type_adapter(ReferenceOptions).validate_python(dict(reference))
@@ -266,7 +266,8 @@ class LiveReferences:
         Table samples go to shared memory. `values` and `samples` as `generator` returns them, `restores` as in `set`.
         Raises ConfigError for values beyond limits.command_um (in raw mode: beyond the limits of the drive), for a
         constant reference beyond the position interlock (not in raw mode) and for too many samples; Refusal within
-        `reserved` and while the loop may still read an earlier table; else as `Desk.submit`.
+        `reserved`, with `restores` in raw mode, and while the loop may still read an earlier table; else as
+        `Desk.submit`.
         """
         if self._activity:
             raise Refusal(f"reference: {self._activity}; send the request again afterwards")
@@ -274,6 +275,8 @@ class LiveReferences:
         limits = options.limits
         lowest, highest = extent(values, samples)
         if self._staging.in_raw_mode:
+            if restores:
+                raise Refusal("reference: the earlier reference is in µm; references in mode raw are in V")
             if not limits.lowest_v <= lowest <= highest <= limits.drive_v:
                 allowed = f"{limits.lowest_v:g} V … {limits.drive_v:g} V (limits.drive_min_v, limits.drive_v)"
                 raise invalid_request(

@@ -86,8 +86,8 @@ def learn(
     Raises ConfigError for an invalid request and for a loop in which learning would not converge, Refusal if the state
     does not allow the learning or the learning was aborted. After an abort the reference becomes the best table if
     `keep` is true, a cycle was judged and the loop is still in closed loop without a trip; else the setpoint. It stays
-    if a client has set another one. Raises ClientDisconnected if the client disconnects before the end; the loop then
-    returns to its setpoint.
+    in raw mode, and if a client has set another one. Raises ClientDisconnected if the client disconnects before the
+    end; the loop then returns to its setpoint.
     """
     number = live.axis_number(axis)
     rate_hz = live.prepared.configuration.loop.rate_hz
@@ -110,21 +110,22 @@ def learn(
     except Exception:
         if player.owns_reference:
             with suppress(RtloopError):
-                _set_final_reference(player, trials, request.keep and player.is_in_closed_loop)
+                _set_final_reference(player, trials, request.keep)
         raise
     return LearnResult(trials.cycles, trials.best_table, end_reason)
 
 
 def _set_final_reference(player: Player, trials: _Trials, keep: bool) -> None:
-    """Play the best table endlessly if `keep` is true, one was judged and the client is connected; else return to the
-    setpoint.
+    """Play the best table endlessly if `keep` is true, one was judged, the client is connected and the loop is in
+    closed loop without a trip; else return to the setpoint.
 
     Raises as `Player.play` and `Player.hold`.
     """
-    if keep and trials.tables and is_client_waiting():
+    if keep and trials.tables and is_client_waiting() and player.is_in_closed_loop:
         player.play(trials.best_table, repeat=True)
-    else:
-        player.hold(player.hold_um)
+        if player.is_in_closed_loop:  # A trip until here would let the stage scan after reset and start.
+            return
+    player.hold(player.hold_um)
 
 
 class _Trials:

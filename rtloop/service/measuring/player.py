@@ -80,8 +80,9 @@ class Player:
             return self._live.references.set_waveform(self.axis, samples, 1, repeat)
 
     def hold(self, value_um: float) -> None:
-        """Set a constant reference, also in place of another client's, and wait REST_S. Raises as
-        `LiveReferences.set`.
+        """Set a constant reference, µm, also in place of another client's, and wait REST_S.
+
+        Raises as `LiveReferences.set`, also Refusal in raw mode, in which the loop holds its output.
         """
         with self._count_own_reference():
             self._live.references.set(self.axis, {"kind": "hold", "value": value_um}, restores=True)

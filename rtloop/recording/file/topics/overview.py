@@ -24,10 +24,20 @@ from rtloop.signals import DEADLINE, TICK
 
 MINIMUM, MAXIMUM, MEAN = range(3)
 STATISTICS = ("min", "max", "mean")
+LARGEST_FIELD_BYTES = 3 + 8
+"""Size of a double with a tag of three bytes."""
 Intervals = Real
 """Array (n, columns, 3) of statistics: minimum, maximum, mean."""
 Range = tuple[int, int]
 """Range of ticks: first tick, count."""
+
+
+def most_intervals(columns: int) -> int:
+    """Return the largest number of intervals of `columns` signals, at least 1, whose messages fit into a usual chunk.
+
+    The reader refuses chunks that are much larger.
+    """
+    return max(1, format.MAX_CHUNK_BYTES // (len(STATISTICS) * columns * LARGEST_FIELD_BYTES))
 
 
 def overview_records(columns: Sequence[str]) -> list[McapRecord]:
