@@ -159,17 +159,24 @@ def test_learning_ends_with_its_client_and_the_held_reference_comes_back(running
     assert_reference_returns(running)
 
 
-def test_a_learning_that_trips_leaves_the_setpoint_as_reference(running: Bench):
-    """After a reset the stage returns to its setpoint, and does not scan."""
-    hold_setpoint(running)
+def learn_until(bench: Bench, end: Callable[[], Any]) -> tuple[Any, int, Any]:
+    """Learn from the setpoint, call `end` while tables are tried; return its result, and status and body of /learn."""
+    hold_setpoint(bench)
     answers: list[tuple[int, Any]] = []
     request = REQUEST | {"cycles": LONG_CYCLES}
-    learning = threading.Thread(target=lambda: answers.append(answer(running, "POST", "/learn", request)))
+    learning = threading.Thread(target=lambda: answers.append(answer(bench, "POST", "/learn", request)))
     learning.start()
-    await_tables(running)
-    running.client.post("/tune", {"axis": "x", "section": "interlocks", "values": {"position_um": 3.0}})
+    await_tables(bench)
+    result = end()
     learning.join()
     ((code, text),) = answers
+    return result, code, text
+
+
+def test_a_learning_that_trips_leaves_the_setpoint_as_reference(running: Bench):
+    """After a reset the stage returns to its setpoint, and does not scan."""
+    tight = {"axis": "x", "section": "interlocks", "values": {"position_um": 3.0}}
+    _, code, text = learn_until(running, lambda: running.client.post("/tune", tight))
     assert (code, "the loop tripped (position" in text["error"]) == (409, True), text
     assert reference_um(running) == SETPOINT_UM
     running.client.post("/undo", {"axis": "x"})
@@ -180,17 +187,9 @@ def test_a_learning_that_trips_leaves_the_setpoint_as_reference(running: Bench):
 
 
 def test_a_learning_in_which_the_mode_becomes_raw_leaves_the_drive_as_it_is(running: Bench):
-    hold_setpoint(running)
-    answers: list[tuple[int, Any]] = []
-    request = REQUEST | {"cycles": LONG_CYCLES}
-    learning = threading.Thread(target=lambda: answers.append(answer(running, "POST", "/learn", request)))
-    learning.start()
-    await_tables(running)
-    tick = running.client.post("/mode", {"mode": "raw"})["tick"]
-    learning.join()
-    ((code, text),) = answers
+    response, code, text = learn_until(running, lambda: running.client.post("/mode", {"mode": "raw"}))
     assert (code, "the mode is not closed_loop" in text["error"]) == (409, True), text
-    wait_for(lambda: running.ticks > tick + RATE_HZ, "a second in raw mode")
+    wait_for(lambda: running.ticks > response["tick"] + RATE_HZ, "a second in raw mode")
     axis = running.client.get("/status")["axes"]["x"]
     assert axis["drive_v"] == axis["reference_um"] != SETPOINT_UM
     running.client.post("/mode", {"mode": "closed_loop"})
