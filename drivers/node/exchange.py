@@ -174,7 +174,8 @@ def _open_again(card):
 def _await_answer(card, duration_ns):
     """Receive frames until the last request is answered, or the exchange fails, for at most `duration_ns`.
 
-    Of the frames that have come by then, up to MAX_FRAMES_PER_TICK are received, for the process may have been stopped.
+    After that time, up to MAX_FRAMES_PER_TICK waiting frames are still received, because the answer may be among them
+    if the process was suspended.
     """
     deadline_ns, frames_after = monotonic_ns(card.timespec) + duration_ns, 0
     while card.newest != card.sequence and card.failure == 0:

@@ -238,10 +238,10 @@ def _structured_singular_value(matrices: Complex) -> Real:
     """Return an upper bound (k,) of the structured singular value μ of `matrices` (k, m, m), for one complex change per
     axis (a diagonal); exact for two axes.
 
-    The bound is σ̄ after a scaling that makes, for each axis, the norms of its row and its column off the diagonal equal
-    (Osborne, 1960): the Frobenius norm is then least, and with it, for two axes, the largest singular value, as the
-    product of both singular values does not depend on the scaling. An axis that only acts on others, or on which
-    only others act, counts as uncoupled: scaling makes such a coupling as small as one likes.
+    The bound is σ̄ after a scaling that makes, for each axis, the norm of its row equal to the norm of its column, both
+    without the diagonal (Osborne, 1960). The Frobenius norm is then least. For two axes the largest singular value is
+    least, too, because the product of both singular values does not depend on the scaling. The couplings of an axis
+    that only acts on others, or is only acted on, are set to 0: scaling makes them arbitrarily small.
     """
     balanced = matrices.copy()
     axes = np.arange(balanced.shape[1])

@@ -159,16 +159,19 @@ def _require_even_rows(path: Path, dialect: CsvDialect, without_last: npt.NDArra
 
 
 def _number_rows(lines: _NumberLines, dialect: CsvDialect) -> Iterator[tuple[int, str]]:
-    """Yield number, from 1, and text of each line with a row of numbers; pandas skips lines of blanks and tabs, too."""
+    """Yield, for each line with a row of numbers, its line number in the file, from 1, and its text.
+
+    Empty lines and lines of blanks and tabs are left out, as pandas does.
+    """
     for number, line in enumerate(lines, start=dialect.first + 1):
         if line.strip(" \t\r\n") or (dialect.delimiter is not None and dialect.delimiter in line):
             yield number, line
 
 
 def _line_number(path: Path, dialect: CsvDialect, row: int) -> int:
-    """Return the number, from 1, of the line with a row of numbers; the first row has index 0.
+    """Return the line number in the file, from 1, of the row of numbers with index `row`, from 0.
 
-    A quoted text with line breaks above it makes the number too small.
+    The result is too small if an earlier row has a quoted text with line breaks.
     """
     with contextlib.closing(_NumberLines(path, dialect)) as lines:
         number, _ = next(itertools.islice(_number_rows(lines, dialect), row, None), (dialect.first + row + 1, ""))

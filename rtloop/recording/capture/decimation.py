@@ -40,8 +40,9 @@ class Decimation:
             self._add_run(run)
 
     def take_intervals(self, most: int) -> Intervals:
-        """Remove and return the first intervals (0 ≤ n ≤ `most`, columns, 3: minimum, maximum, mean), also the
-        unfinished one if there are fewer.
+        """Remove and return up to `most` of the oldest intervals, (n, columns, 3: minimum, maximum, mean).
+
+        The unfinished interval is returned too if fewer than `most` finished ones wait.
         """
         if len(self._intervals) < most:
             self._end_interval()

@@ -31,11 +31,12 @@ class ChangeHistory:
         self._changes.append(change)
 
     def newest(self, number: int, owner: int) -> tuple[Change | None, Change | None]:
-        """Return the newest change of axis `number` or of the controller that it shares, of axis `owner`, and the
-        change to undo before it; None without one.
+        """Return the newest change that `undo` of axis `number` may take back, and the change that blocks it; each None
+        if there is none.
 
-        Before a change of the controller, the newest change of another section of `owner`, if it is another axis, must
-        be undone: the options before the change of the controller include that section. Both stay in the history.
+        Candidates are all changes of axis `number`, and changes of the section "controller" of axis `owner`, whose
+        controller axis `number` uses. A newer change of another section of `owner` blocks a change of the controller,
+        which restores all options of `owner`. Nothing is removed from the history.
         """
         blocker = None
         for change in reversed(self._changes):

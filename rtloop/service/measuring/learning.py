@@ -116,8 +116,8 @@ def learn(
 
 
 def _set_final_reference(player: Player, trials: _Trials, keep: bool) -> None:
-    """Play the best table endlessly if `keep` is true, one was judged, the client is connected and the loop is in
-    closed loop without a trip; else return to the setpoint.
+    """Play the best table endlessly if `keep` is true, a table was judged, the client is connected and the mode is
+    closed_loop without a trip; else set the setpoint as reference.
 
     Raises as `Player.play` and `Player.hold`.
     """

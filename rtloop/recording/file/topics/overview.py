@@ -33,7 +33,7 @@ Range = tuple[int, int]
 
 
 def most_intervals(columns: int) -> int:
-    """Return the largest number of intervals of `columns` signals, at least 1, whose messages fit into a usual chunk.
+    """Return how many intervals of `columns` signals fit into a chunk of MAX_CHUNK_BYTES; 1 if none does.
 
     The reader refuses chunks that are much larger.
     """
