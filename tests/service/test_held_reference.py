@@ -22,7 +22,7 @@ from rtloop.service.changing.staging import Staging
 from rtloop.service.desk import Refusal, UnconfirmedCommand
 from rtloop.service.measuring import player as player_module
 from rtloop.service.measuring.player import Player
-from rtloop.signals import Mode
+from rtloop.signals import FLAGS, MODE, Flag, Mode
 from rtloop.supervision.supervisor import Supervisor
 from tests.engine.harness import AXIS, CONTROLLER, IDEAL, LoopBench, prepare_text, text
 
@@ -206,6 +206,17 @@ def test_in_raw_mode_the_player_does_not_send_its_setpoint_as_volts(bench: Bench
     assert drives_v[0] == held_v != SETPOINT_UM
     with pytest.raises(Refusal, match="the earlier reference is in µm; references in mode raw are in V"):
         player.hold(SETPOINT_UM)
+
+
+@pytest.mark.parametrize(("mode", "flag", "is_closed"), [(3, 0, True), (3, Flag.TRIP_POSITION, False), (0, 0, False)])
+def test_a_tick_with_a_trip_is_not_in_closed_loop(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch, mode: int, flag: int, is_closed: bool
+) -> None:
+    """The tick of a trip may still have the mode closed_loop."""
+    player, rows = bench.player(), bench.loop.block.ring("ticks").slots[:1].copy()
+    rows[:, MODE], rows[:, FLAGS] = mode, flag
+    monkeypatch.setattr(Supervisor, "newest", lambda *_: rows)
+    assert player.is_in_closed_loop == is_closed
 
 
 def test_a_refused_reference_of_another_client_leaves_the_axis_to_the_player(bench: Bench) -> None:
