@@ -114,6 +114,12 @@ def discretise_controller(
     that is held. Raises ValueError for a bad period, method or frequency, a pole or zero that the method cannot map,
     and where no anti-windup exists.
     """
+    _require_valid(period_s, method, prewarp_hz)
+    if _is_at_zero(transfer.poles, period_s).any() and (cancelled := _is_at_zero(transfer.zeros, period_s)).any():
+        raise ValueError(
+            f"zeros: {transfer.zeros[cancelled][0].real:g} rad/s cancels the controller's integrator at 0 rad/s; "
+            "remove both"
+        )
     discrete = discretise_transfer(transfer, period_s, method, prewarp_hz)
     a, b, c, d = discrete.system
     return DiscreteController(
@@ -134,6 +140,7 @@ def discretise_transfer(
     if transfer.gain == 0 or transfer.order == 0:
         no_roots, static = np.empty(0, dtype=complex), _static_system(transfer)
         return DiscreteTransfer(no_roots, no_roots, static.d, static, "modal")
+    transfer = _with_integrators(transfer, period_s)
     if method in ("zoh", "foh"):
         system, form = _exact_hold(transfer, period_s, method == "foh")
         zeros, gain = zeros_and_gain(system)
@@ -142,6 +149,17 @@ def discretise_transfer(
         _map_matched(transfer, period_s) if method == "matched" else _map_tustin(transfer, period_s, prewarp_hz)
     )
     return DiscreteTransfer(zeros, poles, gain, *realise(zeros, poles, gain, unit_circle_points()))
+
+
+def _is_at_zero(roots: Complex, period_s: float) -> npt.NDArray[np.bool_]:
+    """Return whether the image exp(sT) of each root rounds to 1, that of a root at 0."""
+    return np.abs(roots) * period_s < np.finfo(float).eps
+
+
+def _with_integrators(transfer: Transfer, period_s: float) -> Transfer:
+    """Return `transfer` with a pole at 0 in place of one that rounds to it, as numerical programs print integrators."""
+    poles = np.where(_is_at_zero(transfer.poles, period_s), 0, transfer.poles)
+    return Transfer(transfer.zeros, poles, transfer.gain)
 
 
 def zero_order_hold(transfer: Transfer, period_s: float) -> System:
@@ -206,12 +224,17 @@ def _map_matched(transfer: Transfer, period_s: float) -> tuple[Complex, Complex,
     gain = complex(transfer.gain)
     for root in transfer.zeros[~is_representable]:
         gain *= -root
-    for root, image in zip(transfer.zeros[is_representable], zeros, strict=True):
-        gain *= -root / (1 - image) if root else 1 / period_s
-    for root, image in zip(transfer.poles, poles, strict=True):
-        gain *= (1 - image) / -root if root else period_s
+    for root in transfer.zeros[is_representable]:
+        gain /= _matched_factor(root, period_s)
+    for root in transfer.poles:
+        gain *= _matched_factor(root, period_s)
     infinite = poles.size - transfer.zeros.size
     return _add_zeros_at_minus_one(zeros, infinite), poles, gain.real / 2.0**infinite
+
+
+def _matched_factor(root: complex, period_s: float) -> complex:
+    """Return (1 − exp(root·T))/(−root), in s, without cancellation near 0; T at 0."""
+    return complex(np.expm1(root * period_s) / root) if root else period_s
 
 
 def _map_tustin(transfer: Transfer, period_s: float, prewarp_hz: float | None) -> tuple[Complex, Complex, float]:

@@ -77,6 +77,34 @@ def rounding_error(controller, hz) -> float:
     return max_error
 
 
+@pytest.mark.parametrize("distance", [1e-16, 3.6e-15, 1e-12, 1e-8])
+@pytest.mark.parametrize(("method", "prewarp_hz"), METHODS)
+def test_roots_next_to_0_each_other_and_half_the_rate_lose_few_digits(method, prewarp_hz, distance):
+    half_rate = np.pi / T
+    near_half_rate = [complex(-50, sign * half_rate * (1 - distance)) for sign in (1, -1)]
+    for zeros, poles in [
+        ([-300.0], [-distance, -4000.0]),
+        ([-300.0], [distance, -4000.0]),
+        ([-distance], [-300.0, -4000.0]),
+        ([distance], [-300.0, -4000.0]),
+        ([-30.0, -300.0], [-distance, -2 * distance, -4000.0]),
+        ([-30.0, -300.0], [distance * (-1 + 1j), distance * (-1 - 1j), -4000.0]),
+        ([-30.0], [-300.0, -300.0 * (1 + distance), -4000.0]),
+        ([-30.0, -300.0], [-300.0 * (1 + distance), -4000.0, -10.0]),
+        ([-30.0], [complex(-distance, 3740), complex(-distance, -3740), -4000.0]),
+        ([-30.0], [*near_half_rate, -4000.0]),
+        (near_half_rate, [-30.0, -300.0, -4000.0]),
+    ]:
+        error = worst_error(Transfer.from_zpk(zeros, poles, 2.0), method, prewarp_hz, HZ[[0, 2, 6]])
+        assert error < 1e-10, (zeros, poles)
+
+
+def test_a_zero_that_cancels_the_integrator_is_refused_with_its_place():
+    for zero, pole in [(0.0, 0.0), (-2e-13, -1e-13)]:
+        with pytest.raises(ValueError, match="cancels the controller's integrator"):
+            discretise_controller(Transfer.from_zpk([zero], [pole, -4000.0], 1.0), T)
+
+
 @pytest.mark.parametrize(("method", "prewarp_hz"), METHODS)
 def test_paper_controller_to_1e9(method, prewarp_hz) -> None:
     """The controller is eq (20), sampled at 10 kHz."""
