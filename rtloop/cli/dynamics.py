@@ -49,6 +49,7 @@ from rtloop.cli.output import print_warnings
     help="Recorded signal that excited the closed loop and is independent of its noise; repeatable.  "
     "[default: reference and feed of the axis]",
 )  # fmt: skip
+@click.option("--detrend", is_flag=True, help="Subtract the straight line of input and position, as of a drift.")
 @click.option(
     "--compare",
     type=OUTPUT,
@@ -61,8 +62,8 @@ from rtloop.cli.output import print_warnings
 def dynamics(runs: tuple[Path, ...], out: Path | None, plot: Path | None, as_json: bool, **options: Any) -> None:
     """Identify the dynamics D(s) of an axis.
 
-    The first RUN identifies the model; further RUNs validate it. A RUN begins at rest and has a step or another
-    excitation, or it is a closed loop whose reference moves.
+    The first RUN identifies the model; further RUNs validate it. A RUN has a step or another excitation, best after a
+    rest of a hundred samples, or it is a closed loop whose reference moves.
     """
     from rtloop.design.identification.model_sections import require_new
     from rtloop.workbench.dynamics import fit_dynamics

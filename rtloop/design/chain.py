@@ -20,7 +20,10 @@ import numpy as np
 from rtloop.analysis.comparison import LIGHT_DAMPING
 from rtloop.configuration.axis import LimitsOptions, ModelOptions
 from rtloop.design.identification.axis_recording import AxisRecording, UnsuitableData, jumps, noise_std
-from rtloop.design.identification.dynamics.identify_dynamics import DynamicsFit, Excitation, identify_dynamics
+from rtloop.design.identification.dynamics.beginning import refer_to_beginning
+from rtloop.design.identification.dynamics.dynamics_fit import DynamicsFit
+from rtloop.design.identification.dynamics.identify_in_loop import identify_recorded_dynamics
+from rtloop.design.identification.dynamics.prediction_error import Excitation
 from rtloop.design.identification.hysteresis.identify_hysteresis import identify_hysteresis
 from rtloop.design.identification.hysteresis.recording_set import HysteresisFit
 from rtloop.design.identification.model_sections import (
@@ -91,8 +94,8 @@ def identify_stage(hysteresis: AxisRecording, step: AxisRecording, order: int | 
 
     `hysteresis` records a slow sine, `step` a step of the drive. Raises UnsuitableData for a step without a
     configuration, as in an imported file, if ticks of the step are missing or late, if no model explains the step, and
-    as `identify_hysteresis` and `identify_dynamics`; the message calls the recordings swapped if `hysteresis` has steps
-    of the drive and `step` has none. Raises ArithmeticError for a model with an unstable predictor.
+    as `identify_hysteresis` and `identify_recorded_dynamics`; the message calls the recordings swapped if `hysteresis`
+    has steps of the drive and `step` has none. Raises ArithmeticError for a model with an unstable predictor.
     """
     try:
         return _identify_stage(hysteresis, step, order)
@@ -120,7 +123,7 @@ def _identify_stage(hysteresis: AxisRecording, step: AxisRecording, order: int |
         )
     fit = identify_hysteresis([hysteresis])
     excitation = Excitation(step.name, model_output(fit.model, step.drive_v), step.position_um, step.period_s)
-    dynamics = identify_dynamics(excitation, order, criterion="held-out")
+    dynamics = identify_recorded_dynamics(refer_to_beginning(excitation, begins_at_0=True), order)
     noise_um = min(noise_std(step.position_um), noise_std(hysteresis.position_um))
     _require_explained(step, dynamics, max(noise_um, HYSTERESIS_SHARE * float(np.ptp(excitation.input))))
     return Stage(hysteresis, step, fit, dynamics, scale_hysteresis(fit.model, dynamics.static_gain))

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from rtloop.design.identification.axis_recording import AxisRecording, read_axis_recording
 from rtloop.design.identification.dynamics.dynamics_fit import DynamicsFit
+from rtloop.design.identification.dynamics.excitation import LoopExcitation
 from rtloop.design.identification.dynamics.identify_delay import delay_input
 from rtloop.design.identification.dynamics.identify_dynamics import Criterion
 from rtloop.design.identification.dynamics.identify_in_loop import identify_recorded_dynamics
@@ -106,6 +107,7 @@ class DynamicsResult(IdentifiedModel):
             {"recordings": [run.name for run in self.runs], "digests": [run.digest for run in self.runs]}
             | {"input": self.input, "sampled_together": self.runs[0].is_sampled_together}
             | {"loop": loop and {"from_tick": loop.start, "to_tick": loop.end, "outside": loop.names}}
+            | {"begins_in_motion": loop is None and isinstance(self.excitation, LoopExcitation)}
             | {key: value for key, value in dataclass_fields(fit).items() if key not in ("model", "free_motion_um")}
             | {"order": self.order, "tests": dataclass_fields(fit.tests) | tests}
             | {"frequency_response": self.comparison, "output": self.output, "plot": self.picture}
@@ -142,6 +144,7 @@ def fit_dynamics(
     criterion: Criterion | None = None,
     loop: State = "auto",
     outside: Sequence[str] = (),
+    detrend: bool = False,
     compare: Path | None = None,
     warn: Warn = lambda _: None,
 ) -> DynamicsResult:
@@ -150,7 +153,8 @@ def fit_dynamics(
     `input` of D is the drive through the model of the hysteresis, the command, or the drive. `hysteresis` is a file
     with the actuator's model (None: the recorded configuration). `order`, `delay` (as `delay_ticks`) None: searched,
     the order up to `largest_order` by `criterion` (None: "held-out"). `loop` says whether the loop was closed
-    ("auto": by the recorded mode), `outside` which signals moved the closed loop. `compare` is a recording for a
+    ("auto": by the recorded mode), `outside` which signals moved the closed loop. `detrend` subtracts the
+    straight line of each signal. `compare` is a recording for a
     measured frequency response. `warn` receives lists of warnings before the fit. Raises RtloopError for recordings
     that cannot be used, ConfigError where no model can be fitted.
     """
@@ -159,7 +163,8 @@ def fit_dynamics(
     loops = [find_closed_loop(Path(run.name), axis, loop, outside) for run in runs]
     actuator = load_actuator(runs[0], hysteresis, axis) if input == "hysteresis" else None
     excitations = [
-        dynamics_excitation(run, input, actuator, closed_loop) for run, closed_loop in zip(runs, loops, strict=True)
+        dynamics_excitation(run, input, actuator, closed_loop, detrends=detrend)
+        for run, closed_loop in zip(runs, loops, strict=True)
     ]
     try:
         fit = identify_recorded_dynamics(excitations[0], order, largest_order, criterion, excitations[1:], delay)
@@ -170,7 +175,8 @@ def fit_dynamics(
     response, comparison = None, None
     if compare is not None:
         closed_loop = find_closed_loop(compare, axis, loop, outside)
-        excitation = dynamics_excitation(read_axis_recording(compare, axis), input, actuator, closed_loop)
+        compared = read_axis_recording(compare, axis)
+        excitation = dynamics_excitation(compared, input, actuator, closed_loop, detrends=detrend)
         response = recording_response(delay_input(excitation, fit.delay_ticks))
         comparison = compare_responses(fit.model, response)
     return DynamicsResult(fit, runs, loops, input, excitations[0], actuator, response, comparison, collect.warnings)

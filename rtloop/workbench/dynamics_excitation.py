@@ -8,6 +8,7 @@ from typing import Literal
 import numpy as np
 
 from rtloop.design.identification.axis_recording import AxisRecording, UnsuitableData
+from rtloop.design.identification.dynamics.beginning import refer_to_beginning, without_drift
 from rtloop.design.identification.dynamics.prediction_error import Excitation
 from rtloop.design.identification.dynamics.recorded_loop import RecordedLoop
 from rtloop.design.identification.model_sections import parse_feedforward, read_feedforward
@@ -18,14 +19,20 @@ Input = Literal["hysteresis", "command", "drive"]
 
 
 def dynamics_excitation(
-    run: AxisRecording, input_kind: Input, feedforward: PlayModel | None, loop: RecordedLoop | None
+    run: AxisRecording,
+    input_kind: Input,
+    feedforward: PlayModel | None,
+    loop: RecordedLoop | None,
+    *,
+    detrends: bool = False,
 ) -> Excitation:
     """Return the input to D and its output from a recording; `feedforward` is the actuator's model, for "hysteresis".
 
     The input is the recorded command for `input_kind` "command", the drive for "drive", and the drive through the model
     for "hysteresis". A closed `loop` limits input and output to its ticks in closed loop, and adds its external
-    signals; None for a recording in open loop. Raises UnsuitableData for ticks that are missing or late and, for
-    "command", if the command was not recorded or a limit or ramp changed it in a closed loop.
+    signals; None for a recording in open loop, whose input is relative to the level at which the stage rests.
+    `detrends` subtracts the straight line of each signal. Raises UnsuitableData for ticks that are missing or late
+    and, for "command", if the command was not recorded or a limit or ramp changed it in a closed loop.
     """
     if not run.is_even:
         raise UnsuitableData(
@@ -41,10 +48,12 @@ def dynamics_excitation(
         signal = model_output(feedforward, run.drive_v)
     full_excitation = Excitation(run.name, signal, run.position_um, run.period_s)
     if loop is None:
-        return full_excitation
-    if input_kind == "command":
-        loop.require_commands_obeyed(run.name)
-    return loop.excitation(full_excitation)
+        excitation = refer_to_beginning(full_excitation, begins_at_0=not run.is_imported)
+    else:
+        if input_kind == "command":
+            loop.require_commands_obeyed(run.name)
+        excitation = loop.excitation(full_excitation)
+    return without_drift(excitation) if detrends else excitation
 
 
 def load_actuator(run: AxisRecording, hysteresis: Path | None, axis: str | None) -> PlayModel:

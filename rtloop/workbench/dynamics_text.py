@@ -47,6 +47,10 @@ def print_dynamics(out: Console, report: Mapping[str, Any]) -> None:
         'of orders, "error" is the error in the part of the recording that was held out of the fit, or in the whole '
         'recording if no part was; "validation" is the error on the other recordings, – without any'
     )
+    if report["begins_in_motion"]:
+        out.print(
+            "the input before the recording is unknown: the motion that it left was estimated and left out of the fit"
+        )
     if report["free_motion_s"]:
         out.print(
             f"the recording does not begin at rest: its first {1e3 * report['free_motion_s']:.3g} ms contain free "

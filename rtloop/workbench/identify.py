@@ -59,6 +59,7 @@ def identify(
     criterion: Criterion | None = None,
     loop: State = "auto",
     outside: Sequence[str] = (),
+    detrend: bool = False,
     compare: RecordedRun | None = None,
 ) -> DynamicsResult: ...
 def identify(recordings: object, kind: str = "hysteresis", **options: Any) -> HysteresisResult | DynamicsResult:
@@ -68,9 +69,9 @@ def identify(recordings: object, kind: str = "hysteresis", **options: Any) -> Hy
     written.
     `options` have the names of the options of `rtloop identify hysteresis` and `rtloop identify dynamics`, with `_` for
     `-`: operators, placement, thresholds (V), weights, memory, validate; and hysteresis, input, order, largest_order,
-    delay (samples), criterion, loop, outside, compare; axis for both. Raises UnsuitableData for recordings that tell
-    too little, RecordingError for files that cannot be read, ConfigError where no model can be fitted, RtloopError for
-    a kind or an option that is not allowed.
+    delay (samples), criterion, loop, outside, detrend, compare; axis for both. Raises UnsuitableData for recordings
+    that tell too little, RecordingError for files that cannot be read, ConfigError where no model can be fitted,
+    RtloopError for a kind or an option that is not allowed.
     """
     require_choice(kind, "identify: kind", ("hysteresis", "dynamics"))
     fit = fit_hysteresis if kind == "hysteresis" else fit_dynamics

@@ -11,6 +11,7 @@ from scipy.optimize import least_squares
 
 from rtloop.design.identification.axis_recording import UnsuitableData
 from rtloop.design.identification.dynamics.identify_dynamics import identify_dynamics
+from rtloop.design.identification.dynamics.identify_in_loop import identify_recorded_dynamics
 from rtloop.design.identification.dynamics.innovations import Innovations
 from rtloop.design.identification.dynamics.inverse_hold import continuous_modal
 from rtloop.design.identification.dynamics.markov import fit_residues
@@ -71,9 +72,10 @@ def test_a_stage_that_moves_against_its_drive_is_named(signs: tuple[float, float
     run = model_excitation(type(EQ_4)(rig.thresholds, rig.weights), rig.measure(step_drive(), FAST_S))
     inverted = Excitation(run.name, signs[0] * run.input, signs[1] * run.position_um, run.period_s)
     with pytest.raises(
-        UnsuitableData, match=r"the sign of drive or position is wrong: .* falls where the drive rises\. .* um_per_v"
+        UnsuitableData,
+        match=r"the sign of drive or position is wrong: .* falls where the drive rises, by 1\.0.* um_per_v",
     ):
-        identify_dynamics(inverted, largest_order=4)
+        identify_recorded_dynamics(inverted, largest_order=4)
 
 
 def test_the_measured_frequency_response_agrees_where_it_is_coherent() -> None:

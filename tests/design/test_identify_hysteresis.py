@@ -210,6 +210,16 @@ def test_a_wrong_sign_and_a_position_that_does_not_follow_are_named() -> None:
                 identify([recording])
 
 
+def test_a_drift_is_no_evidence_of_a_wrong_sign() -> None:
+    """Over one period, a sine and a rising line are correlated by −0.78."""
+    drive = 10 * np.sin(2 * np.pi * np.linspace(0, 1, 5000))
+    drifting = make_recording(drive, 0.3 * drive + np.linspace(0, 100, 5000))
+    assert np.corrcoef(drifting.drive_v, drifting.position_um)[0, 1] < -0.7
+    identify_from_parts([drifting])
+    with pytest.raises(UnsuitableData, match="the drive turns back 1 time"):
+        identify_hysteresis([drifting])
+
+
 @pytest.mark.parametrize(("truth", "creeps"), [(creeping_plays, True), (preisach, False)])
 def test_what_plays_leave_is_called_creep_where_a_lag_over_time_explains_it(truth, creeps: bool) -> None:
     """The creep is 0.5 µm/V with a lag of 1.5 s, in a recording of 25 s with 1 nm of noise."""

@@ -123,7 +123,7 @@ def test_what_follows_from_outside_is_the_input_without_its_noise() -> None:
     ("reference", "samples", "message"),
     [
         (np.zeros, 4000, "no external excitation: the reference is constant"),
-        (np.ones, 1500, "too short: 1500 ticks in closed loop"),
+        (np.ones, 1500, "too short: 1500 ticks; allowed in closed loop"),
         (
             lambda n: 0.3 * np.sin(2 * np.pi * 1.0 * PERIOD_S * np.arange(n)),
             4000,

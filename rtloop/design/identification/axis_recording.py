@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from scipy.signal import detrend
 
 from rtloop.errors import RtloopError
 from rtloop.foundation.arrays import Real
@@ -22,6 +23,8 @@ LEAST_SPAN_TO_NOISE = 50.0
 LEAST_TICKS = 100
 LARGEST_ANTICORRELATION = -0.5
 """Correlation of position and drive below which the position falls as a slow drive rises."""
+LEAST_TURNING = 0.1
+"""Least share of a drive's variance without its straight line, for a sign: a ramp cannot be told from a drift."""
 JUMP_SHARE = 0.2
 """A drive that changes by this fraction of its span within one tick jumps: it has a step, and is no slow sine."""
 PLATEAU_DRIVE = 0.02
@@ -69,6 +72,11 @@ class AxisRecording:
     """Whether a controller made the drive in some ticks; False where the modes were not recorded."""
     is_sampled_together: bool = False
     """Whether drive and position of a recorded row count as sampled at the same time."""
+
+    @property
+    def is_imported(self) -> bool:
+        """Whether another program recorded the run, so that the drive before its first tick is unknown."""
+        return not self.configuration
 
     @property
     def seconds(self) -> Real:
@@ -223,9 +231,12 @@ def excitation_warnings(runs: Sequence[AxisRecording]) -> list[str]:
 def require_rising(run: AxisRecording) -> None:
     """Raise UnsuitableData where the position falls as a slow drive rises: a sign is wrong somewhere.
 
-    It falls if its correlation with the drive is below LARGEST_ANTICORRELATION, which is negative.
+    It falls if its correlation with the drive is below LARGEST_ANTICORRELATION, which is negative, both without their
+    straight lines: a drift is no evidence. A drive that is little more than a line gives none.
     """
-    drive_v, position_um = run.drive_v[:-1], run.position_um[1:]
+    drive_v, position_um = detrend(run.drive_v[:-1]), detrend(run.position_um[1:])
+    if np.var(drive_v) < LEAST_TURNING * np.var(run.drive_v):
+        return
     if np.corrcoef(drive_v, position_um)[0, 1] < LARGEST_ANTICORRELATION:
         slope = float(np.polyfit(drive_v, position_um, 1)[0])
         raise wrong_sign(run.name, f"the position falls by {-slope:.3g} µm per volt of drive")

@@ -16,7 +16,7 @@ from typing import Literal
 
 import numpy as np
 
-from rtloop.design.identification.axis_recording import UnsuitableData, wrong_sign
+from rtloop.design.identification.axis_recording import UnsuitableData
 from rtloop.design.identification.dynamics.dynamics_fit import (
     Candidate,
     DynamicsFit,
@@ -69,7 +69,7 @@ def identify_dynamics(
     two parts (`held_out_start`); "aic" by the run itself, which takes slow errors of the hysteresis model for modes;
     "validation" by the free-running output error on `validation`. Free motion of a run that does not begin at rest is
     estimated and left out. Raises UnsuitableData if the input excites too few poles, if no model is stable, if every
-    model has a time constant longer than the run, and if the static gain is below 0; ValueError for "validation"
+    model has a time constant longer than the run; ValueError for "validation"
     without other recordings; ArithmeticError for a model with an unstable predictor.
     """
     left_out_um, duration_s, repetitions = np.zeros_like(run.position_um), 0.0, 0
@@ -125,8 +125,6 @@ def _identify_from_rest(
     model = models[_choose_order_index(candidates, score, by_aic=criterion != "validation" and start is None)]
     if start is not None and (refitted := refine(model, recording)) and _has_settled(refitted, recording):
         model = refitted
-    if model.static_gain < 0:
-        raise wrong_sign(run.name, "the position falls where the drive rises")
     return _build_fit(model, recording, tuple(candidates), delay_ticks, corrected), recording
 
 

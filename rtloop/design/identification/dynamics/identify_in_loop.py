@@ -38,10 +38,11 @@ from rtloop.design.identification.dynamics.nested_models import (
     delay_recording,
     preferred_models,
 )
+from rtloop.design.identification.dynamics.plausibility import require_plausible
 from rtloop.design.identification.dynamics.prediction_error import LARGEST_ORDER, Excitation
 from rtloop.design.identification.dynamics.residuals import residual_tests
 
-METHOD = "refined instrumental variables, closed loop"
+METHOD = "refined instrumental variables"
 LEAST_SAMPLES = 50 * ARX_ORDER
 PATIENCE = 2
 """Modes in a row without gain, after which the search ends."""
@@ -65,14 +66,20 @@ def identify_recorded_dynamics(
 
     The model has `order` poles behind `delay_ticks` samples of delay; None estimates them, the order up to
     `largest_order`. The candidates also report their errors on the runs `validation`. None for `criterion` is
-    "held-out". Raises ValueError for another criterion in closed loop, and the errors of both functions, such as
-    UnsuitableData.
+    "held-out". Raises ValueError for another criterion of a LoopExcitation, and the errors of both functions and of
+    `require_plausible`, such as UnsuitableData.
     """
     if not isinstance(run, LoopExcitation):
-        return identify_dynamics(run, order, largest_order, criterion or "held-out", validation, delay_ticks)
-    if criterion not in (None, "held-out"):
-        raise ValueError(f"criterion: {criterion!r}; allowed for a closed loop: 'held-out'")
-    return identify_in_loop(run, order, largest_order, validation, delay_ticks)
+        fit = identify_dynamics(run, order, largest_order, criterion or "held-out", validation, delay_ticks)
+    elif criterion not in (None, "held-out"):
+        raise ValueError(
+            f"criterion: {criterion!r}; allowed for a closed loop, and for a recording that does not begin at rest: "
+            "'held-out'"
+        )
+    else:
+        fit = identify_in_loop(run, order, largest_order, validation, delay_ticks)
+    require_plausible(run, fit)
+    return fit
 
 
 def identify_in_loop(
@@ -174,8 +181,8 @@ def _require_samples(run: LoopExcitation) -> None:
     """Raise UnsuitableData for fewer than LEAST_SAMPLES ticks."""
     if run.input.size < LEAST_SAMPLES:
         raise UnsuitableData(
-            f"{run.name}: too short: {run.input.size} ticks in closed loop; allowed: at least {LEAST_SAMPLES} ticks. "
-            "Record longer"
+            f"{run.name}: too short: {run.input.size} ticks; allowed in closed loop, and without a rest at the "
+            f"beginning: at least {LEAST_SAMPLES} ticks. Record longer"
         )
 
 
