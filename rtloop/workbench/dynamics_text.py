@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
+from rtloop.design.identification.dynamics.residuals import LARGEST_CROSS_RATIO
 from rtloop.design.identification.frequency_response import SEGMENT_S
 from rtloop.design.identification.model_sections import static_gain_text
 from rtloop.values import count_text
@@ -68,7 +69,12 @@ def print_dynamics(out: Console, report: Mapping[str, Any]) -> None:
         f"(largest cross-correlation {tests['largest_cross_correlation']:.3f}, {tests['cross_ratio']:.2g} of its 99 % "
         "bound)"
     )
-    if not tests["white"]:
+    if tests["cross_ratio"] > LARGEST_CROSS_RATIO:
+        out.print(
+            f"no order explains the recording: the standard deviations (±) are widened {tests['cross_ratio']:.2g} "
+            "times. Compare with a measured response (--compare), or record a longer rest between the steps"
+        )
+    elif not tests["white"]:
         out.print("the standard deviations (±) include the correlation of these residuals, but no error of the input")
     if report["level_correction"]:
         unit = "V" if report["input"] == "drive" else "µm"

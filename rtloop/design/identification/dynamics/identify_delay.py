@@ -22,6 +22,7 @@ from rtloop.design.identification.dynamics.prediction_error import (
     LEAST_IMPROVEMENT,
     Excitation,
     fit_models_at_gap,
+    judged_rms,
     refine,
     rms_error,
 )
@@ -98,7 +99,7 @@ def _judge_candidate(ticks: int, model: Innovations, run: Excitation, start: int
     if errors is None:
         return Candidate(ticks, model, np.inf, False)
     tests = residual_tests(run.input[:start], errors[:start], model.pack(noise=True).size)
-    return Candidate(ticks, model, float(np.sqrt(np.mean(errors[start or 0 :] ** 2))), tests.is_independent)
+    return Candidate(ticks, model, judged_rms(model, run, errors, start or 0), tests.is_independent)
 
 
 def _refitted_rms_um(model: Innovations, run: Excitation) -> float:

@@ -44,7 +44,7 @@ from rtloop.design.identification.dynamics.prediction_error import (
     refine,
     rms_error,
 )
-from rtloop.design.identification.dynamics.residuals import residual_tests
+from rtloop.design.identification.dynamics.residuals import LARGEST_CROSS_RATIO, residual_tests
 
 Criterion = Literal["aic", "held-out", "validation"]
 METHOD = "prediction errors (ARMAX), open loop"
@@ -122,7 +122,9 @@ def _identify_from_rest(
     models = _require_settled(models, recording)
     candidates = [_score_model(model, recording, start, validation) for model in models]
     score: Callable[[Candidate], float] = lambda c: c.validation_rms_um if criterion == "validation" else c.rms_error_um
-    model = models[_choose_order_index(candidates, score, by_aic=criterion != "validation" and start is None)]
+    eligible = [candidates[i] for i in _independent(models, fitted_part(recording, start))]
+    chosen = _choose_candidate(eligible, score, by_aic=criterion != "validation" and start is None)
+    model = models[candidates.index(chosen)]
     if start is not None and (refitted := refine(model, recording)) and _has_settled(refitted, recording):
         model = refitted
     return _build_fit(model, recording, tuple(candidates), delay_ticks, corrected), recording
@@ -169,17 +171,32 @@ def _validation_rms(model: Innovations, runs: Sequence[Excitation]) -> float:
     return float(np.sqrt(np.mean(np.concatenate([part - part.mean() for part in errors]) ** 2))) if errors else np.nan
 
 
-def _choose_order_index(candidates: Sequence[Candidate], score: Callable[[Candidate], float], *, by_aic: bool) -> int:
-    """Return the index of the smallest order whose score is within LEAST_IMPROVEMENT of the least score and, if
-    `by_aic`, whose AIC is the least among all orders up to it; without such an order, the index of the least score.
+def _independent(models: Sequence[Innovations], run: Excitation) -> Sequence[int]:
+    """Return the indices of the models whose errors in `run` do not follow from the input beyond LARGEST_CROSS_RATIO of
+    the bound; of all models, if there is none.
+    """
+    unknowns = [model.pack(noise=True).size for model in models]
+    tests = [
+        residual_tests(run.input, prediction_errors(model, run), count)
+        for model, count in zip(models, unknowns, strict=True)
+    ]
+    independent = [i for i, test in enumerate(tests) if test.cross_ratio <= LARGEST_CROSS_RATIO]
+    return independent or range(len(models))
+
+
+def _choose_candidate(
+    candidates: Sequence[Candidate], score: Callable[[Candidate], float], *, by_aic: bool
+) -> Candidate:
+    """Return the smallest order whose score is within LEAST_IMPROVEMENT of the least score and, if `by_aic`, whose AIC
+    is the least among all orders up to it; without such an order, the one of the least score.
 
     `candidates` are in rising order.
     """
     limit = min(map(score, candidates)) * (1 + LEAST_IMPROVEMENT)
     for i, candidate in enumerate(candidates):
         if score(candidate) <= limit and (not by_aic or candidate.aic <= min(c.aic for c in candidates[: i + 1])):
-            return i
-    return int(np.argmin([score(candidate) for candidate in candidates]))
+            return candidate
+    return min(candidates, key=score)
 
 
 def _build_fit(
@@ -188,12 +205,16 @@ def _build_fit(
     """Return the result for the chosen model, with residual tests and standard deviations from the whole run.
 
     `candidates` are all models compared. The input of `run` is delayed by `delay_ticks` already; `corrected` is the
-    largest correction of its levels (`correct_levels`), in its unit. Raises ArithmeticError for an unstable predictor.
+    largest correction of its levels (`correct_levels`), in its unit. Errors that follow from the input beyond
+    LARGEST_CROSS_RATIO of the bound widen the deviations by that ratio. Raises ArithmeticError for an unstable
+    predictor.
     """
     errors = prediction_errors(model, run)
     output_error_um = run.position_um - model.simulate_output(run.input)
     tests = residual_tests(run.input, errors, model.pack(noise=True).size)
     covariance = estimate_covariance(model, run, errors, white=tests.is_white)
+    if tests.cross_ratio > LARGEST_CROSS_RATIO:
+        covariance = covariance * tests.cross_ratio**2
     return DynamicsFit(
         continuous_transfer(model),
         model.static_gain,

@@ -33,6 +33,8 @@ LEAST_EXCITATION = 1e-7
 """
 ENOUGH_POLES = 9
 """An input that can tell so many poles apart has no gap in its spectrum and can tell LARGEST_ORDER apart."""
+MOST_LEVELS = 16
+"""Most levels of the held-out input that are measured by the position; with more of them, each tells little."""
 MOST_EVALUATIONS = 20
 SampleSelection = slice | npt.NDArray[np.bool_]
 ALL_SAMPLES = slice(None)
@@ -173,11 +175,28 @@ def has_stable_continuous_form(model: Innovations) -> bool:
 
 
 def rms_error(model: Innovations, run: Excitation, start: int = 0) -> float:
-    """Return the rms one-step-ahead error in µm of a fitted model, from sample `start` on.
+    """Return the rms one-step-ahead error in µm of a fitted model, from sample `start` on (`judged_rms`).
 
     Raises ArithmeticError for an unstable predictor.
     """
-    return float(np.sqrt(np.mean(prediction_errors(model, run)[start:] ** 2)))
+    return judged_rms(model, run, prediction_errors(model, run), start)
+
+
+def judged_rms(model: Innovations, run: Excitation, errors: Real, start: int) -> float:
+    """Return the rms of prediction errors (samples,) from sample `start` on, without what follows from wrong levels of
+    the input there: the model of the hysteresis errs by a constant at each level, which no order of D(s) can predict.
+
+    An input of more than MOST_LEVELS levels there has one such error, of its first change.
+    """
+    judged = errors[start:]
+    if start:
+        changes = np.flatnonzero(np.diff(run.input[start - 1 :]))
+        changes = changes if changes.size <= MOST_LEVELS else changes[:1]
+        steps = (np.arange(judged.size) >= changes[:, None]).astype(float)
+        columns = [model.simulate_output(step) - model.offset for step in steps]
+        level_errors = model.whiten(np.array(columns), model.predictor_poles()).T
+        judged = judged - level_errors @ np.linalg.lstsq(level_errors, judged, rcond=1e-12)[0]
+    return float(np.sqrt(np.mean(judged**2)))
 
 
 def prediction_errors(model: Innovations, run: Excitation) -> Real:

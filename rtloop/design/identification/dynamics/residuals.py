@@ -18,6 +18,8 @@ from rtloop.foundation.arrays import Real
 
 LAGS = 25
 LEVEL = 0.99
+LARGEST_CROSS_RATIO = 3.0
+"""Cross-correlation with the input, over its bound, from which on a model lacks a part of the dynamics."""
 
 
 @dataclass(frozen=True)
