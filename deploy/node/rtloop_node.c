@@ -367,11 +367,11 @@ static void obey(struct rtloop_node *node, const struct drive *drive, uint64_t s
     if (drive->flags & RTLOOP_OPEN) {
         open_session(node, drive, sender);
     }
-    node->newest = drive->sequence;
-    node->turn = drive->course.turn;
     if (node->session == 0) {
         return; /* a repeated PARK */
     }
+    node->newest = drive->sequence;
+    node->turn = drive->course.turn;
     node->accepted_us = node->now_us;
     node->hold_us = drive->hold_us < node->config->longest_hold_us ? drive->hold_us : node->config->longest_hold_us;
     if (drive->flags & RTLOOP_PARK) {

@@ -103,7 +103,7 @@ class Bench:
         key: bytes | None = None,
         period_us: int = PERIOD_US,
     ) -> bool:
-        """Start the node, and return whether it accepted its configuration; without a key it has that of the last start."""
+        """Start the node, and return whether it accepted its configuration; key None: that of the last start."""
         self.seal = Seal(key or self.seal.key, boot)
         self.outputs = len(outputs)
         channels = [*inputs, *outputs]

@@ -158,26 +158,28 @@ def parse(answer: bytes, seal: Seal = UNSEALED) -> Welcome | Sample | Refusal | 
         seal = Seal(seal.key, fields.boot, fields.opening)
     elif kind == SAMPLE:
         session, boot, flags, inputs, digital, age_ns, applied = struct.unpack_from("<IIBBHII", content)
-        fields = Sample(sequence, session, boot, flags, digital, age_ns, applied, struct.unpack(f"<{inputs}i", content[20:]))
+        codes = struct.unpack(f"<{inputs}i", content[20:])
+        fields = Sample(sequence, session, boot, flags, digital, age_ns, applied, codes)
     else:
         assert kind == WELCOME
-        session, version, a, b, c, d, zero, boot, *rest = struct.unpack_from("<IH4BHIIIII", content)
+        session, version, a, b, c, d, zero, boot, *numbers = struct.unpack_from("<IH4BHIIIII", content)
+        hold_us, period_us, flags, opening = numbers
         assert zero == 0
         assert len(answer) == 52 + 32 * (a + b)
         channels = [Channel(*values) for values in struct.iter_unpack("<iiiIdd", content[32:])]
-        fields = Welcome(sequence, session, version, (a, b, c, d), boot, *rest, channels)
+        fields = Welcome(sequence, session, version, (a, b, c, d), boot, hold_us, period_us, flags, opening, channels)
         seal = Seal(seal.key, boot, fields.opening)
     assert tag == seal.tag(answer[:-12])
     return fields
 
 
-def reason(answer: Sample | Refusal | None) -> int:
+def reason(answer: Welcome | Sample | Refusal | None) -> int:
     """Return a REFUSAL's reason, 0 for a SAMPLE."""
-    assert answer is not None
+    assert isinstance(answer, Sample | Refusal)
     return answer.reason if isinstance(answer, Refusal) else 0
 
 
-def flags(answer: Sample | Refusal | None) -> int:
+def flags(answer: Welcome | Sample | Refusal | None) -> int:
     """Return the flags of an answer that must be a SAMPLE."""
     assert isinstance(answer, Sample)
     return answer.flags

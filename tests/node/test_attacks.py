@@ -1,7 +1,7 @@
 """Frames of an attacker without the key, between those of a loop: no output follows them, and each PARK is obeyed.
 
-The attacker has recorded all frames of this and of earlier sessions and boots, sends from the loop's address too, and has
-even DRIVEs with the right key for other boots, openings and turns.
+The attacker has recorded all frames of this and of earlier sessions and boots, sends from the loop's address too, and
+has even DRIVEs with the right key for other boots, openings and turns.
 """
 
 from __future__ import annotations
@@ -38,10 +38,13 @@ class Attacked:
         assert self.bench.start(boot=self.boot, key=KEY)
         self.expected = list(SAFE)
 
-    def send(self, act: int, codes: list[int], step: int = 1) -> Sample:
-        """Send a DRIVE of the loop, which the node must accept, and record it."""
-        self.sequence += step
-        turn, sequence = divmod(self.sequence, 2**32)
+    def send(self, act: int, codes: list[int], sequence: int) -> Sample:
+        """Send a DRIVE of the loop, which the node must accept, and record it.
+
+        The sequence goes on beyond 32 bits.
+        """
+        self.sequence = sequence
+        turn, sequence = divmod(sequence, 2**32)
         content = drive(self.session, sequence, act | ANSWER, codes, 0, HOLD_US, self.seal._replace(turn=turn))
         self.history.append(content)
         answer = self.bench.send_bytes(content)
@@ -58,7 +61,7 @@ class Attacked:
         welcome = parse(self.bench.send_bytes(hello(self.session)), self.seal)
         assert isinstance(welcome, Welcome)
         self.seal = self.seal._replace(opening=welcome.opening)
-        assert self.send(OPEN, SAFE, 0).flags == READY | AT_SAFE
+        assert self.send(OPEN, SAFE, self.sequence).flags == READY | AT_SAFE
 
     def forged(self) -> bytes:
         """Return a frame that is not the loop's next one."""
@@ -74,7 +77,8 @@ class Attacked:
             seal = Seal(draw.randbytes(16), *seal[1:])
         elif kind == 4:
             field = draw.choice(("boot", "opening", "turn"))
-            session, seal = self.session, seal._replace(**{field: getattr(seal, field) + draw.choice((2, 3, 2**31, -2))})
+            session = self.session
+            seal = seal._replace(**{field: getattr(seal, field) + draw.choice((2, 3, 2**31, -2))})
         elif kind == 5 or not self.history:
             return draw.choice((draw.randbytes(draw.randrange(60)), hello(session, draw.choice((1, 2)), sequence)))
         elif kind == 6:
@@ -108,13 +112,12 @@ class Attacked:
             self.attack(draw.randrange(20))
             self.bench.poll(draw.randrange(HOLD_US // 2))
             codes = [draw.randint(100, 1000), draw.randint(-200, 100)]
-            assert self.send(APPLY, codes, draw.choice((1, 1, 1, 2, 40_000))).flags & READY
+            step = draw.choice((1, 1, 1, 2, 40_000))
+            assert self.send(APPLY, codes, self.sequence + step).flags & READY
             self.expected = codes
         self.attack(draw.randrange(20))
-        turn = self.sequence // 2**32
-        self.sequence = turn * 2**32 + draw.choice(((self.sequence + 1) % 2**32, draw.randrange(self.sequence % 2**32 + 1)))
-        turned = self.sequence % 2**32 == 0
-        self.send(PARK, SAFE, 2 if turned else 0)
+        start_of_turn = self.sequence // 2**32 * 2**32
+        self.send(PARK, SAFE, draw.choice((self.sequence + 1, draw.randint(start_of_turn, self.sequence))))
         self.parks += 1
         while self.expected != SAFE:
             self.attack(draw.randrange(3))
@@ -124,7 +127,7 @@ class Attacked:
             self.expected = [max(channel.safe, code - channel.change_per_ms) for code, channel in pairs]
             self.bench.poll(1)
             assert self.bench.codes == self.expected
-        assert self.send(PARK, SAFE).flags == AT_SAFE
+        assert self.send(PARK, SAFE, self.sequence + 1).flags == AT_SAFE
         if draw.random() < 0.1:
             self.restart()
 

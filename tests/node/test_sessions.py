@@ -96,7 +96,16 @@ def test_an_open_of_session_0_is_refused(bench: Bench):
 
 @pytest.mark.parametrize(
     ("distance", "accepted"),
-    [(1, True), (2, True), (40_000, True), (40_001, False), (2**30, False), (2**31, False), (2**32 - 1, False), (0, False)],
+    [
+        (1, True),
+        (2, True),
+        (40_000, True),
+        (40_001, False),
+        (2**30, False),
+        (2**31, False),
+        (2**32 - 1, False),
+        (0, False),
+    ],
 )
 @pytest.mark.parametrize("newest", [7, 2**31 - 1, 2**32 - 1])
 def test_a_drive_must_be_newer_than_the_newest(bench: Bench, newest: int, distance: int, accepted: bool):
