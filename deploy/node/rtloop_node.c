@@ -23,12 +23,22 @@ static bool channels_allowed(const struct rtloop_node_channel *channels, uint8_t
     return true;
 }
 
+/* Return whether a key is more than a memory that nobody has written: bytes that are all equal. */
+static bool key_allowed(const uint8_t *key)
+{
+    uint8_t differences = 0;
+    for (int i = 1; key != NULL && i < RTLOOP_KEY_BYTES; i++) {
+        differences |= key[i] ^ key[0];
+    }
+    return key == NULL || differences != 0;
+}
+
 /* Return whether a configuration describes a node that the protocol allows. */
 static bool config_allowed(const struct rtloop_node_config *config)
 {
     return config->inputs >= 1 && config->outputs >= 1 && config->inputs + config->outputs <= RTLOOP_MAX_CHANNELS
            && config->digital_inputs <= RTLOOP_MAX_DIGITAL && config->digital_outputs <= RTLOOP_MAX_DIGITAL
-           && config->longest_hold_us >= 1 && channels_allowed(config->input, config->inputs, false)
+           && config->longest_hold_us >= 1 && key_allowed(config->key) && channels_allowed(config->input, config->inputs, false)
            && channels_allowed(config->output, config->outputs, true);
 }
 

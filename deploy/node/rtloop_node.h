@@ -37,7 +37,7 @@ struct rtloop_node_config {
     uint32_t shortest_period_us;  /* shortest period from DRIVE to DRIVE; the loop keeps it */
     const struct rtloop_node_channel *input;
     const struct rtloop_node_channel *output;
-    const uint8_t *key;           /* 16 bytes that the node shares with its loop; NULL: whoever reaches the node may drive it */
+    const uint8_t *key;           /* 16 random bytes, not all equal; NULL: whoever reaches the node may drive it */
     void *context;                /* first argument of the functions below */
     /* Convert all inputs now. */
     void (*read_inputs)(void *context, int32_t *codes, uint16_t *digital);

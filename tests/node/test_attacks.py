@@ -150,5 +150,6 @@ def test_no_output_follows_an_attacker_and_each_park_is_obeyed(bench: Bench, see
 
 @keyed_node
 @pytest.mark.soak
+@pytest.mark.timeout(3600)
 def test_no_output_follows_a_million_frames_of_an_attacker(bench: Bench):
     attack_a_node(bench, 3, 1_000_000)

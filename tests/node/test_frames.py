@@ -185,6 +185,8 @@ def test_the_good_frame_of_the_test_above_is_accepted(bench: Bench):
         {"outputs": [OUTPUTS[0]._replace(safe=32768)]},
         {"outputs": [OUTPUTS[0]._replace(safe=-32769)]},
         {"outputs": [OUTPUTS[0]._replace(change_per_ms=0)]},
+        {"key": bytes(16)},
+        {"key": b"\xff" * 16},
     ],
 )
 def test_a_node_that_the_protocol_does_not_allow_does_not_start(bench: Bench, change: dict):

@@ -184,7 +184,7 @@ static bool start(struct rtloop_node_config *config)
         return false;
     }
     if (!rtloop_node_init(&node, config, boot, clock_us())) {
-        fprintf(stderr, "the board's channels are not allowed; rtloop_node.h says what is\n");
+        fprintf(stderr, "the board's channels, or a key of 16 equal bytes, are not allowed; rtloop_node.h says what is\n");
         return false;
     }
     printf("{\"port\": %u, \"boot\": %u}\n", transport.port, boot);
