@@ -16,6 +16,7 @@ from pathlib import Path
 
 from rtloop.drivers.errors import DriverError
 from rtloop.drivers.node.cobs import FrameReader, encode
+from rtloop.drivers.node.keys import read_key
 from rtloop.drivers.node.options import NodeOptions, SerialOptions, UdpOptions
 from rtloop.drivers.node.simulated import SimulatedNode
 from rtloop.foundation.trusted import close_descriptor
@@ -168,15 +169,16 @@ def serve(
     refused and ignored frames, and parkings.
 
     `on_ready` is called when the line is open. Raises ValueError if rig and axes do not fit together, DriverError if
-    the line cannot be opened.
+    the line cannot be opened, or for a key that cannot be read.
     """
-    node = SimulatedNode(options, axes)
+    node = SimulatedNode(options, axes, key=read_key(options.key))
     with open_port(options) as port:
         on_ready()
         start_s = time.monotonic()
         while not is_stopped():
             step(node, port, start_s)
     return (
-        f"{node.samples} samples sent, {node.refused} frames refused, {node.old + node.invalid} frames ignored, "
+        f"{node.samples} samples sent, {node.refused} frames refused, "
+        f"{node.old + node.invalid + node.foreign} frames ignored, "
         f"outputs parked {node.watchdog_parkings} times by the watchdog"
     )
