@@ -65,6 +65,7 @@ CARD = np.dtype(
         ("digital", np.uint32),  # inputs in the newest sample
         ("hold_us", np.uint32),
         ("opening", np.uint32),
+        ("turn", np.uint32),  # how often the sequence has begun again at 0
     ]
 )
 """State of an exchange; each name in the first group is the address of an array."""

@@ -187,9 +187,9 @@ class NodeDriver(Driver):
         """
         if self._link is None or self._card is None:
             return
-        sequence, boot, opening = (int(self._card[name][0]) for name in ("last_sequence", "boot", "opening"))
+        sequence, *state = (int(self._card[name][0]) for name in ("last_sequence", "boot", "opening", "turn"))
         try:
-            self._park(self._link, sequence, Seal(self._key, boot, opening))
+            self._park(self._link, sequence, Seal(self._key, *state))
         except OSError as error:
             raise DriverError(f"{self._options.label}: {error.strerror or error}; {UNCONFIRMED}") from None
         finally:
@@ -311,9 +311,11 @@ class NodeDriver(Driver):
         """
         safe = tuple(scale.safe for scale in welcome.outputs)
         start_s, sequence = time.monotonic(), 0
-        seal = first = Seal(self._key, welcome.boot, welcome.opening)
         while time.monotonic() < start_s + self._options.wait_s:
             sequence += 1
+            if self._key is not None and sequence > 1:  # Another loop may have opened a session meanwhile.
+                welcome = self._greet(link)
+            seal = Seal(self._key, welcome.boot, welcome.opening)
             flags = frames.OPEN | frames.ANSWER
             sent = frames.drive(Drive(sequence, self._session, flags, 0, OPENING_HOLD_US, safe), seal)
             link.send(sent)
@@ -324,12 +326,6 @@ class NodeDriver(Driver):
                 if answer.reason != frames.BUSY or time.monotonic() > start_s + BUSY_S:
                     raise DriverError(f"{self._options.label}: {failure_text(answer.reason)}")
                 time.sleep(RETRY_S)
-            if self._key is not None and not isinstance(answer, Sample):
-                # Another loop has opened a session, or the answer to the OPEN that began this one was lost.
-                welcome = self._greet(link)
-                newest = Seal(self._key, welcome.boot, welcome.opening)
-                first = newest if answer is not None else first
-                seal = newest if seal == first else first
         raise DriverError(
             f"{self._options.label}: the node's outputs did not reach their safe values within "
             f"{self._options.wait_s:g} s; check the node, or raise driver.wait_s"
@@ -371,6 +367,7 @@ class NodeDriver(Driver):
         codes = tuple(self._arrays["safe"].tolist())
         while time.monotonic() < min(heard_s + self._options.wait_s, start_s + LONGEST_PARKING_S):
             sequence = (sequence + 1) & 0xFFFFFFFF
+            seal = seal._replace(turn=seal.turn + (sequence == 0))
             content = Drive(sequence, self._session, frames.PARK | frames.ANSWER, 0, OPENING_HOLD_US, codes)
             sent = frames.drive(content, seal)
             link.send(sent)

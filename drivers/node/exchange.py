@@ -122,12 +122,13 @@ def _send_drive(card, flags):
     """
     frame = carray(address_pointer(card.sent), 1, DRIVE)[0]
     card.last_sequence = np.uint32(card.last_sequence + np.uint32(1))
+    card.turn += 1 if card.last_sequence == 0 else 0
     frame.magic, frame.format, frame.batches = MAGIC, DRIVE_FORMAT, BATCHES
     frame.sequence, frame.session = card.last_sequence, card.session
     frame.bits, frame.outputs, frame.hold_us, frame.zero = flags, card.outputs, card.hold_us, 0
     length = DRIVE_HEAD + 4 * card.outputs
     if card.is_keyed != 0:
-        write_tag(card.key_low, card.key_high, card.sent, length, card.boot, card.opening)
+        write_tag(card.key_low, card.key_high, card.sent, length, card.boot, card.opening, card.turn)
         tags = carray(address_pointer(card.ring_tag), WINDOW, np.uint64)
         tags[np.int64(card.last_sequence) % WINDOW] = load_word(card.sent + length)
     length += TAG_BYTES
@@ -252,16 +253,17 @@ def _is_whole(card, length):
 def _is_genuine(card, length):
     """Whether the whole frame received has the right tag, and a REFUSAL also the tag of a DRIVE that was sent.
 
-    The tag in the frame's bytes is replaced by the right one.
+    The bytes of tag and check are overwritten.
     """
     content = length - END_BYTES
     frame = carray(address_pointer(card.received), 1, REFUSAL)[0]
     received_tag = load_word(card.received + content)
     if frame.format != REFUSAL_FORMAT:
-        write_tag(card.key_low, card.key_high, card.received, content, card.boot, card.opening)
+        turn = card.turn - (1 if frame.sequence > card.last_sequence else 0)
+        write_tag(card.key_low, card.key_high, card.received, content, card.boot, card.opening, turn)
         return load_word(card.received + content) == received_tag
     sent_tag = carray(address_pointer(card.ring_tag), WINDOW, np.uint64)[np.int64(frame.sequence) % WINDOW]
-    write_tag(card.key_low, card.key_high, card.received, content, frame.boot, frame.opening)
+    write_tag(card.key_low, card.key_high, card.received, content, frame.boot, frame.opening, 0)
     return load_word(card.received + content) == received_tag and frame.drive_tag == sent_tag != 0
 
 

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import fcntl
 import os
 import pty
 import select
 import socket
+import termios
 import time
 import tty
 from abc import ABC, abstractmethod
@@ -107,6 +109,7 @@ class TerminalPort(Port):
         if (frame := self._reader.next_frame()) is not None:
             return frame, None
         if not select.select([self._fd], [], [], timeout_s)[0]:
+            fcntl.ioctl(self._end, termios.TIOCNXCL)  # A loop that was killed has left the terminal to itself alone.
             return None
         try:
             self._reader.feed(os.read(self._fd, LARGEST_DATAGRAM))

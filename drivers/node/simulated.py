@@ -20,7 +20,7 @@ RAMP_STEP_US = 1000
 LONGEST_HOLD_US = 10_000_000
 SHORTEST_PERIOD_US = 10
 MODULUS = 1 << 32
-WINDOW = 2_000_000 // SHORTEST_PERIOD_US
+NEWER_STEPS = 2_000_000 // SHORTEST_PERIOD_US
 """Largest step from the newest sequence to that of a DRIVE: two frames in each shortest period of a second."""
 US_PER_S = 1e6
 KINDS = frames.OPEN | frames.APPLY | frames.PARK
@@ -51,7 +51,7 @@ class SimulatedNode:
         self.codes = [scale.safe for scale in self._outputs]
         self.digital = 0
         self._key = key
-        self._session = self._ended = self._openings = self._parked_opening = 0
+        self._session = self._ended = self._openings = self._turn = 0
         self._parked: tuple[int, Hashable] = (0, None)
         self._sender: Hashable = None
         self._newest = self._applied = 0
@@ -112,37 +112,41 @@ class SimulatedNode:
             self.invalid += 1
             return None
         reason = self._lack_of_access(content, sender)
-        # Whatever its tag, so that a loop learns that the node has started again.
-        is_refused = reason != 0 and not self._session
-        if not is_refused and not frames.is_genuine(data, self._seal(content)):
-            self.foreign += 1
-            return None
+        seal = self._seal(content)
+        if self._session or not reason:  # A DRIVE of no session is refused whatever its tag, for a node that restarted.
+            is_copy = self._key is not None and reason == frames.BUSY and content.session == self._session
+            if is_copy or not frames.is_genuine(data, seal):
+                self.foreign += 1
+                return None
         if not reason and not self._is_due(content):
             self.old += 1
             return None
         if reason := reason or self._fault_of_content(content):
             return self._refuse(header, reason, data)
-        return self._accept(content, sender, now_us)
+        return self._accept(content, seal, sender, now_us)
 
     def _seal(self, content: Drive) -> Seal:
         """Return the seal of a DRIVE: of its session, which is open or was parked, or of the next one."""
-        if self._session:
-            opening = self._openings - (content.session == self._session)
-        else:
-            is_parked = content.flags & frames.PARK and content.session == self._parked[0]
-            opening = self._parked_opening if is_parked else self._openings
-        return Seal(self._key, self.boot, opening % MODULUS)
+        is_known = content.session == (self._session or self._parked[0])
+        if not is_known or not (self._session or content.flags & frames.PARK):
+            return Seal(self._key, self.boot, self._openings)
+        is_next_turn = content.sequence < self._newest and self._is_newer(content)
+        return Seal(self._key, self.boot, (self._openings - 1) % MODULUS, (self._turn + is_next_turn) % MODULUS)
 
     def _lack_of_access(self, content: Drive, sender: Hashable) -> int:
         """Return the reason, a key of REFUSALS, for which `sender` may not drive the node now; 0 if it may.
 
         Only the DRIVE's session and flags and the address of `sender` decide.
         """
+        parks_from_anywhere = self._key is not None and content.flags & frames.PARK
         if self._session:
-            return 0 if (content.session, sender) == (self._session, self._sender) else frames.BUSY
+            is_at_home = sender == self._sender or parks_from_anywhere
+            return 0 if content.session == self._session and is_at_home else frames.BUSY
         if content.session == 0:
             return frames.UNKNOWN
-        is_parked = content.flags & frames.PARK and (content.session, sender) == self._parked
+        session, address = self._parked
+        is_parked = content.flags & frames.PARK and content.session == session
+        is_parked = is_parked and (sender == address or parks_from_anywhere)
         if content.flags & frames.OPEN or is_parked:
             return 0
         return frames.WATCHDOG if content.session == self._ended else frames.UNKNOWN
@@ -165,22 +169,26 @@ class SimulatedNode:
         """
         if not self._session or content.flags & frames.PARK:
             return True
-        step = (content.sequence - self._newest) % MODULUS
-        return 0 < step <= WINDOW or (step == 0 and bool(content.flags & frames.OPEN))
+        is_repeated = content.sequence == self._newest and bool(content.flags & frames.OPEN)
+        return is_repeated or self._is_newer(content)
 
-    def _accept(self, content: Drive, sender: Hashable, now_us: float) -> bytes | None:
+    def _is_newer(self, content: Drive) -> bool:
+        """Whether the sequence of a DRIVE is newer than the newest one."""
+        return 0 < (content.sequence - self._newest) % MODULUS <= NEWER_STEPS
+
+    def _accept(self, content: Drive, seal: Seal, sender: Hashable, now_us: float) -> bytes | None:
         """Convert the inputs, begin a session if a DRIVE says OPEN, and obey its flags.
 
         Returns the bytes of the sample if the DRIVE asks for one, else None.
         """
         codes, digital = self._read_inputs(), self.digital & ((1 << self._digital_counts[0]) - 1)
-        seal = self._seal(content)
+        self._newest, self._turn = content.sequence, seal.turn
         if content.flags & frames.OPEN:
             self._openings = (self._openings + (not self._session)) % MODULUS
             self._session, self._sender = content.session, sender
             self._begin_ramp(now_us)
         if self._session:
-            self._newest, self._heard_us = content.sequence, now_us
+            self._heard_us = now_us
             self._hold_us = min(content.hold_us, LONGEST_HOLD_US)
             self._obey(content, now_us)
         self._set_outputs()
@@ -197,7 +205,6 @@ class SimulatedNode:
         """End the session and begin a ramp if a DRIVE says PARK; apply its codes if it says APPLY and no ramp runs."""
         if content.flags & frames.PARK:
             self._parked, self._session = (self._session, self._sender), 0
-            self._parked_opening = self._openings - 1
             self._ended = 0 if self._ended == self._parked[0] else self._ended
             self._begin_ramp(now_us)
         elif content.flags & frames.APPLY and not self.is_ramping:
@@ -231,10 +238,12 @@ class SimulatedNode:
 
     def _describe(self, session: int) -> Welcome:
         """Return the description of the node for a session's HELLO."""
+        is_open = session != 0 and session == self._session
+        opening = (self._openings - is_open) % MODULUS
         flags = frames.DRIVEN * (self._session != 0) | frames.KEYED * (self._key is not None)
         return Welcome(
-            session, frames.VERSION, self.boot, LONGEST_HOLD_US, SHORTEST_PERIOD_US, flags, self._openings,
-            self._inputs, self._outputs, *self._digital_counts,
+            session, frames.VERSION, self.boot, LONGEST_HOLD_US, SHORTEST_PERIOD_US, flags, opening, self._inputs,
+            self._outputs, *self._digital_counts,
         )  # fmt: skip
 
 

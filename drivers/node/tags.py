@@ -10,8 +10,8 @@ from rtloop.foundation.native.compiled import cfunc, jit, jit_rare
 from rtloop.foundation.native.pointers import add_words, address_pointer, carray, load_word
 
 TAG_BYTES, KEY_BYTES = 8, 16
-STATE_BYTES = 8
-"""Bytes of boot and opening, which a tag covers and no frame contains."""
+STATE_BYTES = 12
+"""Bytes of boot, opening and turn, which a tag covers and no frame contains."""
 _INITIAL = tuple(map(np.uint64, (0x736F6D6570736575, 0x646F72616E646F6D, 0x6C7967656E657261, 0x7465646279746573)))
 _0, _1, _2, _3 = _INITIAL
 _FINAL = np.uint64(0xFF)
@@ -19,11 +19,12 @@ _8, _13, _16, _17, _21, _32, _56, _64 = map(np.uint64, (8, 13, 16, 17, 21, 32, 5
 
 
 class Seal(NamedTuple):
-    """What the tag of a frame depends on besides the frame: the key, None without one, and boot and opening."""
+    """What the tag of a frame depends on besides the frame: the key, None without one, boot, opening and turn."""
 
     key: bytes | None
     boot: int
     opening: int
+    turn: int = 0
 
 
 @jit
@@ -64,18 +65,18 @@ def siphash(key_low, key_high, address, length):
 
 
 @jit
-def write_tag(key_low, key_high, address, length, boot, opening):
-    """Write the tag of the `length` bytes at `address` to the 8 bytes behind them."""
-    place = carray(address_pointer(address + length), 2, np.uint32)
-    place[0], place[1] = boot, opening  # The tag covers them, and then takes their place.
+def write_tag(key_low, key_high, address, length, boot, opening, turn):
+    """Write the tag of the `length` bytes at `address` behind them; 4 bytes more, the place of the check, are lost."""
+    place = carray(address_pointer(address + length), 3, np.uint32)
+    place[0], place[1], place[2] = boot, opening, turn  # The tag covers them, and then takes their place.
     tag = siphash(key_low, key_high, address, length + STATE_BYTES)
     place[0], place[1] = tag & np.uint64(0xFFFFFFFF), tag >> _32
 
 
-@cfunc("int32(uint64, uint64, intp, int64, int64, int64)")
-def _write_tag_of_bytes(key_low, key_high, address, length, boot, opening):
-    """Call `write_tag` for Python, and return 0."""
-    write_tag(key_low, key_high, address, length, boot, opening)
+@cfunc("int32(uint64, uint64, intp, int64, int64, int64, int64)")
+def write_tag_from_python(key_low, key_high, address, length, boot, opening, turn):
+    """Call `write_tag` with integers of Python, and return 0."""
+    write_tag(key_low, key_high, address, length, boot, opening, turn)
     return 0
 
 
@@ -88,6 +89,6 @@ def tag_of(content: bytes, seal: Seal) -> bytes:
     """Return the tag (8 bytes) of a frame that begins with `content`; zeros without a key."""
     if seal.key is None:
         return bytes(TAG_BYTES)
-    buffer = np.frombuffer(bytearray(content + bytes(TAG_BYTES)), np.uint8)
-    _write_tag_of_bytes(*key_words(seal.key), buffer.ctypes.data, len(content), seal.boot, seal.opening)
-    return buffer[-TAG_BYTES:].tobytes()
+    buffer = np.frombuffer(bytearray(content + bytes(STATE_BYTES)), np.uint8)
+    write_tag_from_python(*key_words(seal.key), buffer.ctypes.data, len(content), *seal[1:])
+    return buffer[len(content) :][:TAG_BYTES].tobytes()
