@@ -14,6 +14,7 @@ from collections import Counter
 from collections.abc import Iterator
 from typing import Any
 
+from rtloop.drivers.node.keys import read_key
 from tests.drivers.network_plan import Copy, Plan, damage_datagram
 from tests.drivers.relay_frames import (
     LOOP,
@@ -23,9 +24,10 @@ from tests.drivers.relay_frames import (
     Node,
     drive_content,
     parse_drive,
+    refusal_content,
     sample_content,
 )  # fmt: skip
-from tests.node.frames import ANSWER, APPLY, DRIVE, REFUSAL, SAMPLE, UNSEALED, frame
+from tests.node.frames import ANSWER, APPLY, DRIVE, REFUSAL, SAMPLE, UNSEALED, Seal, frame
 
 PERIOD_US = 1000
 """Time that the node's clock advances with each datagram."""
@@ -225,6 +227,19 @@ class Relay:
         if chance.random() < plan.strangers:  # A sample whose sequence no drive has had.
             data = frame(SAMPLE, newest + 5, sample_content(self._session, boot, codes), UNSEALED)
             self._send(data, Arrival("foreign" if self.node.key else "invalid"))
+        if self.node.key and chance.random() < plan.strangers:  # An answer to the newest drive, by one without the key.
+            self._send(
+                chance.choice(
+                    (
+                        frame(SAMPLE, newest, sample_content(self._session, boot, codes), UNSEALED),
+                        frame(REFUSAL, newest, refusal_content(self._session, boot), UNSEALED),
+                    )
+                ),
+                Arrival("foreign"),
+            )
+        if self.node.key and chance.random() < plan.strangers:  # The node's refusal of a drive that another has sent.
+            seal = Seal(read_key(self.node.key), boot, 1)
+            self._send(frame(REFUSAL, newest, refusal_content(self._session, boot), seal), Arrival("foreign"))
         if chance.random() < plan.strangers and self.earlier:  # A frame of an earlier run, at either end.
             data = chance.choice(self.earlier)
             self._send(data, self._classify(data))

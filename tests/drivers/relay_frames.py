@@ -67,3 +67,8 @@ def drive_content(session: int, flags: int, codes: tuple[int, ...]) -> bytes:
 def sample_content(session: int, boot: int, codes: tuple[int, ...]) -> bytes:
     """Return the bytes of a SAMPLE between its sequence and its tag."""
     return struct.pack(f"<IIBBHII{len(codes)}i", session, boot, 1, len(codes), 0, 0, 0, *codes)
+
+
+def refusal_content(session: int, boot: int) -> bytes:
+    """Return the bytes of a REFUSAL, BUSY for a DRIVE with the tag 7, between its sequence and its tag."""
+    return struct.pack("<IIHHIQ", session, boot, 2, 2, 1, 7)

@@ -254,10 +254,7 @@ def checksum(data: bytes) -> int:
 
 
 def forge_refusals(loop_port: int, node_port: int) -> Callable[[], None]:
-    """Return a function that tells the loop's system, as the network would, that no program receives at the node's port.
-
-    It sends an ICMP message "port unreachable" (RFC 792).
-    """
+    """Return a function that tells the loop's system that no program receives at the node's port: ICMP (RFC 792)."""
     home = socket.inet_aton("127.0.0.1")
     original = struct.pack(">BBHHHBBH4s4s", 0x45, 0, 36, 1, 0, 64, socket.IPPROTO_UDP, 0, home, home)
     original += struct.pack(">HHHH", loop_port, node_port, 16, 0)
