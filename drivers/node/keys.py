@@ -39,4 +39,9 @@ def read_key(path: str | None) -> bytes | None:
             f"driver.key: {path}: the content is not a key; allowed: {DIGITS} hexadecimal digits on one "
             f"line, such as `(umask 077; openssl rand -hex {KEY_BYTES} > {path})` makes"
         )
-    return bytes.fromhex(text.decode())
+    key = bytes.fromhex(text.decode())
+    if len(set(key)) == 1:
+        raise DriverError(
+            f"driver.key: {path}: {KEY_BYTES} equal bytes are no key; allowed: random ones; make a new key"
+        )
+    return key

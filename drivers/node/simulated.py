@@ -163,14 +163,8 @@ class SimulatedNode:
         return frames.FLAGS if content.hold_us == 0 or (content.flags & KINDS).bit_count() > 1 else 0
 
     def _is_due(self, content: Drive) -> bool:
-        """Whether a DRIVE comes after the newest one, repeats it with the flag OPEN, or has the flag PARK.
-
-        True without a session.
-        """
-        if not self._session or content.flags & frames.PARK:
-            return True
-        is_repeated = content.sequence == self._newest and bool(content.flags & frames.OPEN)
-        return is_repeated or self._is_newer(content)
+        """Whether a DRIVE comes after the newest one or has the flag PARK; True without a session."""
+        return not self._session or bool(content.flags & frames.PARK) or self._is_newer(content)
 
     def _is_newer(self, content: Drive) -> bool:
         """Whether the sequence of a DRIVE is newer than the newest one."""
@@ -182,13 +176,12 @@ class SimulatedNode:
         Returns the bytes of the sample if the DRIVE asks for one, else None.
         """
         codes, digital = self._read_inputs(), self.digital & ((1 << self._digital_counts[0]) - 1)
-        self._newest, self._turn = content.sequence, seal.turn
         if content.flags & frames.OPEN:
             self._openings = (self._openings + (not self._session)) % MODULUS
             self._session, self._sender = content.session, sender
             self._begin_ramp(now_us)
         if self._session:
-            self._heard_us = now_us
+            self._newest, self._turn, self._heard_us = content.sequence, seal.turn, now_us
             self._hold_us = min(content.hold_us, LONGEST_HOLD_US)
             self._obey(content, now_us)
         self._set_outputs()
