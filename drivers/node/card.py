@@ -118,8 +118,14 @@ def _scale_array(scales: tuple[Scale, ...]) -> npt.NDArray[np.void]:
 
 
 def crc_table() -> npt.NDArray[np.uint32]:
-    """Return the table (256,), uint32, to compute CRC-32 byte by byte (polynomial 0xEDB88320, bits reflected)."""
-    table = np.arange(256, dtype=np.uint32)
+    """Return the tables (4, 256), uint32, to compute CRC-32 by words of four bytes (polynomial 0xEDB88320, reflected).
+
+    Row k has the CRC of each byte with k bytes 0 behind it.
+    """
+    tables = np.zeros((4, 256), np.uint32)
+    tables[0] = np.arange(256, dtype=np.uint32)
     for _ in range(8):
-        table = np.where(table & 1, np.uint32(0xEDB88320) ^ (table >> 1), table >> 1).astype(np.uint32)
-    return table
+        tables[0] = np.where(tables[0] & 1, np.uint32(0xEDB88320) ^ (tables[0] >> 1), tables[0] >> 1)
+    for k in range(3):
+        tables[k + 1] = (tables[k] >> 8) ^ tables[0][tables[k] & 0xFF]
+    return tables
