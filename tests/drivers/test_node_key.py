@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import pickle
 import re
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -22,7 +23,9 @@ from rtloop.drivers.node.tags import Seal, key_words, siphash, tag_of
 from rtloop.supervision.hardware import Hardware
 from tests.drivers.bench_driver import open_driver
 from tests.drivers.lossy_relay import relayed
-from tests.drivers.node_bench import ONE_AXIS, NodeProcess, make_key, make_options
+from tests.drivers.node_bench import ONE_AXIS, NodeProcess, free_udp_port, make_key, make_options
+from tests.drivers.processes import completed
+from tests.drivers.processes import rtloop as start_rtloop
 from tests.drivers.relayed_nodes import PythonNode
 from tests.node import frames
 from tests.stage_text import one_axis
@@ -168,6 +171,25 @@ def test_the_path_starts_at_the_folder_of_the_configuration_and_the_key_is_nowhe
 def test_a_check_warns_of_a_missing_key(tmp_path: Path, line: str, message: str):
     (warning,) = option_cautions(prepare(load(configuration(tmp_path, line))))
     assert re.search(message, warning)
+
+
+def test_a_simulated_node_and_parking_read_the_key_of_the_configuration(tmp_path: Path):
+    (folder := tmp_path / "stage").mkdir()
+    make_key(folder)
+    place = f'host = "127.0.0.1"\nport = {free_udp_port()}\n'
+    config = configuration(folder, place + 'key = "node.key"')
+    node = start_rtloop("hil", "serve", config, "--udp")
+    try:
+        assert node.stderr is not None
+        assert "Ctrl-C ends the node" in node.stderr.readline()
+        parked = completed(sys.executable, "-m", "rtloop", "park", config)
+        (tmp_path / "other").mkdir()
+        other = completed(sys.executable, "-m", "rtloop", "park", configuration(tmp_path / "other", place))
+    finally:
+        node.terminate()
+        node.communicate()
+    assert (parked.returncode, other.returncode) == (0, 69), parked.stderr + other.stderr
+    assert "the node has a key, and driver.key is not set" in " ".join(other.stderr.split())
 
 
 @pytest.mark.parametrize(
