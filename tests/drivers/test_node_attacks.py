@@ -29,6 +29,7 @@ from tests.users import ATTACKER, ROOT_ONLY, VICTIM, as_user
 PATIENT = {"watchdog_ms": 5000.0, "error_limit": 1_000_000, "hold_ticks": 1000, "wait_s": 60.0}
 LARGEST = 2**23 - 1
 """Code of the output's highest voltage."""
+UNWATCHED = socket.socket
 SHARING = (socket.SO_REUSEADDR, socket.SO_REUSEPORT)
 ADDRESSES = (("", socket.AF_INET), ("127.0.0.1", socket.AF_INET), ("::", socket.AF_INET6),
              ("::ffff:127.0.0.1", socket.AF_INET6))  # fmt: skip
@@ -41,7 +42,7 @@ def bound_as_attacker(port: int) -> list[tuple[str, tuple[int, ...]]]:
     def attempt() -> list[tuple[str, tuple[int, ...]]]:
         bound = []
         for (address, family), chosen in product(ADDRESSES, ((), SHARING[:1], SHARING[1:], SHARING)):
-            with socket.socket(family, socket.SOCK_DGRAM) as thief:
+            with UNWATCHED(family, socket.SOCK_DGRAM) as thief:
                 if family == socket.AF_INET6:
                     thief.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_V6ONLY, 0)
                 for option in chosen:
