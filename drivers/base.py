@@ -120,6 +120,10 @@ class Driver(ABC):
         """
         return [channel.safe_v for channel in self.facts.outputs]
 
+    def cautions(self) -> Sequence[str]:
+        """Return warnings about the options, a line each, which begins with "driver." and the option's name."""
+        return ()
+
     def measure_exchanges(self, count: int) -> Exchanges | None:
         """Return the durations of `count` exchanges (request and answer) with the hardware, one in each tick's period.
 

@@ -1,4 +1,4 @@
-/* Frames between loop and node, protocol version 1 (docs/node-protocol.md): numbers in little-endian order, header, check.
+/* Frames between loop and node, protocol version 2 (docs/node-protocol.md): numbers in little-endian order, header, tag, check.
  *
  * Every function works on bytes, so that neither the processor's byte order nor an address of a frame matters. */
 #ifndef RTLOOP_FRAME_H
@@ -8,13 +8,16 @@
 #include <stddef.h>
 #include <stdint.h>
 
+#include "rtloop_siphash.h"
+
 enum {
-    RTLOOP_PROTOCOL_VERSION = 1,
+    RTLOOP_PROTOCOL_VERSION = 2,
     RTLOOP_MAGIC = 0x057B,
     RTLOOP_MAX_CHANNELS = 44,                            /* inputs and outputs together */
     RTLOOP_MAX_DIGITAL = 16,
-    RTLOOP_MAX_ANSWER = 40 + 32 * RTLOOP_MAX_CHANNELS,   /* bytes of the longest WELCOME */
-    RTLOOP_MAX_DRIVE = 28 + 4 * 255                      /* bytes of the longest DRIVE, of whatever node */
+    RTLOOP_MAX_ANSWER = 52 + 32 * RTLOOP_MAX_CHANNELS,   /* bytes of the longest WELCOME */
+    RTLOOP_MAX_DRIVE = 36 + 4 * 255,                     /* bytes of the longest DRIVE, of whatever node */
+    RTLOOP_END_BYTES = 12                                /* tag and check */
 };
 
 enum rtloop_format { RTLOOP_HELLO = 0x70, RTLOOP_WELCOME, RTLOOP_DRIVE, RTLOOP_SAMPLE, RTLOOP_REFUSAL };
@@ -22,6 +25,8 @@ enum rtloop_format { RTLOOP_HELLO = 0x70, RTLOOP_WELCOME, RTLOOP_DRIVE, RTLOOP_S
 enum rtloop_drive_flag { RTLOOP_OPEN = 1, RTLOOP_APPLY = 2, RTLOOP_ANSWER = 4, RTLOOP_PARK = 8 };
 
 enum rtloop_sample_flag { RTLOOP_READY = 1, RTLOOP_AT_SAFE = 2 };
+
+enum rtloop_welcome_flag { RTLOOP_DRIVEN = 1, RTLOOP_KEYED = 2 };
 
 enum rtloop_reason {
     RTLOOP_VERSION = 1,
@@ -31,6 +36,13 @@ enum rtloop_reason {
     RTLOOP_SIZE,
     RTLOOP_RANGE,
     RTLOOP_FLAGS
+};
+
+/* Numbers that are in a frame's tag without being sent. */
+struct rtloop_course {
+    uint32_t boot;
+    uint32_t opening;
+    uint32_t turn;
 };
 
 /* Write a number of 16 bits to two bytes. */
@@ -47,6 +59,13 @@ static inline void rtloop_put32(uint8_t *bytes, uint32_t value)
     rtloop_put16(bytes + 2, value >> 16);
 }
 
+/* Write a number of 64 bits to eight bytes. */
+static inline void rtloop_put64(uint8_t *bytes, uint64_t value)
+{
+    rtloop_put32(bytes, (uint32_t)(value & 0xFFFFFFFFu));
+    rtloop_put32(bytes + 4, (uint32_t)(value >> 32));
+}
+
 /* Return the number of 16 bits in two bytes. */
 static inline uint16_t rtloop_get16(const uint8_t *bytes)
 {
@@ -57,6 +76,12 @@ static inline uint16_t rtloop_get16(const uint8_t *bytes)
 static inline uint32_t rtloop_get32(const uint8_t *bytes)
 {
     return (uint32_t)rtloop_get16(bytes) | (uint32_t)rtloop_get16(bytes + 2) << 16;
+}
+
+/* Return the number of 64 bits in eight bytes. */
+static inline uint64_t rtloop_get64(const uint8_t *bytes)
+{
+    return (uint64_t)rtloop_get32(bytes) | (uint64_t)rtloop_get32(bytes + 4) << 32;
 }
 
 /* Return the signed number of 32 bits in four bytes. */
@@ -96,6 +121,36 @@ static inline size_t rtloop_frame_end(uint8_t *frame, size_t length)
 {
     rtloop_put32(frame + length - 4, rtloop_crc32(frame, length - 4));
     return length;
+}
+
+/* Return the tag of a frame with this length; 0 without a key. */
+static inline uint64_t rtloop_frame_tag(const uint8_t *frame, size_t length, const uint8_t *key, struct rtloop_course course)
+{
+    struct rtloop_siphash hash;
+    uint8_t unsent[12];
+    if (key == NULL) {
+        return 0;
+    }
+    rtloop_put32(unsent, course.boot);
+    rtloop_put32(unsent + 4, course.opening);
+    rtloop_put32(unsent + 8, course.turn);
+    rtloop_siphash_begin(&hash, key);
+    rtloop_siphash_add(&hash, frame, length - RTLOOP_END_BYTES);
+    rtloop_siphash_add(&hash, unsent, sizeof unsent);
+    return rtloop_siphash_end(&hash);
+}
+
+/* Return whether a frame has the tag of a course, in a time that does not depend on the tag; true without a key. */
+static inline bool rtloop_frame_tagged(const uint8_t *frame, size_t length, const uint8_t *key, struct rtloop_course course)
+{
+    return key == NULL || (rtloop_get64(frame + length - RTLOOP_END_BYTES) ^ rtloop_frame_tag(frame, length, key, course)) == 0;
+}
+
+/* Write the tag and the check to the last bytes of a frame, and return the frame's length. */
+static inline size_t rtloop_frame_seal(uint8_t *frame, size_t length, const uint8_t *key, struct rtloop_course course)
+{
+    rtloop_put64(frame + length - RTLOOP_END_BYTES, rtloop_frame_tag(frame, length, key, course));
+    return rtloop_frame_end(frame, length);
 }
 
 /* Return whether a frame has a valid header and check; its length is judged by its reader, who knows the format. */

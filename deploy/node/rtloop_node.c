@@ -7,8 +7,8 @@ _Static_assert(sizeof(double) == 8, "a channel's constants are numbers of 64 bit
 /* Time between two steps of a ramp. */
 #define STEP_US 1000u
 
-/* Difference of two sequences from which on the first one is the older: half of their range. */
-#define HALF 0x80000000u
+/* Twice the µs of a second: a DRIVE that is further ahead than a second with two frames in a period is no newer frame. */
+#define WINDOW_US 2000000u
 
 /* Return whether a description of channels is allowed. */
 static bool channels_allowed(const struct rtloop_node_channel *channels, uint8_t count, bool outputs)
@@ -23,12 +23,22 @@ static bool channels_allowed(const struct rtloop_node_channel *channels, uint8_t
     return true;
 }
 
+/* Return whether a key is more than a memory that nobody has written: bytes that are all equal. */
+static bool key_allowed(const uint8_t *key)
+{
+    uint8_t differences = 0;
+    for (int i = 1; key != NULL && i < RTLOOP_KEY_BYTES; i++) {
+        differences |= key[i] ^ key[0];
+    }
+    return key == NULL || differences != 0;
+}
+
 /* Return whether a configuration describes a node that the protocol allows. */
 static bool config_allowed(const struct rtloop_node_config *config)
 {
     return config->inputs >= 1 && config->outputs >= 1 && config->inputs + config->outputs <= RTLOOP_MAX_CHANNELS
            && config->digital_inputs <= RTLOOP_MAX_DIGITAL && config->digital_outputs <= RTLOOP_MAX_DIGITAL
-           && config->longest_hold_us >= 1 && channels_allowed(config->input, config->inputs, false)
+           && config->longest_hold_us >= 1 && key_allowed(config->key) && channels_allowed(config->input, config->inputs, false)
            && channels_allowed(config->output, config->outputs, true);
 }
 
@@ -152,8 +162,14 @@ uint64_t rtloop_node_due_us(const struct rtloop_node *node)
     return node->session != 0 && trip_us < due_us ? trip_us : due_us;
 }
 
-/* Write a REFUSAL of a frame, and return its length. */
-static size_t refuse(struct rtloop_node *node, const uint8_t *frame, enum rtloop_reason reason, uint8_t *answer)
+/* Return the course of a frame of this boot. */
+static struct rtloop_course course(const struct rtloop_node *node, uint32_t opening, uint32_t turn)
+{
+    return (struct rtloop_course){.boot = node->boot, .opening = opening, .turn = turn};
+}
+
+/* Write a REFUSAL of a HELLO or DRIVE, and return its length. */
+static size_t refuse(struct rtloop_node *node, const uint8_t *frame, size_t length, enum rtloop_reason reason, uint8_t *answer)
 {
     node->counters.refused++;
     rtloop_frame_begin(answer, RTLOOP_REFUSAL, rtloop_get32(frame + 4));
@@ -161,8 +177,13 @@ static size_t refuse(struct rtloop_node *node, const uint8_t *frame, enum rtloop
     rtloop_put32(answer + 12, node->boot);
     rtloop_put16(answer + 16, (uint32_t)reason);
     rtloop_put16(answer + 18, RTLOOP_PROTOCOL_VERSION);
-    rtloop_put32(answer + 20, 0);
-    return rtloop_frame_end(answer, 28);
+    if (reason == RTLOOP_VERSION) {
+        rtloop_put32(answer + 20, 0);
+        return rtloop_frame_end(answer, 28);
+    }
+    rtloop_put32(answer + 20, node->counters.sessions);
+    memcpy(answer + 24, frame + length - RTLOOP_END_BYTES, 8);
+    return rtloop_frame_seal(answer, 44, node->config->key, course(node, node->counters.sessions, 0));
 }
 
 /* Copy the 64 bits of a number to eight bytes. */
@@ -170,8 +191,7 @@ static void put_double(uint8_t *bytes, const double *number)
 {
     uint64_t bits;
     memcpy(&bits, number, sizeof bits);
-    rtloop_put32(bytes, (uint32_t)(bits & 0xFFFFFFFFu));
-    rtloop_put32(bytes + 4, (uint32_t)(bits >> 32));
+    rtloop_put64(bytes, bits);
 }
 
 /* Write the description of channels, and return the place behind it. */
@@ -188,12 +208,19 @@ static uint8_t *put_channels(uint8_t *bytes, const struct rtloop_node_channel *c
     return bytes;
 }
 
+/* Return whether a number is that of the session that is open. */
+static bool is_own(const struct rtloop_node *node, uint32_t session)
+{
+    return node->session != 0 && session == node->session;
+}
+
 /* Answer a HELLO by a WELCOME, or by a REFUSAL if it has another version, and return the answer's length. */
-static size_t receive_hello(struct rtloop_node *node, const uint8_t *frame, uint8_t *answer)
+static size_t receive_hello(struct rtloop_node *node, const uint8_t *frame, size_t length, uint8_t *answer)
 {
     const struct rtloop_node_config *config = node->config;
+    uint32_t opening = node->counters.sessions - is_own(node, rtloop_get32(frame + 8));
     if (rtloop_get16(frame + 12) != RTLOOP_PROTOCOL_VERSION) {
-        return refuse(node, frame, RTLOOP_VERSION, answer);
+        return refuse(node, frame, length, RTLOOP_VERSION, answer);
     }
     rtloop_frame_begin(answer, RTLOOP_WELCOME, rtloop_get32(frame + 4));
     rtloop_put32(answer + 8, rtloop_get32(frame + 8));
@@ -206,10 +233,11 @@ static size_t receive_hello(struct rtloop_node *node, const uint8_t *frame, uint
     rtloop_put32(answer + 20, node->boot);
     rtloop_put32(answer + 24, config->longest_hold_us);
     rtloop_put32(answer + 28, config->shortest_period_us);
-    rtloop_put32(answer + 32, node->session != 0);
-    uint8_t *end = put_channels(answer + 36, config->input, config->inputs, false);
+    rtloop_put32(answer + 32, (node->session != 0 ? RTLOOP_DRIVEN : 0u) | (config->key != NULL ? RTLOOP_KEYED : 0u));
+    rtloop_put32(answer + 36, opening);
+    uint8_t *end = put_channels(answer + 40, config->input, config->inputs, false);
     end = put_channels(end, config->output, config->outputs, true);
-    return rtloop_frame_end(answer, (size_t)(end - answer) + 4);
+    return rtloop_frame_seal(answer, (size_t)(end - answer) + RTLOOP_END_BYTES, config->key, course(node, opening, 0));
 }
 
 /* A DRIVE, read from its bytes. */
@@ -221,11 +249,27 @@ struct drive {
     uint8_t flags;
     uint8_t outputs;
     const uint8_t *codes;
+    bool newer;                   /* than the newest one of the session */
+    struct rtloop_course course;  /* that its tag must have */
 };
 
-static struct drive read_drive(const uint8_t *frame)
+/* Return whether a DRIVE is of the session that is open, or parks once more the session that was parked last. */
+static bool is_of_session(const struct rtloop_node *node, const struct drive *drive)
 {
-    return (struct drive){
+    bool parks_again = node->session == 0 && drive->flags & RTLOOP_PARK && drive->session == node->parked_session;
+    return drive->session != 0 && (parks_again || is_own(node, drive->session));
+}
+
+/* Return whether a sequence is newer than the newest one (rule 4). */
+static bool is_newer(const struct rtloop_node *node, uint32_t sequence)
+{
+    uint32_t window = WINDOW_US / (node->config->shortest_period_us != 0 ? node->config->shortest_period_us : 1);
+    return sequence - node->newest - 1 < (window > 2 ? window : 2);
+}
+
+static struct drive read_drive(const struct rtloop_node *node, const uint8_t *frame)
+{
+    struct drive drive = {
         .sequence = rtloop_get32(frame + 4),
         .session = rtloop_get32(frame + 8),
         .flags = frame[12],
@@ -234,32 +278,47 @@ static struct drive read_drive(const uint8_t *frame)
         .hold_us = rtloop_get32(frame + 16),
         .codes = frame + 24,
     };
+    drive.newer = is_newer(node, drive.sequence);
+    drive.course = is_of_session(node, &drive)
+                       ? course(node, node->counters.sessions - 1, node->turn + (drive.newer && drive.sequence < node->newest))
+                       : course(node, node->counters.sessions, 0);
+    return drive;
 }
 
-/* Return why a DRIVE from an address has no access to the node (rules 3, 5 and 9); 0 if it has. */
+/* Return why a DRIVE from an address has no access to the node (rules 3, 5 and 9); 0 if it has.
+ * With a key the tag of a PARK is enough, so that no other address keeps a loop from parking. */
 static enum rtloop_reason judge_access(const struct rtloop_node *node, const struct drive *drive, uint64_t sender)
 {
+    bool from_any = node->config->key != NULL && drive->flags & RTLOOP_PARK;
     if (node->session != 0) {
-        return drive->session == node->session && sender == node->sender ? 0 : RTLOOP_BUSY;
+        return is_own(node, drive->session) && (from_any || sender == node->sender) ? 0 : RTLOOP_BUSY;
     }
     if (drive->session == 0) {
         return RTLOOP_UNKNOWN;
     }
-    if (drive->flags & RTLOOP_OPEN) {
-        return 0;
-    }
-    if (drive->flags & RTLOOP_PARK && drive->session == node->parked_session && sender == node->parked_sender) {
+    if (drive->flags & RTLOOP_OPEN || (is_of_session(node, drive) && (from_any || sender == node->parked_sender))) {
         return 0;
     }
     return drive->session == node->tripped_session ? RTLOOP_WATCHDOG : RTLOOP_UNKNOWN;
 }
 
-/* Return whether a DRIVE of the session is not newer than the newest one (rule 4).
- * An OPEN that has the newest sequence itself is a repetition. An older one comes from a network that delayed it. */
+/* Return whether a DRIVE, which `reason` would refuse, is foreign to a node with a key.
+ * All are told UNKNOWN and WATCHDOG, so that a node that has started again can tell its loop. A copy of a loop's DRIVE from another
+ * address is not told BUSY, which the loop would believe. */
+static bool is_foreign(const struct rtloop_node *node, const struct drive *drive, enum rtloop_reason reason, const uint8_t *frame,
+                       size_t length)
+{
+    if (node->config->key == NULL || reason == RTLOOP_UNKNOWN || reason == RTLOOP_WATCHDOG) {
+        return false;
+    }
+    bool copied = reason == RTLOOP_BUSY && drive->session == node->session;
+    return copied || !rtloop_frame_tagged(frame, length, node->config->key, drive->course);
+}
+
+/* Return whether a DRIVE of the session comes too late (rule 4). A PARK is obeyed whatever its sequence. */
 static bool is_old(const struct rtloop_node *node, const struct drive *drive)
 {
-    uint32_t distance = drive->sequence - node->newest;
-    return node->session != 0 && (distance >= HALF || (distance == 0 && !(drive->flags & RTLOOP_OPEN)));
+    return node->session != 0 && !drive->newer && !(drive->flags & RTLOOP_PARK);
 }
 
 /* Return why the content of a DRIVE is not allowed (rule 6); 0 if it is. */
@@ -322,6 +381,7 @@ static void obey(struct rtloop_node *node, const struct drive *drive, uint64_t s
         return; /* a repeated PARK */
     }
     node->newest = drive->sequence;
+    node->turn = drive->course.turn;
     node->accepted_us = node->now_us;
     node->hold_us = drive->hold_us < node->config->longest_hold_us ? drive->hold_us : node->config->longest_hold_us;
     if (drive->flags & RTLOOP_PARK) {
@@ -362,14 +422,18 @@ static size_t end_sample(const struct rtloop_node *node, const struct drive *dri
     rtloop_put32(answer + 24, node->applied);
     uint64_t age_ns = board_ns(node) - converted_ns;
     rtloop_put32(answer + 20, age_ns < UINT32_MAX ? (uint32_t)age_ns : UINT32_MAX);
-    return rtloop_frame_end(answer, 32 + 4 * (size_t)node->config->inputs);
+    return rtloop_frame_seal(answer, 40 + 4 * (size_t)node->config->inputs, node->config->key, drive->course);
 }
 
 /* Process a DRIVE, and return the length of its answer; 0: none. */
-static size_t receive_drive(struct rtloop_node *node, const uint8_t *frame, uint64_t sender, uint8_t *answer)
+static size_t receive_drive(struct rtloop_node *node, const uint8_t *frame, size_t length, uint64_t sender, uint8_t *answer)
 {
-    struct drive drive = read_drive(frame);
+    struct drive drive = read_drive(node, frame);
     enum rtloop_reason reason = judge_access(node, &drive, sender);
+    if (is_foreign(node, &drive, reason, frame, length)) {
+        node->counters.foreign++;
+        return 0;
+    }
     if (reason == 0 && is_old(node, &drive)) {
         node->counters.old++;
         return 0;
@@ -378,7 +442,7 @@ static size_t receive_drive(struct rtloop_node *node, const uint8_t *frame, uint
         reason = judge_content(node, &drive);
     }
     if (reason != 0) {
-        return refuse(node, frame, reason, answer);
+        return refuse(node, frame, length, reason, answer);
     }
     uint64_t converted_ns = board_ns(node);
     if (drive.flags & RTLOOP_ANSWER) {
@@ -394,10 +458,10 @@ size_t rtloop_node_receive(struct rtloop_node *node, const uint8_t *frame, size_
     rtloop_node_poll(node, now_us); /* a hold that has passed ends the session before this frame */
     if (rtloop_frame_valid(frame, length)) {
         if (frame[2] == RTLOOP_HELLO && length == 20) {
-            return receive_hello(node, frame, answer);
+            return receive_hello(node, frame, length, answer);
         }
-        if (frame[2] == RTLOOP_DRIVE && length == 28 + 4 * (size_t)frame[13]) {
-            return receive_drive(node, frame, sender, answer);
+        if (frame[2] == RTLOOP_DRIVE && length == 36 + 4 * (size_t)frame[13]) {
+            return receive_drive(node, frame, length, sender, answer);
         }
     }
     node->counters.invalid++;

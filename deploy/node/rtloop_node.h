@@ -37,6 +37,7 @@ struct rtloop_node_config {
     uint32_t shortest_period_us;  /* shortest period from DRIVE to DRIVE; the loop keeps it */
     const struct rtloop_node_channel *input;
     const struct rtloop_node_channel *output;
+    const uint8_t *key;           /* 16 random bytes, not all equal; NULL: whoever reaches the node may drive it */
     void *context;                /* first argument of the functions below */
     /* Convert all inputs now. */
     void (*read_inputs)(void *context, int32_t *codes, uint16_t *digital);
@@ -50,8 +51,9 @@ struct rtloop_node_counters {
     uint32_t invalid;             /* frames with another length, header, format or check */
     uint32_t old;                 /* DRIVEs that were not newer than the newest one */
     uint32_t refused;             /* frames that were answered by a REFUSAL */
-    uint32_t sessions;            /* sessions that were opened */
+    uint32_t sessions;            /* sessions that were opened: the opening of the next one */
     uint32_t watchdog_trips;      /* sessions that the watchdog ended */
+    uint32_t foreign;             /* DRIVEs with another tag or, of the session, from another address: with a key alone */
 };
 
 /* A node. Read its fields freely, and change none. */
@@ -67,6 +69,7 @@ struct rtloop_node {
     uint32_t parked_session;      /* session that ended by PARK last; 0: none */
     uint32_t tripped_session;     /* session that the watchdog ended last; 0: none */
     uint32_t newest;              /* sequence of the newest accepted DRIVE */
+    uint32_t turn;                /* how often the sequence has passed 0 since the session's OPEN */
     uint32_t applied;             /* sequence of the DRIVE whose codes are at the outputs; 0: none */
     uint32_t hold_us;             /* hold of the newest accepted DRIVE */
     bool ramping;
@@ -76,7 +79,8 @@ struct rtloop_node {
 };
 
 /* Start a node with its outputs at their safe codes; return false, and write nothing, if the configuration is not allowed.
- * `boot` is a random number, another one at each start. `now_us` is a clock that never stops or steps while the node runs. */
+ * `boot` is never the same number twice, or recorded frames fit again: take it from a generator in hardware or a counter in
+ * flash. `now_us` is a clock that never stops or steps while the node runs. */
 bool rtloop_node_init(struct rtloop_node *node, const struct rtloop_node_config *config, uint32_t boot, uint64_t now_us);
 
 /* Process one frame from the address `sender`, and return the number of bytes in `answer` to send there; 0: none. */

@@ -8,6 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rtloop.drivers.node.frames import MAX_FRAME_BYTES, Scale
+from rtloop.drivers.node.tags import Seal, key_words
 
 WINDOW = 1024
 """Number of the last frames sent that are still known: their answers count as late or repeated."""
@@ -25,7 +26,7 @@ answered request until the loop had its answer."""
 
 _ADDRESSES = (
     "sent", "received", "coded", "partial", "raw", "crc_table",
-    "in_scales", "out_scales", "codes", "ring_sequence", "ring_request", "ring_ns", "timespec",
+    "in_scales", "out_scales", "codes", "ring_sequence", "ring_request", "ring_ns", "ring_tag", "timespec",
 )  # fmt: skip
 CARD = np.dtype(
     [
@@ -53,6 +54,9 @@ CARD = np.dtype(
         ("raw_position", np.int64),
         ("reads_until_strangers", np.int64),  # reads before the next one that counts their datagrams
         ("frame_length", np.int64),  # bytes of the frame that a serial line has delivered so far; −1 to skip to its end
+        ("is_keyed", np.int64),
+        ("key_low", np.uint64),
+        ("key_high", np.uint64),
         ("session", np.uint32),
         ("boot", np.uint32),
         ("sequence", np.uint32),  # of the last frame that asked for an answer
@@ -60,7 +64,8 @@ CARD = np.dtype(
         ("newest", np.uint32),  # of the newest sample
         ("digital", np.uint32),  # inputs in the newest sample
         ("hold_us", np.uint32),
-        ("spare", np.uint32),
+        ("opening", np.uint32),
+        ("turn", np.uint32),  # how often the sequence has begun again at 0
     ]
 )
 """State of an exchange; each name in the first group is the address of an array."""
@@ -71,14 +76,14 @@ SCALE = np.dtype(
 
 
 def make_card(
-    fd: int, strangers_fd: int | None, **values: Any
+    fd: int, strangers_fd: int | None, seal: Seal, **values: Any
 ) -> tuple[npt.NDArray[np.void], dict[str, npt.NDArray[np.generic]]]:
     """Return a record CARD, shape (1,), and a dict of the arrays whose addresses it holds, by the names of these
     fields.
 
     The arrays must live as long as the record. `fd` is connected to the node; `strangers_fd` is a socket of the same
-    port for all others, None for a serial line. `values` are further fields; `in_scales` and `out_scales` are sequences
-    of Scale.
+    port for all others, None for a serial line. `seal` is that of the session. `values` are further fields; `in_scales`
+    and `out_scales` are sequences of Scale.
     """
     inputs, outputs = (_scale_array(values.pop(name)) for name in ("in_scales", "out_scales"))
     arrays: dict[str, npt.NDArray[np.generic]] = {
@@ -91,11 +96,14 @@ def make_card(
         "ring_sequence": np.zeros(WINDOW, np.uint32),
         "ring_request": np.zeros(WINDOW, np.int64),
         "ring_ns": np.zeros(WINDOW, np.int64),
+        "ring_tag": np.zeros(WINDOW, np.uint64),
         "timespec": np.zeros(2, np.int64),
     }
     card = np.zeros(1, CARD)
     card["fd"], card["is_serial"], card["strangers_fd"] = fd, strangers_fd is None, strangers_fd or 0
     card["inputs"], card["outputs"] = len(inputs), len(outputs)
+    card["boot"], card["opening"], card["is_keyed"] = seal.boot, seal.opening, seal.key is not None
+    card["key_low"], card["key_high"] = (0, 0) if seal.key is None else key_words(seal.key)
     for name, value in values.items():
         card[name] = value
     for name, array in arrays.items():
@@ -110,8 +118,14 @@ def _scale_array(scales: tuple[Scale, ...]) -> npt.NDArray[np.void]:
 
 
 def crc_table() -> npt.NDArray[np.uint32]:
-    """Return the table (256,), uint32, to compute CRC-32 byte by byte (polynomial 0xEDB88320, bits reflected)."""
-    table = np.arange(256, dtype=np.uint32)
+    """Return the tables (4, 256), uint32, to compute CRC-32 by words of four bytes (polynomial 0xEDB88320, reflected).
+
+    Row k has the CRC of each byte with k bytes 0 behind it.
+    """
+    tables = np.zeros((4, 256), np.uint32)
+    tables[0] = np.arange(256, dtype=np.uint32)
     for _ in range(8):
-        table = np.where(table & 1, np.uint32(0xEDB88320) ^ (table >> 1), table >> 1).astype(np.uint32)
-    return table
+        tables[0] = np.where(tables[0] & 1, np.uint32(0xEDB88320) ^ (tables[0] >> 1), tables[0] >> 1)
+    for k in range(3):
+        tables[k + 1] = (tables[k] >> 8) ^ tables[0][tables[k] & 0xFF]
+    return tables

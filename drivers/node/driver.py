@@ -7,7 +7,8 @@ from __future__ import annotations
 
 import secrets
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
+from typing import ClassVar
 
 import numpy as np
 import numpy.typing as npt
@@ -19,10 +20,14 @@ from rtloop.drivers.node.card import OBSERVED, WINDOW, make_card
 from rtloop.drivers.node.exchange import HIGH_V, node_read, node_write
 from rtloop.drivers.node.failures import failure_text
 from rtloop.drivers.node.frames import Drive, Sample, Welcome
+from rtloop.drivers.node.keys import read_key
 from rtloop.drivers.node.link import Link, open_link
 from rtloop.drivers.node.options import NodeOptions, SerialOptions, UdpOptions
+from rtloop.drivers.node.tags import Seal
 
 RETRY_S, BUSY_S, CONFIRM_S = 0.05, 1.5, 0.02
+DOUBT_S = 1.0
+"""Time in which the node's own WELCOME may still come after one that cannot be used."""
 LONGEST_PARKING_S = 10.0
 OPENING_HOLD_US = 0xFFFFFFFF
 UNCONFIRMED = (
@@ -39,6 +44,8 @@ class NodeDriver(Driver):
     """The driver of a node; its two kinds differ in their options, which choose the line."""
 
     options_model = NodeOptions
+    WHO_DRIVES: ClassVar[str]
+    """Words for those who can drive a node without a key."""
 
     def __init__(self, options: NodeOptions, wiring: Mapping[str, Wiring], rate_hz: float) -> None:
         """Check the wiring; no line is opened. Raises ValueError for a channel that the node lacks."""
@@ -46,6 +53,7 @@ class NodeDriver(Driver):
         self._options = options
         self._link: Link | None = None
         self._card: npt.NDArray[np.void] | None = None
+        self._key: bytes | None = None
         self._arrays: dict[str, npt.NDArray[np.generic]] = {}
         require_channels(wiring, self.facts)
 
@@ -67,6 +75,16 @@ class NodeDriver(Driver):
             hardware_watchdog=True,
             delay_ticks=0 if options.waits else 1,
         )
+
+    def cautions(self) -> Sequence[str]:
+        """Return a warning for options without a key, or with a key that cannot be used."""
+        if self._options.key is None:
+            return (f"driver.key: none, so {self.WHO_DRIVES} can drive the node; make a key (docs/drivers.md, A key)",)
+        try:
+            read_key(self._options.key)
+        except DriverError as error:
+            return (str(error),)
+        return ()
 
     def _count(self, number: int | None) -> int:
         """Return `number`, an option's number of channels; if it is None, the number of axes, at least 1."""
@@ -91,9 +109,10 @@ class NodeDriver(Driver):
 
         Raises DriverError, with the line closed, if no node answers within `wait_s`, if the node has other channels,
         ranges or safe values, another version, or a largest rate below the loop's, if a serial line is too slow for
-        the loop, if another controller drives the node, if its outputs do not reach their safe values in time, and if
-        the line fails.
+        the loop, if another controller drives the node, if its outputs do not reach their safe values in time, if the
+        line fails, for a key that cannot be read, and if loop and node do not have the same key, or none.
         """
+        self._key = read_key(self._options.key)
         self._link = open_link(self._options)
         try:
             return self._open_node(self._link)
@@ -115,13 +134,13 @@ class NodeDriver(Driver):
         self._require_fit(welcome)
         self._require_rate(link, welcome)
         read, write = node_read.address, node_write.address
-        last = self._begin_session(link, welcome)
+        last, seal = self._begin_session(link, welcome)
         self._card, self._arrays = make_card(
-            link.fd, link.strangers_fd, in_scales=welcome.inputs, out_scales=welcome.outputs,
+            link.fd, link.strangers_fd, seal, in_scales=welcome.inputs, out_scales=welcome.outputs,
             digital_inputs=options.digital_inputs, digital_outputs=options.digital_outputs,
             hold_ticks=options.hold_ticks, error_limit=options.error_limit, waits=options.waits,
             deadline_ns=round(options.deadline_us * US_PER_MS), hold_us=round(options.watchdog_ms * US_PER_MS),
-            session=self._session, boot=welcome.boot, sequence=last, last_sequence=last, newest=last,
+            session=self._session, sequence=last, last_sequence=last, newest=last,
         )  # fmt: skip
         self._set_codes([scale.safe for scale in welcome.outputs])
         self._arrays["ring_ns"][last % WINDOW] = time.monotonic_ns()
@@ -168,9 +187,9 @@ class NodeDriver(Driver):
         """
         if self._link is None or self._card is None:
             return
-        sequence = int(self._card["last_sequence"][0])
+        sequence, *state = (int(self._card[name][0]) for name in ("last_sequence", "boot", "opening", "turn"))
         try:
-            self._park(self._link, sequence)
+            self._park(self._link, sequence, Seal(self._key, *state))
         except OSError as error:
             raise DriverError(f"{self._options.label}: {error.strerror or error}; {UNCONFIRMED}") from None
         finally:
@@ -186,37 +205,58 @@ class NodeDriver(Driver):
     def _greet(self, link: Link) -> Welcome:
         """Send a HELLO every RETRY_S until the node describes itself, and return its description.
 
-        Raises DriverError if no description comes within `wait_s`, and if the node speaks another version of the
-        protocol; OSError if the line fails.
+        Raises DriverError if no description comes within `wait_s`, and, some time after it was seen first, because
+        anybody may forge it, if the node speaks another version of the protocol or has another key; OSError if the line
+        fails.
         """
-        deadline_s, sequence = time.monotonic() + self._options.wait_s, 0
+        deadline_s, sequence, fault = time.monotonic() + self._options.wait_s, 0, None
         while time.monotonic() < deadline_s:
             sequence += 1
             link.send(frames.hello(sequence, self._session))
-            if (welcome := self._await_welcome(link, RETRY_S)) is not None:
-                return welcome
+            answer = self._await_welcome(link, RETRY_S)
+            if isinstance(answer, Welcome):
+                return answer
+            if answer is not None and fault is None:
+                deadline_s = min(deadline_s, time.monotonic() + DOUBT_S)
+            fault = answer or fault
+        if fault is not None:
+            raise DriverError(f"{self._options.label}: {fault}")
         command = "--serial" if isinstance(self._options, SerialOptions) else "--udp"
         raise DriverError(
             f"{self._options.label}: no node has answered within {self._options.wait_s:g} s; "
             f"switch the node on, or start a simulated node with `rtloop hil serve CONFIG {command}`"
         )
 
-    def _await_welcome(self, link: Link, timeout_s: float) -> Welcome | None:
-        """Return the node's description if it comes within `timeout_s`, else None.
+    def _await_welcome(self, link: Link, timeout_s: float) -> Welcome | str | None:
+        """Return the node's description if it comes within `timeout_s`; else the fault of one that cannot be used, None
+        if there was none.
 
-        Raises DriverError if the node speaks another version of the protocol, OSError if the line fails.
+        Raises OSError if the line fails.
         """
+        fault = None
         for header, data in _receive_for(link, timeout_s):
             if header.session != self._session:
                 continue
             refusal = frames.read_refusal(data) if header.format == frames.REFUSAL_FORMAT else None
             if refusal is not None and refusal.reason == frames.VERSION_REFUSED:
-                raise DriverError(
-                    f"{self._options.label}: the node speaks version {refusal.version} of the protocol; "
-                    f"allowed: {frames.VERSION}; install the node's program of this version of rtloop"
+                fault = (
+                    f"the node speaks version {refusal.version} of the protocol; allowed: {frames.VERSION}; install "
+                    "the node's program of this version of rtloop"
                 )
             if header.format == frames.WELCOME and (welcome := frames.read_welcome(data)) is not None:
-                return welcome
+                fault = self._key_fault(data, welcome)
+                if fault is None:
+                    return welcome
+        return fault
+
+    def _key_fault(self, data: bytes, welcome: Welcome) -> str | None:
+        """Return the fault of a WELCOME whose tag or flag does not fit the key of the options; None if both do."""
+        if bool(welcome.flags & frames.KEYED) != (self._key is not None):
+            if self._key is None:
+                return "the node has a key, and driver.key is not set; set driver.key to a file with the node's key"
+            return "the node has no key; give the node the key in driver.key, or remove driver.key"
+        if not frames.is_genuine(data, Seal(self._key, welcome.boot, welcome.opening)):
+            return "the node has another key than the file in driver.key; give both the same key"
         return None
 
     def _require_fit(self, welcome: Welcome) -> None:
@@ -262,22 +302,26 @@ class NodeDriver(Driver):
     def _require_rate(self, link: Link, welcome: Welcome) -> None:
         """Do nothing: every line counts as fast enough. A subclass may measure its line, and raise DriverError."""
 
-    def _begin_session(self, link: Link, welcome: Welcome) -> int:
+    def _begin_session(self, link: Link, welcome: Welcome) -> tuple[int, Seal]:
         """Send an OPEN every RETRY_S until the node is ready: it obeys this session, and its outputs are safe.
 
-        Returns the sequence number of the OPEN that the node answered as ready. Raises DriverError if another loop
-        drives the node for longer than BUSY_S, if the node refuses for another reason, and if the node is not ready
-        within `wait_s`; OSError if the line fails.
+        Returns the sequence number of the OPEN that the node answered as ready, and the seal of the session. Raises
+        DriverError if another loop drives the node for longer than BUSY_S, if the node refuses for another reason, and
+        if the node is not ready within `wait_s`; OSError if the line fails.
         """
         safe = tuple(scale.safe for scale in welcome.outputs)
         start_s, sequence = time.monotonic(), 0
         while time.monotonic() < start_s + self._options.wait_s:
             sequence += 1
+            if self._key is not None and sequence > 1:  # Another loop may have opened a session meanwhile.
+                welcome = self._greet(link)
+            seal = Seal(self._key, welcome.boot, welcome.opening)
             flags = frames.OPEN | frames.ANSWER
-            link.send(frames.drive(Drive(sequence, self._session, flags, 0, OPENING_HOLD_US, safe)))
-            answer = self._await_answer(link, sequence, RETRY_S)
+            sent = frames.drive(Drive(sequence, self._session, flags, 0, OPENING_HOLD_US, safe), seal)
+            link.send(sent)
+            answer = self._await_answer(link, sequence, RETRY_S, sent, seal)
             if isinstance(answer, Sample) and answer.flags & frames.READY:
-                return sequence
+                return sequence, seal
             if isinstance(answer, frames.Refusal):
                 if answer.reason != frames.BUSY or time.monotonic() > start_s + BUSY_S:
                     raise DriverError(f"{self._options.label}: {failure_text(answer.reason)}")
@@ -287,35 +331,47 @@ class NodeDriver(Driver):
             f"{self._options.wait_s:g} s; check the node, or raise driver.wait_s"
         )
 
-    def _await_answer(self, link: Link, sequence: int, timeout_s: float) -> Sample | frames.Refusal | None:
-        """Return the sample or refusal that answers this session's DRIVE `sequence`.
+    def _await_answer(
+        self, link: Link, sequence: int, timeout_s: float, sent: bytes, seal: Seal
+    ) -> Sample | frames.Refusal | None:
+        """Return the sample or refusal that answers this session's DRIVE `sequence`, the frame `sent`.
 
-        Returns None if no answer comes within `timeout_s`, or if its content is malformed. Raises OSError if the line
-        fails.
+        Returns None if no answer comes within `timeout_s`. Frames with a wrong tag, or with malformed content, are not
+        used. Raises OSError if the line fails.
         """
         for header, data in _receive_for(link, timeout_s):
             if header.session != self._session or header.sequence != sequence:
                 continue
-            if header.format == frames.SAMPLE_FORMAT:
-                return frames.read_sample(data)
-            if header.format == frames.REFUSAL_FORMAT:
-                return frames.read_refusal(data)
+            if header.format == frames.SAMPLE_FORMAT and frames.is_genuine(data, seal):
+                sample = frames.read_sample(data)
+                if sample is not None:
+                    return sample
+            refusal = frames.read_refusal(data) if header.format == frames.REFUSAL_FORMAT else None
+            if refusal is not None and self._is_answer(data, refusal, sent):
+                return refusal
         return None
 
-    def _park(self, link: Link, sequence: int) -> None:
+    def _is_answer(self, data: bytes, refusal: frames.Refusal, sent: bytes) -> bool:
+        """Whether a REFUSAL, the frame `data`, is the node's and refuses the frame `sent`; True without a key."""
+        seal = Seal(self._key, refusal.boot, refusal.opening)
+        return seal.key is None or (frames.is_genuine(data, seal) and refusal.drive_tag == frames.tag_in(sent))
+
+    def _park(self, link: Link, sequence: int, seal: Seal) -> None:
         """Send a PARK every CONFIRM_S until the node says that all outputs are safe, or refuses: then its session has
         ended before.
 
-        `sequence` is the number of the last frame sent. Raises DriverError if no answer comes for `wait_s`, or if the
-        node's ramp takes longer than LONGEST_PARKING_S; OSError if the line fails.
+        `sequence` is the number of the last frame sent, `seal` that of the session. Raises DriverError if no answer
+        comes for `wait_s`, or if the node's ramp takes longer than LONGEST_PARKING_S; OSError if the line fails.
         """
         start_s, heard_s = time.monotonic(), time.monotonic()
         codes = tuple(self._arrays["safe"].tolist())
         while time.monotonic() < min(heard_s + self._options.wait_s, start_s + LONGEST_PARKING_S):
             sequence = (sequence + 1) & 0xFFFFFFFF
+            seal = seal._replace(turn=seal.turn + (sequence == 0))
             content = Drive(sequence, self._session, frames.PARK | frames.ANSWER, 0, OPENING_HOLD_US, codes)
-            link.send(frames.drive(content))
-            answer = self._await_answer(link, sequence, CONFIRM_S)
+            sent = frames.drive(content, seal)
+            link.send(sent)
+            answer = self._await_answer(link, sequence, CONFIRM_S, sent, seal)
             if isinstance(answer, frames.Refusal):
                 return
             if isinstance(answer, Sample):
@@ -337,6 +393,7 @@ class UdpDriver(NodeDriver):
 
     kind = "udp"
     options_model = UdpOptions
+    WHO_DRIVES = "everybody who can send to the node, such as all users of this computer,"
 
 
 class SerialDriver(NodeDriver):
@@ -344,6 +401,7 @@ class SerialDriver(NodeDriver):
 
     kind = "serial"
     options_model = SerialOptions
+    WHO_DRIVES = "everybody who may open the serial line, such as the group dialout,"
     PROBES = 64
     """Exchanges by which `open` measures the line."""
 
@@ -368,7 +426,7 @@ class SerialDriver(NodeDriver):
         for sequence in range(1, self.PROBES + 1):
             start_s = time.monotonic()
             link.send(frames.hello(sequence, self._session))
-            if self._await_welcome(link, RETRY_S) is not None:
+            if isinstance(self._await_welcome(link, RETRY_S), Welcome):
                 durations_s.append(time.monotonic() - start_s)
         if len(durations_s) < self.PROBES / 2:
             raise DriverError(

@@ -21,6 +21,7 @@ from rtloop.drivers.node.frames import (
     DRIVE,
     DRIVE_FORMAT,
     DRIVE_HEAD,
+    END_BYTES,
     MAGIC,
     OPEN,
     READY,
@@ -31,10 +32,11 @@ from rtloop.drivers.node.frames import (
     SAMPLE_FORMAT,
     SAMPLE_HEAD,
 )
+from rtloop.drivers.node.tags import TAG_BYTES, write_tag
 from rtloop.drivers.node.transport import BROKEN, EMPTY, GONE, receive_frame, send_frame, take_strangers
 from rtloop.foundation.native.compiled import cfunc, jit, jit_rare
 from rtloop.foundation.native.monotonic import monotonic_ns
-from rtloop.foundation.native.pointers import SIGNATURE, address_pointer, carray
+from rtloop.foundation.native.pointers import SIGNATURE, address_pointer, carray, load_word
 
 FAILED, GOOD, HELD = -1, 0, 1
 MAX_FRAMES_PER_TICK = 64
@@ -120,10 +122,16 @@ def _send_drive(card, flags):
     """
     frame = carray(address_pointer(card.sent), 1, DRIVE)[0]
     card.last_sequence = np.uint32(card.last_sequence + np.uint32(1))
+    card.turn += 1 if card.last_sequence == 0 else 0
     frame.magic, frame.format, frame.batches = MAGIC, DRIVE_FORMAT, BATCHES
     frame.sequence, frame.session = card.last_sequence, card.session
     frame.bits, frame.outputs, frame.hold_us, frame.zero = flags, card.outputs, card.hold_us, 0
     length = DRIVE_HEAD + 4 * card.outputs
+    if card.is_keyed != 0:
+        write_tag(card.key_low, card.key_high, card.sent, length, card.boot, card.opening, card.turn)
+        tags = carray(address_pointer(card.ring_tag), WINDOW, np.uint64)
+        tags[np.int64(card.last_sequence) % WINDOW] = load_word(card.sent + length)
+    length += TAG_BYTES
     check = carray(address_pointer(card.sent + length), 1, np.uint32)
     check[0] = checksum(card, card.sent, length)
     if flags & ANSWER:
@@ -138,12 +146,15 @@ def _send_drive(card, flags):
 
 @jit
 def checksum(card, address, length):
-    """Return the CRC-32 of the `length` bytes at `address`, with the table of `card`."""
-    table = carray(address_pointer(card.crc_table), 256, np.uint32)
-    data = carray(address_pointer(address), length, np.uint8)
+    """Return the CRC-32 of the `length` bytes, a multiple of 4, at `address`, with the tables of `card`."""
+    tables = carray(address_pointer(card.crc_table), (4, 256), np.uint32)
+    words = carray(address_pointer(address), length // 4, np.uint32)
     value = np.uint32(0xFFFFFFFF)
-    for i in range(length):
-        value = np.uint32(table[np.int64(value ^ np.uint32(data[i])) & 0xFF] ^ (value >> np.uint32(8)))
+    for i in range(length // 4):
+        word = np.int64(value ^ words[i])
+        value = (
+            tables[3, word & 0xFF] ^ tables[2, word >> 8 & 0xFF] ^ tables[1, word >> 16 & 0xFF] ^ tables[0, word >> 24]
+        )
     return np.uint32(value ^ np.uint32(0xFFFFFFFF))
 
 
@@ -159,7 +170,10 @@ def _open_again(card):
         pass  # Frames from before the first tick are old.
     while take_strangers(card, MAX_FRAMES_PER_TICK) > 0 and monotonic_ns(card.timespec) < deadline_ns:
         pass
-    for _ in range(OPEN_TRIES):
+    first_opening = card.opening
+    for number in range(OPEN_TRIES):
+        # A session that the node has ended meanwhile is begun anew with the next opening.
+        card.opening = np.uint32(first_opening + np.uint32(number & 1))
         _send_drive(card, OPEN | ANSWER)
         _await_answer(card, OPEN_WAIT_NS)
         if card.newest == card.sequence or card.failure != 0:
@@ -212,8 +226,8 @@ def _receive_one(card):
         card.invalid += 1
     else:
         frame = carray(address_pointer(card.received), 1, REFUSAL)[0]
-        if frame.session != card.session:
-            card.foreign += 1  # of a run before this one, or of another controller
+        if frame.session != card.session or (card.is_keyed != 0 and not _is_genuine(card, length)):
+            card.foreign += 1  # of a run before this one, of another controller, or of one who lacks the key
         elif frame.boot != card.boot:
             card.failure = RESTARTED
         elif frame.format == REFUSAL_FORMAT:
@@ -230,12 +244,30 @@ def _is_whole(card, length):
     if length < REFUSAL_BYTES or frame.magic != MAGIC or frame.batches != BATCHES:
         return False
     if frame.format == SAMPLE_FORMAT:
-        if length != SAMPLE_HEAD + 4 * card.inputs + CRC_BYTES or frame.inputs != card.inputs:
+        if length != SAMPLE_HEAD + 4 * card.inputs + END_BYTES or frame.inputs != card.inputs:
             return False
     elif frame.format != REFUSAL_FORMAT or length != REFUSAL_BYTES:
         return False
     check = carray(address_pointer(card.received + length - CRC_BYTES), 1, np.uint32)[0]
     return check == checksum(card, card.received, length - CRC_BYTES)
+
+
+@jit
+def _is_genuine(card, length):
+    """Whether the whole frame received has the right tag, and a REFUSAL also the tag of a DRIVE that was sent.
+
+    The bytes of tag and check are overwritten.
+    """
+    content = length - END_BYTES
+    frame = carray(address_pointer(card.received), 1, REFUSAL)[0]
+    received_tag = load_word(card.received + content)
+    if frame.format != REFUSAL_FORMAT:
+        turn = card.turn - (1 if frame.sequence > card.last_sequence else 0)
+        write_tag(card.key_low, card.key_high, card.received, content, card.boot, card.opening, turn)
+        return load_word(card.received + content) == received_tag
+    sent_tag = carray(address_pointer(card.ring_tag), WINDOW, np.uint64)[np.int64(frame.sequence) % WINDOW]
+    write_tag(card.key_low, card.key_high, card.received, content, frame.boot, frame.opening, 0)
+    return load_word(card.received + content) == received_tag and frame.drive_tag == sent_tag != 0
 
 
 @jit

@@ -27,6 +27,7 @@ SO_BUSY_POLL = 46
 """Option of Linux, which Python does not name: the network card is polled while a receive waits for a datagram."""
 LARGEST_DATAGRAM = 65_536
 POLL_S = 0.02
+USED = "another program uses this line; stop that program (`fuser -v DEVICE` lists it)"
 
 
 class Link(ABC):
@@ -79,9 +80,9 @@ class UdpLink(Link):
         self.fd, self.strangers_fd = self._socket.fileno(), self._strangers.fileno()
 
     def _bind(self, host: str) -> None:
-        """Bind both sockets to one free port of this computer's address `host`; other sockets cannot share it.
+        """Bind both sockets to one free port of this computer's address `host`; other users' sockets never share it.
 
-        Raises OSError if the system refuses.
+        Linux compares the user for SO_REUSEPORT, and not for SO_REUSEADDR. Raises OSError if the system refuses.
         """
         self._socket.setblocking(False)
         self._strangers.setblocking(False)
@@ -90,10 +91,10 @@ class UdpLink(Link):
             self._socket.setsockopt(socket.SOL_SOCKET, SO_BUSY_POLL, BUSY_POLL_US)
         self._socket.bind((host, 0))  # Alone at its port: sockets share one only if both allow it, here from now on.
         for shared in (self._socket, self._strangers):
-            shared.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            shared.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEPORT, 1)
         self._strangers.bind(self._socket.getsockname())
         for shared in (self._socket, self._strangers):
-            shared.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 0)
+            shared.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEPORT, 0)
 
     def _connect(self) -> None:
         """Connect the first socket to the node, and discard the datagrams that others have sent to it.
@@ -108,11 +109,12 @@ class UdpLink(Link):
     def send(self, frame: bytes) -> None:
         """Send a frame as one datagram; it is lost if the system's queue is full.
 
-        It is also lost if the node's system has just refused an earlier one, because no program receives at the port.
         Raises OSError for an address without a route.
         """
-        with contextlib.suppress(BlockingIOError, ConnectionRefusedError):
-            self._socket.send(frame)
+        for _ in range(2):  # The first call may report that an earlier datagram was refused, in place of sending.
+            with contextlib.suppress(BlockingIOError, ConnectionRefusedError):
+                self._socket.send(frame)
+                break
 
     def receive(self, timeout_s: float) -> bytes | None:
         """Return the next datagram of the node's address, None if none comes within `timeout_s`.
@@ -148,18 +150,18 @@ class SerialLink(Link):
         try:
             self.fd = open_device(options.device)
         except OSError as error:
-            raise DriverError(
-                f"{options.label}: {error.strerror or error}; plug the node in, or start a simulated node with "
-                "`rtloop hil serve CONFIG --serial`"
-            ) from None
+            remedy = "plug the node in, or start a simulated node with `rtloop hil serve CONFIG --serial`"
+            fault = USED if error.errno == errno.EBUSY else f"{error.strerror or error}; {remedy}"
+            raise DriverError(f"{options.label}: {fault}") from None
         try:
             fcntl.flock(self.fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            fcntl.ioctl(self.fd, termios.TIOCEXCL)  # The lock is advice; this refuses every program but root's.
             _set_raw(self.fd, options)
         except (OSError, termios.error) as error:
             close_descriptor(self.fd)
             number = error.args[0] if error.args else 0
             is_locked = number in (errno.EAGAIN, errno.EWOULDBLOCK)
-            reason = "another program uses this line; stop that program" if is_locked else str(error.args[-1])
+            reason = USED if is_locked else str(error.args[-1])
             raise DriverError(f"{options.label}: {reason}") from None
         self._reader = FrameReader()
 
@@ -186,7 +188,9 @@ class SerialLink(Link):
         return frame
 
     def close(self) -> None:
-        """Close the line and its file descriptor."""
+        """Close the line and its file descriptor, and let other programs open the terminal again."""
+        with contextlib.suppress(OSError):  # The terminal may be gone.
+            fcntl.ioctl(self.fd, termios.TIOCNXCL)
         close_descriptor(self.fd)
 
 

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import os
 from typing import Literal, Self
 
-from pydantic import Field, model_validator
+from pydantic import Field, ValidationInfo, field_validator, model_validator
 
 from rtloop.drivers.node.frames import MAX_CHANNELS, MAX_DIGITAL
 from rtloop.drivers.volt_ranges import Volts, require_ranges
@@ -32,6 +33,9 @@ class NodeOptions(RigOptions):
     that holds them for less time by its own choice keeps to its own."""
     wait_s: float = Field(default=10.0, gt=0, le=60.0)
     """Longest wait of `open` for the node's answer."""
+    key: str | None = None
+    """Path of the file with the key that loop and node share, 32 hexadecimal digits, which only you may read; relative
+    to the configuration's folder. By default none: everybody who can send to the node may drive it."""
     inputs: int | None = Field(default=None, ge=1, le=MAX_CHANNELS - 1)
     """Number of the node's inputs, named adc0, adc1, …; by default as many as there are axes."""
     outputs: int | None = Field(default=None, ge=1, le=MAX_CHANNELS - 1)
@@ -48,6 +52,13 @@ class NodeOptions(RigOptions):
     """Voltage to which the node parks every output; a node with another one is refused."""
     park_slew_v_per_s: float = Field(default=1000.0, gt=0, le=1e6)
     """Slew rate of the simulated node's ramps; a real node has its own."""
+
+    @field_validator("key")
+    @classmethod
+    def _resolve_key(cls, key: str | None, info: ValidationInfo) -> str | None:
+        """Return the path of the key's file, absolute if the context of the validation names the `folder`."""
+        folder = (info.context or {}).get("folder")
+        return key if key is None or folder is None else os.path.abspath(os.path.join(folder, key))
 
     @model_validator(mode="after")
     def _check_ranges(self) -> Self:

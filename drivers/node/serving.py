@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import fcntl
 import os
 import pty
 import select
 import socket
+import termios
 import time
 import tty
 from abc import ABC, abstractmethod
@@ -16,6 +18,7 @@ from pathlib import Path
 
 from rtloop.drivers.errors import DriverError
 from rtloop.drivers.node.cobs import FrameReader, encode
+from rtloop.drivers.node.keys import read_key
 from rtloop.drivers.node.options import NodeOptions, SerialOptions, UdpOptions
 from rtloop.drivers.node.simulated import SimulatedNode
 from rtloop.foundation.trusted import close_descriptor
@@ -106,6 +109,7 @@ class TerminalPort(Port):
         if (frame := self._reader.next_frame()) is not None:
             return frame, None
         if not select.select([self._fd], [], [], timeout_s)[0]:
+            fcntl.ioctl(self._end, termios.TIOCNXCL)  # A loop that was killed has left the terminal to itself alone.
             return None
         try:
             self._reader.feed(os.read(self._fd, LARGEST_DATAGRAM))
@@ -168,15 +172,16 @@ def serve(
     refused and ignored frames, and parkings.
 
     `on_ready` is called when the line is open. Raises ValueError if rig and axes do not fit together, DriverError if
-    the line cannot be opened.
+    the line cannot be opened, or for a key that cannot be read.
     """
-    node = SimulatedNode(options, axes)
+    node = SimulatedNode(options, axes, key=read_key(options.key))
     with open_port(options) as port:
         on_ready()
         start_s = time.monotonic()
         while not is_stopped():
             step(node, port, start_s)
     return (
-        f"{node.samples} samples sent, {node.refused} frames refused, {node.old + node.invalid} frames ignored, "
+        f"{node.samples} samples sent, {node.refused} frames refused, "
+        f"{node.old + node.invalid + node.foreign} frames ignored, "
         f"outputs parked {node.watchdog_parkings} times by the watchdog"
     )

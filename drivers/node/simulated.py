@@ -11,6 +11,7 @@ from collections.abc import Hashable, Sequence
 from rtloop.drivers.node import frames
 from rtloop.drivers.node.frames import Drive, Refusal, Sample, Scale, Welcome
 from rtloop.drivers.node.options import NodeOptions
+from rtloop.drivers.node.tags import Seal
 from rtloop.hil.free_running import FreeRunningRig
 
 CODE_BITS = 24
@@ -18,7 +19,9 @@ RIG_RATE_HZ = 50_000.0
 RAMP_STEP_US = 1000
 LONGEST_HOLD_US = 10_000_000
 SHORTEST_PERIOD_US = 10
-HALF, MODULUS = 1 << 31, 1 << 32
+MODULUS = 1 << 32
+NEWER_STEPS = 2_000_000 // SHORTEST_PERIOD_US
+"""Largest step from the newest sequence to that of a DRIVE: two frames in each shortest period of a second."""
 US_PER_S = 1e6
 KINDS = frames.OPEN | frames.APPLY | frames.PARK
 
@@ -29,10 +32,13 @@ class SimulatedNode:
     Channels of no axis are not wired: inputs read 0 V, and digital inputs read the digital outputs of the same number.
     """
 
-    def __init__(self, options: NodeOptions, axes: Sequence[str], boot: int | None = None) -> None:
+    def __init__(
+        self, options: NodeOptions, axes: Sequence[str], boot: int | None = None, key: bytes | None = None
+    ) -> None:
         """Build the rig at rest, with the outputs at their safe values, and compile it.
 
-        `boot` is the number of this start in the node's frames; None for a random one. Raises ValueError if rig and
+        `boot` is the number of this start in the node's frames, None for a random one; `key` has 16 bytes, None for a
+        node without a key. Raises ValueError if rig and
         axes do not fit together.
         """
         self.boot = secrets.randbits(32) if boot is None else boot
@@ -44,13 +50,14 @@ class SimulatedNode:
         self._digital_counts = options.digital_inputs, options.digital_outputs
         self.codes = [scale.safe for scale in self._outputs]
         self.digital = 0
-        self._session = self._ended = 0
+        self._key = key
+        self._session = self._ended = self._openings = self._turn = 0
         self._parked: tuple[int, Hashable] = (0, None)
         self._sender: Hashable = None
         self._newest = self._applied = 0
         self._hold_us = self._heard_us = self._step_us = 0.0
         self.is_ramping = False
-        self.samples = self.invalid = self.old = self.refused = self.watchdog_parkings = 0
+        self.samples = self.invalid = self.foreign = self.old = self.refused = self.watchdog_parkings = 0
 
     @property
     def outputs_v(self) -> list[float]:
@@ -90,37 +97,56 @@ class SimulatedNode:
     def receive(self, data: bytes, sender: Hashable, now_us: float) -> bytes | None:
         """Process the bytes of a frame that came from `sender` at `now_us`; return the bytes of the answer.
 
-        None without an answer: for bytes that are no frame for a node, counted in `invalid`, for a DRIVE that is not
-        newer than the last one, counted in `old`, and for a DRIVE that asks for none.
+        None without an answer: for bytes that are no frame for a node, counted in `invalid`, for a DRIVE with a wrong
+        tag, counted in `foreign`, for one that is not newer than the last one, counted in `old`, and for one that asks
+        for none.
         """
         self.poll(now_us)
         header = frames.read_header(data)
         if header is not None and header.format == frames.HELLO and (version := frames.read_hello(data)) is not None:
             if version != frames.VERSION:
-                return self._refuse(header, frames.VERSION_REFUSED)
-            return frames.welcome(header.sequence, self._describe(header.session))
+                return self._refuse(header, frames.VERSION_REFUSED, data)
+            return frames.welcome(header.sequence, self._describe(header.session), self._key)
         content = frames.read_drive(data) if header is not None and header.format == frames.DRIVE_FORMAT else None
         if header is None or content is None:
             self.invalid += 1
             return None
         reason = self._lack_of_access(content, sender)
+        seal = self._seal(content)
+        if self._session or not reason:  # A DRIVE of no session is refused whatever its tag, for a node that restarted.
+            is_copy = self._key is not None and reason == frames.BUSY and content.session == self._session
+            if is_copy or not frames.is_genuine(data, seal):
+                self.foreign += 1
+                return None
         if not reason and not self._is_due(content):
             self.old += 1
             return None
         if reason := reason or self._fault_of_content(content):
-            return self._refuse(header, reason)
-        return self._accept(content, sender, now_us)
+            return self._refuse(header, reason, data)
+        return self._accept(content, seal, sender, now_us)
+
+    def _seal(self, content: Drive) -> Seal:
+        """Return the seal of a DRIVE: of its session, which is open or was parked, or of the next one."""
+        is_known = content.session == (self._session or self._parked[0])
+        if not is_known or not (self._session or content.flags & frames.PARK):
+            return Seal(self._key, self.boot, self._openings)
+        is_next_turn = content.sequence < self._newest and self._is_newer(content)
+        return Seal(self._key, self.boot, (self._openings - 1) % MODULUS, (self._turn + is_next_turn) % MODULUS)
 
     def _lack_of_access(self, content: Drive, sender: Hashable) -> int:
         """Return the reason, a key of REFUSALS, for which `sender` may not drive the node now; 0 if it may.
 
         Only the DRIVE's session and flags and the address of `sender` decide.
         """
+        parks_from_anywhere = self._key is not None and content.flags & frames.PARK
         if self._session:
-            return 0 if (content.session, sender) == (self._session, self._sender) else frames.BUSY
+            is_at_home = sender == self._sender or parks_from_anywhere
+            return 0 if content.session == self._session and is_at_home else frames.BUSY
         if content.session == 0:
             return frames.UNKNOWN
-        is_parked = content.flags & frames.PARK and (content.session, sender) == self._parked
+        session, address = self._parked
+        is_parked = content.flags & frames.PARK and content.session == session
+        is_parked = is_parked and (sender == address or parks_from_anywhere)
         if content.flags & frames.OPEN or is_parked:
             return 0
         return frames.WATCHDOG if content.session == self._ended else frames.UNKNOWN
@@ -137,23 +163,25 @@ class SimulatedNode:
         return frames.FLAGS if content.hold_us == 0 or (content.flags & KINDS).bit_count() > 1 else 0
 
     def _is_due(self, content: Drive) -> bool:
-        """Whether a DRIVE comes after the newest one, or repeats it with the flag OPEN; True without a session."""
-        if not self._session:
-            return True
-        step = (content.sequence - self._newest) % MODULUS
-        return 0 < step < HALF or (step == 0 and bool(content.flags & frames.OPEN))
+        """Whether a DRIVE comes after the newest one or has the flag PARK; True without a session."""
+        return not self._session or bool(content.flags & frames.PARK) or self._is_newer(content)
 
-    def _accept(self, content: Drive, sender: Hashable, now_us: float) -> bytes | None:
+    def _is_newer(self, content: Drive) -> bool:
+        """Whether the sequence of a DRIVE is newer than the newest one."""
+        return 0 < (content.sequence - self._newest) % MODULUS <= NEWER_STEPS
+
+    def _accept(self, content: Drive, seal: Seal, sender: Hashable, now_us: float) -> bytes | None:
         """Convert the inputs, begin a session if a DRIVE says OPEN, and obey its flags.
 
         Returns the bytes of the sample if the DRIVE asks for one, else None.
         """
         codes, digital = self._read_inputs(), self.digital & ((1 << self._digital_counts[0]) - 1)
         if content.flags & frames.OPEN:
+            self._openings = (self._openings + (not self._session)) % MODULUS
             self._session, self._sender = content.session, sender
             self._begin_ramp(now_us)
         if self._session:
-            self._newest, self._heard_us = content.sequence, now_us
+            self._newest, self._turn, self._heard_us = content.sequence, seal.turn, now_us
             self._hold_us = min(content.hold_us, LONGEST_HOLD_US)
             self._obey(content, now_us)
         self._set_outputs()
@@ -163,7 +191,7 @@ class SimulatedNode:
         is_ready = self._session != 0 and not self.is_ramping
         flags = frames.READY * is_ready | frames.AT_SAFE * self._is_safe
         return frames.sample(
-            Sample(content.sequence, content.session, self.boot, flags, digital, 0, self._applied, tuple(codes))
+            Sample(content.sequence, content.session, self.boot, flags, digital, 0, self._applied, tuple(codes)), seal
         )
 
     def _obey(self, content: Drive, now_us: float) -> None:
@@ -190,15 +218,24 @@ class SimulatedNode:
         count = min(len(self.codes), self._rig.drive_v.size)
         self._rig.drive_v[:count] = self.outputs_v[:count]
 
-    def _refuse(self, header: frames.Header, reason: int) -> bytes:
-        """Return the bytes of the refusal of a frame with this header, for `reason`, a key of REFUSALS; count it."""
+    def _refuse(self, header: frames.Header, reason: int, data: bytes) -> bytes:
+        """Return the bytes of the refusal of the frame `data`, for `reason`, a key of REFUSALS; count it."""
         self.refused += 1
-        return frames.refusal(Refusal(header.sequence, header.session, self.boot, reason, frames.VERSION))
+        opening = 0 if reason == frames.VERSION_REFUSED else self._openings
+        return frames.refusal(
+            Refusal(
+                header.sequence, header.session, self.boot, reason, frames.VERSION, opening, frames.tag_in(data)
+            ),
+            self._key,
+        )  # fmt: skip
 
     def _describe(self, session: int) -> Welcome:
         """Return the description of the node for a session's HELLO."""
+        is_open = session != 0 and session == self._session
+        opening = (self._openings - is_open) % MODULUS
+        flags = frames.DRIVEN * (self._session != 0) | frames.KEYED * (self._key is not None)
         return Welcome(
-            session, frames.VERSION, self.boot, LONGEST_HOLD_US, SHORTEST_PERIOD_US, self._session != 0, self._inputs,
+            session, frames.VERSION, self.boot, LONGEST_HOLD_US, SHORTEST_PERIOD_US, flags, opening, self._inputs,
             self._outputs, *self._digital_counts,
         )  # fmt: skip
 

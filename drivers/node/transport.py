@@ -62,6 +62,9 @@ _errno_address = c_library_function("__errno_location", "intp()", _errno_address
 def send_frame(card, length):
     """Send the first `length` bytes at `card.sent`; return whether the system took all of them."""
     if card.is_serial == 0:
+        if _send(card.fd, card.sent, length, MSG_DONTWAIT) == length:
+            return True
+        # Linux may have reported that an earlier datagram was refused, which anybody can forge, in place of sending.
         return _send(card.fd, card.sent, length, MSG_DONTWAIT) == length
     coded_length = encode_cobs(card, length)
     return _write(card.fd, card.coded, coded_length) == coded_length
@@ -85,6 +88,8 @@ def _receive_datagram(card):
     EMPTY also for an error of the socket, BROKEN for a datagram that is longer than any frame.
     """
     length = _recv(card.fd, card.received, ROOM_BYTES, MSG_DONTWAIT)
+    if length < 0 and carray(address_pointer(_errno_address()), 1, np.int32)[0] != EAGAIN:
+        length = _recv(card.fd, card.received, ROOM_BYTES, MSG_DONTWAIT)  # The first call has cleared the error.
     if length < 0:
         return EMPTY
     return length if length < ROOM_BYTES else BROKEN

@@ -124,7 +124,8 @@ def _print_examination(
     if bad_findings:
         out.print("\n[bold]bad conditions and the delay that each may cost, the largest first[/]")
     for finding in bad_findings:
-        out.print(f"{finding.condition}, up to {_format_time(finding.late_us)}: {escape(finding.consequence)}")
+        delay = f", up to {_format_time(finding.late_us)}" if finding.late_us else ""
+        out.print(f"{finding.condition}{delay}: {escape(finding.consequence)}")
         out.print(f"    {escape(finding.fix)}")
     _print_latency(latency)
     for delay in delays:

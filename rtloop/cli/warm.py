@@ -39,6 +39,7 @@ def _rehearse_other_processes() -> None:
 
     from rtloop.drivers.comedi import comedi_read, comedi_write
     from rtloop.drivers.node.exchange import node_read, node_write
+    from rtloop.drivers.node.tags import write_tag_from_python
     from rtloop.drivers.playback import playback_read, playback_wait, playback_write
     from rtloop.drivers.shm import ShmOptions, shm_read, shm_write
     from rtloop.engine.commands import send, withdraw
@@ -52,7 +53,8 @@ def _rehearse_other_processes() -> None:
     from rtloop.signals import COMMON_SIGNALS
 
     playback = playback_read, playback_wait, playback_write
-    for function in (comedi_read, comedi_write, node_read, node_write, shm_read, shm_write, *playback):
+    node = node_read, node_write, write_tag_from_python
+    for function in (comedi_read, comedi_write, *node, shm_read, shm_write, *playback):
         _ = function.address  # compiles it
     block = SharedBlock.create(Sizes(columns=1, axes=1, rate_hz=1.0, snapshot_bytes=8, table_samples=1))
     Recorder(block)

@@ -15,7 +15,7 @@ from rtloop.analysis.step_response import SETTLING_BAND
 from rtloop.configuration.axis import AxisOptions
 from rtloop.configuration.checks import AxisCheck
 from rtloop.configuration.file import Configuration
-from rtloop.configuration.prepare import Prepared
+from rtloop.configuration.prepare import Prepared, build_driver
 from rtloop.configuration.references import extent, references_in_plan, volts
 from rtloop.configuration.rig import driver_delay_ticks
 from rtloop.configuration.simulated import (
@@ -48,6 +48,7 @@ def option_cautions(prepared: Prepared) -> list[str]:
     """
     configuration = prepared.configuration
     warnings = [f"loop.{line}" for line in _pacing(configuration)] + list(_service(configuration))
+    warnings += build_driver(configuration).cautions()
     for axis, check in zip(configuration.axes, prepared.checks, strict=True):
         lines = (*_references(prepared, axis), *_reach(configuration, axis))
         warnings += [f"axis.{axis.name}.{line}" for line in lines]

@@ -191,7 +191,7 @@ def parse(text: str, name: str, folder: Path, source: str, library: Library | No
     library = library or Library(folder)
     sections = _validated(FileOptions, raw, "", faults, {"library": library})
     laws = () if sections is None else _laws(sections, library, faults)
-    kind, options, channels = _driver(driver, faults)
+    kind, options, channels = _driver(driver, folder, faults)
     if sections is not None:
         faults += _cross_faults(sections, channels)
     if faults or sections is None or options is None:
@@ -239,11 +239,12 @@ def _laws(sections: FileOptions, library: Library, faults: list[str]) -> tuple[L
     return laws
 
 
-def _driver(raw: object, faults: list[str]) -> tuple[str, Options | None, dict[str, ChannelOptions]]:
+def _driver(raw: object, folder: Path, faults: list[str]) -> tuple[str, Options | None, dict[str, ChannelOptions]]:
     """Return kind, options and channels of [driver]; append a line for each fault to `faults`.
 
     The options are None if they are wrong, or if the driver is unknown or cannot be imported. A missing kind is "".
-    Wrong channels are returned as the file's tables, by name.
+    Wrong channels are returned as the file's tables, by name. Relative paths start at `folder`, where the driver's
+    options ask for it.
     """
     if not isinstance(raw, dict):
         faults.append("driver: missing; needs a section [driver] with kind and channels")
@@ -261,7 +262,7 @@ def _driver(raw: object, faults: list[str]) -> tuple[str, Options | None, dict[s
     except (ValueError, DriverError) as error:
         faults.append(f"driver.kind: {error}")
         return kind, None, channels or {}
-    return kind, _validated(model, options, "driver", faults), channels or {}
+    return kind, _validated(model, options, "driver", faults, {"folder": folder}), channels or {}
 
 
 @cache

@@ -19,16 +19,31 @@ US_PER_MS = 1e3
 def check_line(line: NetworkLine | SerialLine | None, host: Host, pacing: Pacing) -> tuple[Finding, ...]:
     """Return the findings on the line to a node; () for None.
 
-    A network line has only the finding of `route` if the node is on this computer, or if this finding is bad.
+    A network line has only the findings of `key` and `route` if the node is on this computer, or if its route is bad.
     """
-    if isinstance(line, SerialLine):
-        return (latency_timer(line, host), low_latency(line, host))
     if line is None:
         return ()
+    if isinstance(line, SerialLine):
+        return (key(line), latency_timer(line, host), low_latency(line, host))
     interface = route(line, host)
     if interface.good is False or line.interface == "lo":
-        return (interface,)
-    return (interface, cable(line, host), coalescing(line), packet_merging(line), card_interrupts(line, host, pacing))
+        return (key(line), interface)
+    return (
+        key(line),
+        interface,
+        cable(line, host),
+        coalescing(line),
+        packet_merging(line),
+        card_interrupts(line, host, pacing),
+    )
+
+
+def key(line: NetworkLine | SerialLine) -> Finding:
+    """Return the finding on the node's key: good if the configuration names one that can be used."""
+    return Finding(
+        "node's key", line.key_fault or "a file of this user", "a key that this user alone can read",
+        not line.key_fault, 0.0, "others can drive the node", "(umask 077; openssl rand -hex 16 > node.key)",
+    )  # fmt: skip
 
 
 def route(line: NetworkLine, host: Host) -> Finding:

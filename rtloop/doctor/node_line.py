@@ -7,10 +7,11 @@ import fcntl
 import socket
 import struct
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from rtloop.configuration.file import Configuration
+from rtloop.configuration.prepare import build_driver
 
 SIOCGIFADDR, SIOCETHTOOL = 0x8915, 0x8946
 ETHTOOL_GCOALESCE, ETHTOOL_GFLAGS = 0x0E, 0x25
@@ -25,6 +26,7 @@ class NetworkLine:
 
     `interface` is "" without a route to `host`. `rx_usecs` is the time in µs for which the card collects packets before
     it interrupts, `is_adaptive` whether the card chooses this time itself, `collects` whether it joins packets (LRO).
+    `key_fault` says what is wrong with the node's key, "" for nothing.
     """
 
     host: str
@@ -32,23 +34,27 @@ class NetworkLine:
     rx_usecs: int | None = None
     is_adaptive: bool | None = None
     collects: bool | None = None
+    key_fault: str = ""
 
 
 @dataclass(frozen=True)
 class SerialLine:
-    """The terminal of a node: its path with links resolved."""
+    """The terminal of a node: its path with links resolved; `key_fault` as for a NetworkLine."""
 
     device: str
+    key_fault: str = ""
 
 
 def find_line(configuration: Configuration) -> NetworkLine | SerialLine | None:
     """Return the network or serial line to the node of a configuration; None for drivers other than "udp", "serial"."""
-    options = configuration.driver_options
+    options = vars(configuration.driver_options)
     if configuration.driver_kind == "udp":
-        return find_network_line(str(vars(options)["host"]), int(vars(options)["port"]), vars(options)["bind"])
-    if configuration.driver_kind == "serial":
-        return SerialLine(str(Path(vars(options)["device"]).resolve()))
-    return None
+        line = find_network_line(str(options["host"]), int(options["port"]), options["bind"])
+    elif configuration.driver_kind == "serial":
+        line = SerialLine(str(Path(options["device"]).resolve()))
+    else:
+        return None
+    return replace(line, key_fault="; ".join(build_driver(configuration).cautions()))
 
 
 def find_network_line(host: str, port: int, bind: str | None) -> NetworkLine:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 
 from rtloop.configuration.file import parse
@@ -62,9 +64,9 @@ def bad_findings(findings) -> list[tuple[str, str]]:
     return [(finding.condition, finding.fix) for finding in findings if finding.good is False]
 
 
-def test_a_good_cable_has_five_good_findings(tmp_path):
+def test_a_key_and_a_good_cable_have_six_good_findings(tmp_path):
     findings = check_line(ETH1, host(tmp_path, WIRED), PACING)
-    assert [finding.good for finding in findings] == [True] * 5
+    assert [finding.good for finding in findings] == [True] * 6
 
 
 @pytest.mark.parametrize("case", BROKEN)
@@ -77,7 +79,14 @@ def test_a_broken_condition_alone_is_bad_and_names_its_command(case, tmp_path):
 
 def test_what_a_card_does_not_tell_is_unknown(tmp_path):
     findings = check_line(NetworkLine("192.168.10.2", "eth1"), host(tmp_path), PACING)
-    assert [finding.good for finding in findings] == [True, None, None, None, None]
+    assert [finding.good for finding in findings] == [True, True, None, None, None, None]
+
+
+def test_a_missing_key_is_bad_on_every_line(tmp_path):
+    for line in (replace(ETH1, key_fault="none"), replace(SERIAL, key_fault="none")):
+        ((name, fix),) = bad_findings(check_line(line, host(tmp_path, WIRED), PACING))
+        assert name == "node's key"
+        assert "openssl rand -hex 16" in fix
 
 
 def test_interrupts_of_the_card_are_moved_on_request(tmp_path):
@@ -92,8 +101,7 @@ def test_nothing_is_judged_on_the_loopback_interface(tmp_path):
     for address in ("127.0.0.1", "localhost"):
         line = find_network_line(address, 5747, None)
         assert line.interface == "lo"
-        (finding,) = check_line(line, host(tmp_path), PACING)
-        assert finding.good is True
+        assert [finding.good for finding in check_line(line, host(tmp_path), PACING)] == [True, True]
 
 
 def test_an_address_that_does_not_exist_has_no_route(tmp_path):
@@ -117,7 +125,7 @@ FLAGS = "sys/class/tty/ttyUSB0/flags"
 )
 def test_a_terminal_must_hand_bytes_on_at_once(files, states, command, tmp_path):
     findings = check_line(SERIAL, host(tmp_path, files), PACING)
-    assert [finding.good for finding in findings] == states
+    assert [finding.good for finding in findings[1:]] == states
     assert "".join(fix for _, fix in bad_findings(findings)) == command
 
 
@@ -137,7 +145,14 @@ um_per_v = 10.0
     ("driver", "line"),
     [
         ('kind = "sim"', None),
-        ('kind = "serial"\ndevice = "/dev/none-such"', SerialLine("/dev/none-such")),
+        (
+            'kind = "serial"\ndevice = "/dev/none-such"',
+            SerialLine(
+                "/dev/none-such",
+                "driver.key: none, so everybody who may open the serial line, such as the group dialout, can drive the "
+                "node; make a key (docs/drivers.md, A key)",
+            ),
+        ),
     ],
 )
 def test_the_line_is_that_of_the_configuration(driver, line, tmp_path):

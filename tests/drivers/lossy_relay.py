@@ -14,6 +14,7 @@ from collections import Counter
 from collections.abc import Iterator
 from typing import Any
 
+from rtloop.drivers.node.keys import read_key
 from tests.drivers.network_plan import Copy, Plan, damage_datagram
 from tests.drivers.relay_frames import (
     LOOP,
@@ -23,9 +24,10 @@ from tests.drivers.relay_frames import (
     Node,
     drive_content,
     parse_drive,
+    refusal_content,
     sample_content,
 )  # fmt: skip
-from tests.node.frames import ANSWER, APPLY, DRIVE, REFUSAL, SAMPLE, frame
+from tests.node.frames import ANSWER, APPLY, DRIVE, REFUSAL, SAMPLE, UNSEALED, Seal, frame
 
 PERIOD_US = 1000
 """Time that the node's clock advances with each datagram."""
@@ -192,7 +194,7 @@ class Relay:
         if answer[2] == REFUSAL:
             self.output_problems.append(f"a refusal: {answer.hex()}")
             return Arrival("refusal", sequence)
-        return Arrival("sample", sequence, struct.unpack(f"<{answer[17]}i", answer[28:-4]))
+        return Arrival("sample", sequence, struct.unpack(f"<{answer[17]}i", answer[28:-12]))
 
     def _send(self, data: bytes, arrival: Arrival, is_strange: bool = False) -> None:
         """Send a datagram to the loop and log its arrival, from the node's address or from another one."""
@@ -207,21 +209,37 @@ class Relay:
         codes = (chance.randint(-20_000, 20_000),)
         if chance.random() < plan.strangers:  # A stranger drives the loop's session.
             self._call_node(
-                frame(DRIVE, newest + 3, drive_content(self._session, APPLY | ANSWER, codes)), STRANGER, False
+                frame(DRIVE, newest + 3, drive_content(self._session, APPLY | ANSWER, codes), UNSEALED), STRANGER, False
             )
         if chance.random() < plan.strangers:  # A drive of another session, from the loop's address.
-            data = frame(DRIVE, newest + 2, drive_content(self._session ^ 1, APPLY | ANSWER, codes))
+            data = frame(DRIVE, newest + 2, drive_content(self._session ^ 1, APPLY | ANSWER, codes), UNSEALED)
             self._take_answer(self._call_node(data, LOOP, False), plan)
         if chance.random() < plan.strangers and self._answers:  # An old drive of this session is repeated.
             data = chance.choice(self._answers)
             if parse_drive(data):
                 self._take_answer(self._call_node(data, LOOP, True), plan)
         if chance.random() < plan.strangers:  # A stranger answers the newest drive.
-            self._send(frame(SAMPLE, newest, sample_content(self._session, boot, codes)), Arrival("stranger"), True)
+            data = frame(SAMPLE, newest, sample_content(self._session, boot, codes), UNSEALED)
+            self._send(data, Arrival("stranger"), True)
         if chance.random() < plan.strangers:  # A sample of another session, from the node's address.
-            self._send(frame(SAMPLE, newest, sample_content(self._session ^ 1, boot, codes)), Arrival("foreign"))
+            data = frame(SAMPLE, newest, sample_content(self._session ^ 1, boot, codes), UNSEALED)
+            self._send(data, Arrival("foreign"))
         if chance.random() < plan.strangers:  # A sample whose sequence no drive has had.
-            self._send(frame(SAMPLE, newest + 5, sample_content(self._session, boot, codes)), Arrival("invalid"))
+            data = frame(SAMPLE, newest + 5, sample_content(self._session, boot, codes), UNSEALED)
+            self._send(data, Arrival("foreign" if self.node.key else "invalid"))
+        if self.node.key and chance.random() < plan.strangers:  # An answer to the newest drive, by one without the key.
+            self._send(
+                chance.choice(
+                    (
+                        frame(SAMPLE, newest, sample_content(self._session, boot, codes), UNSEALED),
+                        frame(REFUSAL, newest, refusal_content(self._session, boot), UNSEALED),
+                    )
+                ),
+                Arrival("foreign"),
+            )
+        if self.node.key and chance.random() < plan.strangers:  # The node's refusal of a drive that another has sent.
+            seal = Seal(read_key(self.node.key), boot, 1)
+            self._send(frame(REFUSAL, newest, refusal_content(self._session, boot), seal), Arrival("foreign"))
         if chance.random() < plan.strangers and self.earlier:  # A frame of an earlier run, at either end.
             data = chance.choice(self.earlier)
             self._send(data, self._classify(data))

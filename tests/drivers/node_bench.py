@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import mmap
+import secrets
 import socket
 import struct
 import subprocess
@@ -23,13 +24,14 @@ WITNESS = struct.Struct("<qqqqdd")
 PROGRAM = """
 import json, mmap, sys, time
 from tests.drivers.node_bench import WITNESS, make_options
+from rtloop.drivers.node.keys import read_key
 from rtloop.drivers.node.serving import open_port, step
 from rtloop.drivers.node.simulated import SimulatedNode
 
 options = make_options(sys.argv[1], json.loads(sys.argv[2]))
 with open(sys.argv[3], "r+b") as file:
     witness = mmap.mmap(file.fileno(), WITNESS.size)
-node = SimulatedNode(options, ["x"])
+node = SimulatedNode(options, ["x"], key=read_key(options.key))
 steps, window_s, first_v, largest_v, start_s = 0, 0.0, 0.0, 0.0, time.monotonic()
 with open_port(options) as port:
     while True:
@@ -46,6 +48,14 @@ with open_port(options) as port:
 def make_options(kind: str, values: dict[str, Any]) -> NodeOptions:
     """Return the options of a driver of kind "udp" or "serial"."""
     return (UdpOptions if kind == "udp" else SerialOptions).model_validate(values)
+
+
+def make_key(folder: Path, name: str = "node.key") -> str:
+    """Write a new key to a file that its owner alone may read; return the file's path."""
+    path = folder / name
+    path.touch(0o600)
+    path.write_text(secrets.token_hex(16) + "\n")
+    return str(path)
 
 
 def free_udp_port() -> int:

@@ -2,7 +2,7 @@
 
     NUMBA_DISABLE_JIT=1 python -m tests.drivers.node_fuzz KIND SEED COUNT
 
-prints the counters as JSON. KIND is "udp" or "serial".
+prints the counters as JSON. KIND is "udp", "udp with a key" or "serial".
 """
 
 from __future__ import annotations
@@ -17,24 +17,25 @@ import zlib
 
 import numpy as np
 
+from rtloop.drivers.node import tags
 from rtloop.drivers.node.card import COUNTS, OBSERVED, make_card
 from rtloop.drivers.node.cobs import encode
 from rtloop.drivers.node.exchange import node_read, node_write
 from rtloop.drivers.node.frames import Scale
+from tests.node import frames
 
 SESSION, BOOT, INPUTS = 77, 88, 3
 SCALES = (Scale(-1000, 1000, 0, 1, 0.01, 0.0),) * INPUTS
 
 
-def sample(sequence: int, codes: list[int], session: int = SESSION, boot: int = BOOT, flags: int = 1) -> bytes:
+def sample(sequence: int, codes: list[int], seal: tags.Seal) -> bytes:
     """Return the bytes of a SAMPLE, written from docs/node-protocol.md."""
-    data = struct.pack("<HBBIIIBBHII", 0x057B, 0x73, 1, sequence, session, boot, flags, len(codes), 0, 0, 0)
-    data += struct.pack(f"<{len(codes)}i", *codes)
-    return data + struct.pack("<I", zlib.crc32(data))
+    content = struct.pack(f"<IIBBHII{len(codes)}i", SESSION, BOOT, 1, len(codes), 0, 0, 0, *codes)
+    return frames.frame(frames.SAMPLE, sequence, content, frames.Seal(*seal))
 
 
-def damage(frame: bytes, draw: random.Random) -> bytes:
-    """Return a damaged frame: a changed bit, cut, grown, random bytes, or one changed byte with a right CRC."""
+def damage(frame: bytes, draw: random.Random, seal: tags.Seal) -> bytes:
+    """Return a damaged frame: a changed bit, cut, grown, random bytes, or one changed byte with a right tag and CRC."""
     kind = draw.randrange(5)
     if kind == 0:
         place = draw.randrange(len(frame))
@@ -45,9 +46,10 @@ def damage(frame: bytes, draw: random.Random) -> bytes:
         return frame + draw.randbytes(draw.randrange(1, 5000))
     if kind == 3:
         return draw.randbytes(draw.randrange(1, 6000))
-    head = bytearray(frame)
+    head = bytearray(frame[:-12])
     head[draw.randrange(8, 24)] = draw.randrange(256)
-    return bytes(head[:-4]) + struct.pack("<I", zlib.crc32(bytes(head[:-4])))
+    content = bytes(head) + struct.pack("<Q", frames.Seal(*seal).tag(bytes(head)))
+    return content + struct.pack("<I", zlib.crc32(content))
 
 
 def fuzz(kind: str, seed: int, count: int) -> dict[str, float]:
@@ -56,7 +58,8 @@ def fuzz(kind: str, seed: int, count: int) -> dict[str, float]:
     Raises IndexError for an index outside an array, AssertionError for codes that no valid frame had.
     """
     draw = random.Random(seed)
-    if kind == "udp":
+    seal = tags.Seal(bytes(range(16)) if "key" in kind else None, BOOT, 1)
+    if kind.startswith("udp"):
         loop, node, strangers = (socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in range(3))
         for endpoint in (loop, node, strangers):
             endpoint.bind(("127.0.0.1", 0))
@@ -70,8 +73,8 @@ def fuzz(kind: str, seed: int, count: int) -> dict[str, float]:
         fd, strangers_fd = incoming, None
         send = lambda data: os.write(outgoing, data if draw.random() < 0.1 else encode(data))
     card, arrays = make_card(
-        fd, strangers_fd, in_scales=SCALES, out_scales=SCALES, hold_ticks=1000, error_limit=1 << 40, session=SESSION,
-        boot=BOOT, hold_us=1000, running=1,
+        fd, strangers_fd, seal, in_scales=SCALES, out_scales=SCALES, hold_ticks=1000,
+        error_limit=1 << 40, session=SESSION, hold_us=1000, running=1,
     )  # fmt: skip
     values, volts = np.zeros(INPUTS + 1 + len(OBSERVED)), np.zeros(INPUTS)
     allowed_codes: set[tuple[int, ...]] = {(0, 0, 0)}
@@ -79,9 +82,9 @@ def fuzz(kind: str, seed: int, count: int) -> dict[str, float]:
         node_write(card.ctypes.data, volts.ctypes.data)
         sequence = int(card["sequence"][0]) - draw.choice((0, 0, 0, 1, 2, 3000)) & 0xFFFFFFFF
         codes = [draw.randint(-1100, 1100) for _ in range(INPUTS)]
-        frame = sample(sequence, codes)
+        frame = sample(sequence, codes, seal)
         if draw.random() < 0.5:
-            frame = damage(frame, draw)
+            frame = damage(frame, draw, seal)
         if frame[-4:] == struct.pack("<I", zlib.crc32(frame[:-4])) and max(map(abs, codes)) <= 1000:
             allowed_codes.add(tuple(codes))
         send(frame)

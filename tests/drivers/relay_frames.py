@@ -15,6 +15,9 @@ LOOP, STRANGER = "loop", "stranger"
 class Node(Protocol):
     """Interface of a node without a line: the relay calls it with each datagram."""
 
+    key: str | None
+    """Path of the file with its key; None without a key."""
+
     def receive(self, data: bytes, sender: str, now_us: int) -> bytes:
         """Process a datagram at a time; return the answer, or no bytes."""
         ...
@@ -41,11 +44,11 @@ class DriveFrame(NamedTuple):
 
 def parse_drive(data: bytes) -> DriveFrame | None:
     """Return the fields of a DRIVE; None for another frame."""
-    if len(data) < 28 or data[2] != DRIVE:
+    if len(data) < 36 or data[2] != DRIVE:
         return None
     assert struct.unpack("<I", data[-4:])[0] == zlib.crc32(data[:-4])
     sequence, session, flags, count = struct.unpack_from("<IIBB", data, 4)
-    return DriveFrame(sequence, session, flags, struct.unpack(f"<{count}i", data[24:-4]))
+    return DriveFrame(sequence, session, flags, struct.unpack(f"<{count}i", data[24:-12]))
 
 
 class Arrival(NamedTuple):
@@ -57,10 +60,15 @@ class Arrival(NamedTuple):
 
 
 def drive_content(session: int, flags: int, codes: tuple[int, ...]) -> bytes:
-    """Return the bytes of a DRIVE between its sequence and its check."""
+    """Return the bytes of a DRIVE between its sequence and its tag."""
     return struct.pack(f"<IBBHII{len(codes)}i", session, flags, len(codes), 0, 50_000, 0, *codes)
 
 
 def sample_content(session: int, boot: int, codes: tuple[int, ...]) -> bytes:
-    """Return the bytes of a SAMPLE between its sequence and its check."""
+    """Return the bytes of a SAMPLE between its sequence and its tag."""
     return struct.pack(f"<IIBBHII{len(codes)}i", session, boot, 1, len(codes), 0, 0, 0, *codes)
+
+
+def refusal_content(session: int, boot: int) -> bytes:
+    """Return the bytes of a REFUSAL, BUSY for a DRIVE with the tag 7, between its sequence and its tag."""
+    return struct.pack("<IIHHIQ", session, boot, 2, 2, 1, 7)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ctypes
 
+from rtloop.drivers.node.keys import read_key
 from rtloop.drivers.node.options import UdpOptions
 from rtloop.drivers.node.simulated import SimulatedNode
 from tests.drivers.relay_frames import LOOP
@@ -28,8 +29,9 @@ class CountingNode(SimulatedNode):
 class PythonNode:
     """The simulated node with one input and one output; its plant stands still."""
 
-    def __init__(self, boot: int | None = None) -> None:
-        self._node = CountingNode(UdpOptions(park_slew_v_per_s=1e5), ["x"], boot)
+    def __init__(self, boot: int | None = None, key: str | None = None) -> None:
+        self.key = key
+        self._node = CountingNode(UdpOptions(park_slew_v_per_s=1e5), ["x"], boot, read_key(key))
         self._node._rig.advance_to = lambda elapsed_s: None
 
     def receive(self, data: bytes, sender: str, now_us: int) -> bytes:
@@ -54,11 +56,12 @@ class PythonNode:
 class LibraryNode:
     """The library in deploy/node with one input, whose codes count the datagrams, and one output."""
 
-    def __init__(self, library: ctypes.CDLL, boot: int = 1) -> None:
+    def __init__(self, library: ctypes.CDLL, boot: int = 1, key: str | None = None) -> None:
+        self.key = key
         self._bench, self._samples = Bench(library), 0
         volts = 10 / LARGEST_CODE
         source, sink = (Channel(-LARGEST_CODE, LARGEST_CODE, 0, ramp, volts, 0.0) for ramp in (0, RAMP_CODES))
-        assert self._bench.start([source], [sink], (0, 0), LONG_HOLD_US, boot)
+        assert self._bench.start([source], [sink], (0, 0), LONG_HOLD_US, boot, read_key(key))
 
     def receive(self, data: bytes, sender: str, now_us: int) -> bytes:
         """Process a datagram at a time; return the answer, or no bytes."""

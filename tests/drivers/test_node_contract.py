@@ -16,17 +16,19 @@ from rtloop.drivers.errors import DriverError
 from rtloop.drivers.node.driver import SerialDriver, UdpDriver
 from rtloop.drivers.node.options import UdpOptions
 from tests.drivers.bench_driver import open_driver
-from tests.drivers.node_bench import NodeProcess, make_options
+from tests.drivers.node_bench import NodeProcess, make_key, make_options
 from tests.faults.evidence import wait_for
 
 PATIENT = {"watchdog_ms": 5000.0, "error_limit": 100_000, "hold_ticks": 1000}
 """Limits so wide that a short stall of this machine fails no test."""
 
 
-@pytest.fixture(scope="module", params=["udp", "serial"])
+@pytest.fixture(scope="module", params=["udp", "udp with a key", "serial with a key"])
 def node(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[NodeProcess]:
     """Yield a node's process, on UDP or on a serial line, that runs for the whole module."""
-    node = NodeProcess(request.param, tmp_path_factory.mktemp("node"))
+    folder = tmp_path_factory.mktemp("node")
+    kind, _, has_key = request.param.partition(" ")
+    node = NodeProcess(kind, folder, **({"key": make_key(folder)} if has_key else {}))
     yield node
     node.end()
 

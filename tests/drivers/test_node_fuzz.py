@@ -18,6 +18,7 @@ SOAK = pytest.mark.soak
     ("kind", "count"),
     [
         ("udp", 600),
+        ("udp with a key", 600),
         ("serial", 100),
         pytest.param("udp", 100_000, marks=SOAK),
         pytest.param("serial", 10_000, marks=SOAK),

@@ -6,7 +6,23 @@ import ctypes
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
-from tests.node.frames import ANSWER, APPLY, AT_SAFE, OPEN, READY, Channel, Refusal, Sample, Welcome, drive, parse
+import pytest
+
+from tests.node.frames import (
+    ANSWER,
+    APPLY,
+    AT_SAFE,
+    OPEN,
+    READY,
+    Channel,
+    Refusal,
+    Sample,
+    Seal,
+    Welcome,
+    drive,
+    hello,
+    parse,
+)
 
 INPUTS = [Channel(-32768, 32767, 0, 0, 10 / 32768, 0.0), Channel(0, 65535, 0, 0, 1e-4, -1.5)]
 OUTPUTS = [Channel(-32768, 32767, 100, 30, 10 / 32768, 0.0), Channel(-500, 40000, -200, 7, 2e-4, 0.25)]
@@ -16,7 +32,11 @@ FAR = [3000, 20000]
 LOOP, OTHER = 0xC0A80001_1234, 0xC0A80002_1234
 """Addresses of two rival loops."""
 BOOT = 0xB0070001
-LONGEST_HOLD_US = 50_000
+LONGEST_HOLD_US, PERIOD_US = 50_000, 50
+KEY = bytes(range(0xA0, 0xB0))
+open_node = pytest.mark.parametrize("bench", [None], indirect=True, ids=["open"])
+keyed_node = pytest.mark.parametrize("bench", [KEY], indirect=True, ids=["keyed"])
+"""Marks of tests for a node of one kind; without a mark a test runs for both."""
 
 
 class _Channel(ctypes.Structure):
@@ -48,21 +68,24 @@ class Counters(NamedTuple):
     refused: int
     sessions: int
     watchdog_trips: int
+    foreign: int
     reads: int
     writes: int
     writes_at_read: int
 
 
 class Bench:
-    """A node with its board; `now_us` is its clock."""
+    """A node with its board; `now_us` is its clock, `seal` that of the next DRIVE, `tag` the tag of the last one."""
 
     def __init__(self, library: ctypes.CDLL):
         self.library = library
         self.now_us = 1_000_000
         self.sequence = 0
         self.outputs = len(OUTPUTS)
+        self.seal = Seal()
+        self.tag = 0
         self._bench = ctypes.c_void_p(library.bench_new())
-        self._answer = ctypes.create_string_buffer(1448)
+        self._answer = ctypes.create_string_buffer(1460)
 
     def __enter__(self) -> Bench:
         return self
@@ -77,8 +100,11 @@ class Bench:
         digital: tuple[int, int] = (3, 4),
         hold_us: int = LONGEST_HOLD_US,
         boot: int = BOOT,
+        key: bytes | None = None,
+        period_us: int = PERIOD_US,
     ) -> bool:
-        """Start the node, and return whether it accepted its configuration."""
+        """Start the node, and return whether it accepted its configuration; key None: that of the last start."""
+        self.seal = Seal(key or self.seal.key, boot)
         self.outputs = len(outputs)
         channels = [*inputs, *outputs]
         if len(channels) <= 44:
@@ -87,7 +113,13 @@ class Bench:
                 table[place] = _Channel(*channel)
         counts = bytes([len(inputs), len(outputs), *digital])
         return self.library.bench_start(
-            self._bench, counts, ctypes.c_uint32(hold_us), ctypes.c_uint32(boot), ctypes.c_uint64(self.now_us)
+            self._bench,
+            counts,
+            ctypes.c_uint32(hold_us),
+            ctypes.c_uint32(period_us),
+            ctypes.c_uint32(boot),
+            self.seal.key,
+            ctypes.c_uint64(self.now_us),
         )
 
     def send_bytes(self, frame: bytes, sender: int = LOOP) -> bytes:
@@ -104,7 +136,7 @@ class Bench:
 
     def send(self, frame: bytes, sender: int = LOOP) -> Welcome | Sample | Refusal | None:
         """Return the fields of the node's answer to a frame."""
-        return parse(self.send_bytes(frame, sender))
+        return parse(self.send_bytes(frame, sender), self.seal)
 
     def drive(
         self,
@@ -117,9 +149,18 @@ class Bench:
         digital: int = 0,
         hold_us: int = 10_000,
     ) -> Sample | Refusal | None:
-        """Send the next DRIVE, or a DRIVE with a given sequence, and return the fields of the answer."""
+        """Send the next DRIVE, or a DRIVE with a given sequence, and return the fields of the answer.
+
+        Before an OPEN the opening is read from a WELCOME, as the protocol says it.
+        """
+        if flags & OPEN:
+            welcome = self.send(hello(session), sender)
+            assert isinstance(welcome, Welcome)
+            self.seal = self.seal._replace(opening=welcome.opening)
         self.sequence = self.sequence + 1 if sequence is None else sequence
-        answer = self.send(drive(session, self.sequence, flags, codes, digital, hold_us), sender)
+        frame = drive(session, self.sequence, flags, codes, digital, hold_us, self.seal)
+        self.tag = int.from_bytes(frame[-12:-4], "little")
+        answer = self.send(frame, sender)
         assert not isinstance(answer, Welcome)
         return answer
 
@@ -174,7 +215,7 @@ class Bench:
     @property
     def counters(self) -> Counters:
         """Present counters of node and board."""
-        array = (ctypes.c_uint32 * 8)()
+        array = (ctypes.c_uint32 * 9)()
         self.library.bench_counters(self._bench, array)
         return Counters(*array)
 

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.node.bench import Bench
+from tests.node.bench import KEY, Bench
 
 NODE = Path(__file__).resolve().parents[2] / "deploy/node"
 STRICT = ["-std=c11", "-Wall", "-Wextra", "-Wpedantic", "-Wconversion", "-Wshadow", "-Werror"]
@@ -36,18 +36,18 @@ def library(compiler: str, tmp_path_factory: pytest.TempPathFactory) -> ctypes.C
         getattr(shared, name).restype = ctypes.c_void_p
     for name in ("bench_receive", "cobs_encode", "cobs_receive"):
         getattr(shared, name).restype = ctypes.c_size_t
-    for name in ("bench_due_us", "bench_write", "bench_extend_us"):
+    for name in ("bench_due_us", "bench_write", "bench_extend_us", "bench_siphash"):
         getattr(shared, name).restype = ctypes.c_uint64
     shared.bench_start.restype = ctypes.c_bool
     shared.bench_crc32.restype = shared.cobs_damaged.restype = ctypes.c_uint32
     return shared
 
 
-@pytest.fixture
-def bench(library: ctypes.CDLL) -> Iterator[Bench]:
-    """Yield a node that has started at 1 s of its clock."""
+@pytest.fixture(params=[None, KEY], ids=["open", "keyed"])
+def bench(library: ctypes.CDLL, request: pytest.FixtureRequest) -> Iterator[Bench]:
+    """Yield a node that has started at 1 s of its clock, without and with a key."""
     with Bench(library) as bench:
-        assert bench.start()
+        assert bench.start(key=request.param)
         yield bench
 
 

@@ -17,11 +17,12 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import NamedTuple
 
-from tests.node.frames import Refusal, Sample, Welcome, cobs, parse, uncobs
+from tests.node.frames import UNSEALED, Refusal, Sample, Seal, Welcome, cobs, parse, uncobs
 
 LONGEST_S = 10.0
 """Time-out in s of an answer on a busy machine."""
-Exchange = Callable[[bytes], Welcome | Sample | Refusal | None]
+Exchange = Callable[..., Welcome | Sample | Refusal | None]
+NO_KEY = "no key: whoever reaches the node may drive it; --key FILE keeps others off\n"
 
 
 class Output(NamedTuple):
@@ -57,6 +58,7 @@ class NodeProcess:
 
     def __init__(self, programs: Path, *options: str | Path):
         command = [programs / "rtloop-node", *map(str, options)]
+        self._notice = "" if "--key" in options else NO_KEY
         self.process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
         assert self.process.stdout is not None
         start = self.process.stdout.readline()
@@ -71,7 +73,7 @@ class NodeProcess:
         output, errors = self.process.communicate(timeout=LONGEST_S)
         if number == signal.SIGKILL:
             return {}
-        assert (self.process.returncode, errors) == (0, "")
+        assert (self.process.returncode, errors) == (0, self._notice)
         return json.loads(output)
 
 
@@ -88,15 +90,15 @@ def running(programs: Path, *options: str | Path) -> Iterator[NodeProcess]:
 
 @contextmanager
 def udp_client(port: int, host: str = "127.0.0.1") -> Iterator[Exchange]:
-    """Yield a function that sends a frame over UDP and returns the fields of the answer."""
+    """Yield a function that sends a frame over UDP and returns the fields of the answer, judged by a seal."""
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     with socket.socket(family, socket.SOCK_DGRAM) as client:
         client.settimeout(LONGEST_S)
         client.connect((host, port))
 
-        def exchange(frame: bytes) -> Welcome | Sample | Refusal | None:
+        def exchange(frame: bytes, seal: Seal = UNSEALED) -> Welcome | Sample | Refusal | None:
             client.send(frame)
-            return parse(client.recv(2048))
+            return parse(client.recv(2048), seal)
 
         yield exchange
 

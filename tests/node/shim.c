@@ -12,6 +12,7 @@ struct bench {
     struct rtloop_node node;
     struct rtloop_node_config config;
     struct rtloop_node_channel channels[RTLOOP_MAX_CHANNELS];
+    uint8_t key[RTLOOP_KEY_BYTES];
     int32_t inputs[RTLOOP_MAX_CHANNELS];
     uint16_t digital_inputs;
     uint32_t reads;
@@ -63,11 +64,16 @@ struct rtloop_node_channel *bench_channels(struct bench *bench)
     return bench->channels;
 }
 
-bool bench_start(struct bench *bench, const uint8_t counts[4], uint32_t longest_hold_us, uint32_t boot, uint64_t now_us)
+bool bench_start(struct bench *bench, const uint8_t counts[4], uint32_t longest_hold_us, uint32_t period_us, uint32_t boot,
+                 const uint8_t *key, uint64_t now_us)
 {
+    if (key != NULL) {
+        memcpy(bench->key, key, sizeof bench->key);
+    }
     bench->config = (struct rtloop_node_config){
         .inputs = counts[0], .outputs = counts[1], .digital_inputs = counts[2], .digital_outputs = counts[3],
-        .longest_hold_us = longest_hold_us, .shortest_period_us = 50, .input = bench->channels,
+        .longest_hold_us = longest_hold_us, .shortest_period_us = period_us, .input = bench->channels,
+        .key = key != NULL ? bench->key : NULL,
         .output = bench->channels + counts[0], .context = bench, .read_inputs = read_inputs,
         .write_outputs = write_outputs, .now_ns = now_ns};
     return rtloop_node_init(&bench->node, &bench->config, boot, now_us);
@@ -100,13 +106,13 @@ void bench_set_inputs(struct bench *bench, const int32_t *codes, uint16_t digita
     bench->conversion_ns = conversion_ns;
 }
 
-/* Fill invalid, old, refused, sessions, watchdog trips, reads, writes, writes before the latest conversion. */
-void bench_counters(const struct bench *bench, uint32_t counters[8])
+/* Fill invalid, old, refused, sessions, watchdog trips, foreign, reads, writes, writes before the latest conversion. */
+void bench_counters(const struct bench *bench, uint32_t counters[9])
 {
-    memcpy(counters, &bench->node.counters, 5 * sizeof *counters);
-    counters[5] = bench->reads;
-    counters[6] = bench->writes;
-    counters[7] = bench->writes_at_read;
+    memcpy(counters, &bench->node.counters, 6 * sizeof *counters);
+    counters[6] = bench->reads;
+    counters[7] = bench->writes;
+    counters[8] = bench->writes_at_read;
 }
 
 /* Fill one write of the outputs, and return its time. */
@@ -125,6 +131,14 @@ uint64_t bench_extend_us(uint64_t previous_us, uint32_t clock_us)
 uint32_t bench_crc32(const uint8_t *bytes, size_t length)
 {
     return rtloop_crc32(bytes, length);
+}
+
+uint64_t bench_siphash(const uint8_t *key, const uint8_t *bytes, size_t length)
+{
+    struct rtloop_siphash hash;
+    rtloop_siphash_begin(&hash, key);
+    rtloop_siphash_add(&hash, bytes, length);
+    return rtloop_siphash_end(&hash);
 }
 
 size_t cobs_encode(const uint8_t *frame, size_t length, uint8_t *line)

@@ -24,6 +24,7 @@ import pytest
 from rtloop.drivers.base import Wiring
 from rtloop.drivers.node.driver import SerialDriver
 from rtloop.drivers.node.options import SerialOptions
+from tests.drivers.node_bench import make_key
 from tests.drivers.node_calls import open_calls
 from tests.drivers.relay_frames import LOOP, Arrival
 from tests.drivers.relayed_nodes import PythonNode
@@ -32,18 +33,18 @@ from tests.node.accounts import COUNTS, expected_counts
 from tests.node.frames import SAMPLE, cobs, uncobs
 
 TICKS, PERIOD_US = 300, 1000
-LONGEST_CODE = 2896
+LONGEST_CODE = 2920
 """Length in bytes from which on the driver skips a frame on the line."""
 
 
 class Line:
     """A pseudo-terminal with a node; a thread answers until `end_thread`, then the test by `exchange`."""
 
-    def __init__(self, link: Path) -> None:
+    def __init__(self, link: Path, key: str | None = None) -> None:
         self._fd, self._end = os.openpty()
         tty.setraw(self._end)
         link.symlink_to(os.ttyname(self._end))
-        self.node, self._now_us, self._unfinished = PythonNode(), 0, b""
+        self.node, self._now_us, self._unfinished = PythonNode(key=key), 0, b""
         self._is_ended = threading.Event()
         self._thread = threading.Thread(target=self._serve)
         self._thread.start()
@@ -126,18 +127,19 @@ def parse_arrival(line: bytes, boot: int, session: int) -> Arrival:
         content = uncobs(line) if len(line) < LONGEST_CODE else b""
     except ValueError:
         content = b""
-    if len(content) != 36 or content[2] != SAMPLE or struct.unpack("<I", content[-4:])[0] != zlib.crc32(content[:-4]):
+    if len(content) != 44 or content[2] != SAMPLE or struct.unpack("<I", content[-4:])[0] != zlib.crc32(content[:-4]):
         return Arrival("invalid")
-    sequence, *owner, code = struct.unpack("<4xIII12xi4x", content)
+    sequence, *owner, code = struct.unpack("<4xIII12xi12x", content)
     assert owner == [session, boot]
     return Arrival("sample", sequence, (code,))
 
 
-@pytest.mark.parametrize("seed", [1, 2, 3])
-def test_the_counts_are_what_the_line_did(seed, tmp_path):
-    line, chance = Line(tmp_path / "tty"), random.Random(seed)
+@pytest.mark.parametrize(("seed", "has_key"), [(1, False), (2, False), (3, True)])
+def test_the_counts_are_what_the_line_did(seed, has_key, tmp_path):
+    key = make_key(tmp_path) if has_key else None
+    line, chance = Line(tmp_path / "tty", key), random.Random(seed)
     options = SerialOptions(
-        device=str(tmp_path / "tty"), hold_ticks=2, error_limit=1_000_000, watchdog_ms=5000, wait_s=60
+        device=str(tmp_path / "tty"), key=key, hold_ticks=2, error_limit=1_000_000, watchdog_ms=5000, wait_s=60
     )
     driver = SerialDriver(options, {"x": Wiring("adc0", "dac0")}, 100.0)
     calls = open_calls(driver)

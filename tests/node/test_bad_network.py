@@ -10,6 +10,7 @@ import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 from itertools import accumulate
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -21,6 +22,7 @@ from rtloop.drivers.node.driver import UdpDriver
 from rtloop.drivers.node.options import UdpOptions
 from tests.drivers.lossy_relay import Relay, relayed
 from tests.drivers.network_plan import DAMAGES, Copy, Plan, Script
+from tests.drivers.node_bench import make_key
 from tests.drivers.node_calls import open_calls
 from tests.drivers.relay_frames import Arrival
 from tests.drivers.relayed_nodes import LibraryNode, PythonNode
@@ -33,13 +35,22 @@ AnyNode = PythonNode | LibraryNode
 
 @pytest.fixture(params=["Python", "C"])
 def node(request: pytest.FixtureRequest) -> AnyNode:
-    """Return a node without a line: the simulated node, then the C library."""
+    """Return a node without a line and without a key: the simulated node, then the C library."""
     return PythonNode() if request.param == "Python" else LibraryNode(request.getfixturevalue("library"))
 
 
+@pytest.fixture(params=["Python", "C"])
+def keyed_node(request: pytest.FixtureRequest, tmp_path: Path) -> AnyNode:
+    """Return a node without a line and with a key: the simulated node, then the C library."""
+    key = make_key(tmp_path)
+    return (
+        PythonNode(key=key) if request.param == "Python" else LibraryNode(request.getfixturevalue("library"), key=key)
+    )
+
+
 def relay_driver(relay: Relay, **options: object) -> UdpDriver:
-    """Return a driver, not yet open, whose node is the relay."""
-    values = {"host": "127.0.0.1", "port": relay.port} | PATIENT | options
+    """Return a driver, not yet open, whose node is the relay; it has the node's key."""
+    values = {"host": "127.0.0.1", "port": relay.port, "key": relay.node.key} | PATIENT | options
     return UdpDriver(UdpOptions.model_validate(values), {"x": Wiring("adc0", "dac0")}, 1000.0)
 
 
@@ -120,6 +131,15 @@ def test_the_counts_are_what_the_network_did(node, seed):
 
 @pytest.mark.parametrize("seed", [4, 5])
 def test_damaged_and_forged_datagrams_reach_no_output_and_no_sample(node, seed):
+    assert_forgeries_have_no_effect(node, seed)
+
+
+def test_damaged_and_forged_datagrams_have_no_effect_with_a_key(keyed_node):
+    assert_forgeries_have_no_effect(keyed_node, 6)
+
+
+def assert_forgeries_have_no_effect(node: AnyNode, seed: int) -> None:
+    """Run an exchange behind a network that damages and forges, and require the values of the driver's own frames."""
     with relayed(node) as relay:
         RecordedExchange(relay, Plan(0, 0, 0, 0, 0), ticks=20)  # frames of this run are forged in the next one
         before = node.counts[0]

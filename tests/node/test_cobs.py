@@ -10,7 +10,7 @@ import pytest
 
 from tests.node.frames import cobs, uncobs
 
-LONGEST = 28 + 4 * 255
+LONGEST = 36 + 4 * 255
 
 
 class Line:

@@ -48,7 +48,7 @@ def test_a_drive_is_judged_as_a_whole_before_any_output_moves(
     before = bench.counters
     bench.now_us += 5000
     answer = bench.drive(act | ANSWER, codes, digital=1, hold_us=hold_us)
-    assert answer == Refusal(bench.sequence, 5, BOOT, expected, 1)
+    assert answer == Refusal(bench.sequence, 5, BOOT, expected, 2, 1, bench.tag)
     assert bench.counters == before._replace(refused=before.refused + 1)
     bench.poll(4999)
     assert bench.counters.watchdog_trips == 0

@@ -9,13 +9,15 @@ import zlib
 
 import pytest
 
-from tests.node.bench import BOOT, INPUTS, LONGEST_HOLD_US, OUTPUTS, SAFE, Bench
+from tests.node.bench import BOOT, INPUTS, LONGEST_HOLD_US, OUTPUTS, SAFE, Bench, open_node
 from tests.node.frames import (
     ANSWER,
     APPLY,
     AT_SAFE,
     DRIVE,
+    DRIVEN,
     HELLO,
+    KEYED,
     OPEN,
     READY,
     SAMPLE,
@@ -38,11 +40,13 @@ def test_the_check_is_that_of_zlib(library: ctypes.CDLL):
 
 
 def test_welcome_says_what_the_node_is(bench: Bench):
-    expected = Welcome(9, 2**32 - 1, 1, (2, 2, 3, 4), BOOT, LONGEST_HOLD_US, 50, 0, [*INPUTS, *OUTPUTS])
+    kept, channels = KEYED if bench.seal.key else 0, [*INPUTS, *OUTPUTS]
+    expected = Welcome(9, 2**32 - 1, 2, (2, 2, 3, 4), BOOT, LONGEST_HOLD_US, 50, kept, 0, channels)
     assert bench.send(hello(2**32 - 1, sequence=9)) == expected
     bench.open()
-    assert bench.send(hello(2**32 - 1, sequence=9)) == expected._replace(driven=1)
-    assert len(bench.send_bytes(hello())) == 40 + 32 * 4
+    assert bench.send(hello(2**32 - 1, sequence=9)) == expected._replace(flags=kept | DRIVEN, opening=1)
+    assert bench.send(hello(5, sequence=9)) == expected._replace(session=5, flags=kept | DRIVEN)
+    assert len(bench.send_bytes(hello())) == 52 + 32 * 4
 
 
 def test_hello_changes_nothing(bench: Bench):
@@ -56,9 +60,9 @@ def test_hello_changes_nothing(bench: Bench):
     assert bench.counters.watchdog_trips == 1
 
 
-@pytest.mark.parametrize("version", [0, 2, 257, 65535])
+@pytest.mark.parametrize("version", [0, 1, 3, 258, 65535])
 def test_a_hello_of_another_version_is_refused(bench: Bench, version: int):
-    assert bench.send(hello(6, version, 3)) == Refusal(3, 6, BOOT, VERSION, 1)
+    assert bench.send(hello(6, version, 3)) == Refusal(3, 6, BOOT, VERSION)
     assert bench.counters.refused == 1
 
 
@@ -71,7 +75,7 @@ def test_a_safe_code_and_a_change_of_an_input_are_0_in_welcome(bench: Bench):
 
 def test_the_largest_node_fits_into_one_ethernet_frame(bench: Bench):
     assert bench.start(inputs=INPUTS[:1] * 22, outputs=OUTPUTS[:1] * 22, digital=(16, 16))
-    assert len(bench.send_bytes(hello())) == 1448
+    assert len(bench.send_bytes(hello())) == 1460
     codes = list(range(22))
     bench.set_inputs([-code for code in codes], 0xFFFF)
     bench.open(codes=codes)
@@ -134,7 +138,7 @@ def _with_crc(content: bytes) -> bytes:
         *(GOOD[:length] for length in range(len(GOOD))),
         *(
             bytes(byte ^ (1 << bit) * (i == place) for i, byte in enumerate(GOOD))
-            for place in range(36)
+            for place in range(len(GOOD))
             for bit in (0, 7)
         ),
         GOOD + b"\0",
@@ -143,12 +147,14 @@ def _with_crc(content: bytes) -> bytes:
         _with_crc(GOOD[:-4] + bytes(4)),
         _with_crc(b"\x7a" + GOOD[1:-4]),
         _with_crc(GOOD[:3] + b"\2" + GOOD[4:-4]),
-        *(frame(kind, 2, GOOD[8:-4]) for kind in range(256) if kind != DRIVE),
+        *(frame(kind, 2, GOOD[8:-12]) for kind in range(256) if kind != DRIVE),
         frame(HELLO, 2, bytes(9)),
         frame(HELLO, 2, bytes(7)),
         frame(DRIVE, 2, b""),
         _with_crc(b""),
-        bytes(36),
+        bytes(len(GOOD)),
+        _with_crc(GOOD[:-12]),
+        _with_crc(GOOD[:-8]),
         GOOD[:-4] + bytes(4),
     ],
 )
@@ -159,6 +165,7 @@ def test_a_frame_that_is_not_valid_is_counted_and_moves_nothing(bench: Bench, co
     assert bench.counters == before._replace(invalid=1)
 
 
+@open_node
 def test_the_good_frame_of_the_test_above_is_accepted(bench: Bench):
     bench.open(sequence=1)
     assert bench.send_bytes(GOOD)[2] == SAMPLE
@@ -178,6 +185,8 @@ def test_the_good_frame_of_the_test_above_is_accepted(bench: Bench):
         {"outputs": [OUTPUTS[0]._replace(safe=32768)]},
         {"outputs": [OUTPUTS[0]._replace(safe=-32769)]},
         {"outputs": [OUTPUTS[0]._replace(change_per_ms=0)]},
+        {"key": bytes(16)},
+        {"key": b"\xff" * 16},
     ],
 )
 def test_a_node_that_the_protocol_does_not_allow_does_not_start(bench: Bench, change: dict):

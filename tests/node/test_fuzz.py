@@ -25,20 +25,23 @@ def fuzz(compiler: str, tmp_path_factory: pytest.TempPathFactory) -> list[str]:
     return ["make", "-s", "-C", str(NODE), f"BUILD={folder}", f"CC={compiler}"]
 
 
-def run(command: list[str]) -> dict[str, float]:
-    """Run the command and return the figures that it prints."""
+def run(command: list[str]) -> list[dict[str, float]]:
+    """Run the command and return the figures that it prints: of a node without a key, then of one with a key."""
     result = subprocess.run(command, capture_output=True, text=True)
     assert result.returncode == 0, result.stdout + result.stderr
-    return json.loads(result.stdout)
+    figures = [json.loads(line) for line in result.stdout.splitlines()]
+    assert [values["keyed"] for values in figures] == [False, True]
+    return figures
 
 
 def test_random_datagrams_break_no_rule(fuzz: list[str]):
-    figures = run([*fuzz, "test", "SEED=2"])
-    assert figures["datagrams"] == 200_000
-    for name in ("sessions", "watchdog_trips", "old", "refused", "invalid", "writes"):
-        assert figures[name] > 1000
+    for figures in run([*fuzz, "test", "SEED=2"]):
+        assert figures["datagrams"] == 200_000
+        assert (figures["foreign"] > 10_000) is figures["keyed"]
+        for name in ("sessions", "watchdog_trips", "old", "refused", "invalid", "writes"):
+            assert figures[name] > 1000
 
 
 @pytest.mark.soak
 def test_ten_million_random_datagrams_break_no_rule(fuzz: list[str]):
-    assert run([*fuzz, "fuzz", "SEED=3"])["datagrams"] == 10_000_000
+    assert [figures["datagrams"] for figures in run([*fuzz, "fuzz", "SEED=3"])] == [10_000_000] * 2

@@ -13,24 +13,37 @@ from pathlib import Path
 
 import pytest
 
+from tests.node.bench import KEY
 from tests.node.frames import (
     ANSWER,
     APPLY,
     AT_SAFE,
+    KEYED,
     OPEN,
     PARK,
     READY,
     UNKNOWN,
+    VERSION,
     WATCHDOG,
     Refusal,
     Sample,
+    Seal,
     Welcome,
     cobs,
     drive,
     hello,
     parse,
 )
-from tests.node.node_process import Exchange, read_witness, running, serial_client, serial_line, udp_client, wait_until
+from tests.node.node_process import (
+    NO_KEY,
+    Exchange,
+    read_witness,
+    running,
+    serial_client,
+    serial_line,
+    udp_client,
+    wait_until,
+)
 
 LONG_US = 4_000_000
 """Hold time of the watchdog that a busy machine does not exceed between two frames."""
@@ -52,7 +65,7 @@ def test_a_session_over_udp_from_hello_to_park(programs: Path, tmp_path: Path):
     with running(programs, *map(str, options)) as node, udp_client(node.port) as exchange:
         welcome = exchange(hello(5))
         assert isinstance(welcome, Welcome)
-        assert (welcome.counts, welcome.boot, welcome.driven) == ((2, 2, 4, 4), node.boot, 0)
+        assert (welcome.counts, welcome.boot, welcome.flags) == ((2, 2, 4, 4), node.boot, 0)
         assert welcome.channels[2][:5] == (-32768, 32767, 0, 330, 10 / 32768)
         open_and_set(exchange, [1000, -2000])
         answer = exchange(drive(5, 3, APPLY | ANSWER, [-32768, 32767], hold_us=LONG_US))
@@ -89,7 +102,7 @@ def test_the_watchdog_ramps_the_outputs_down(programs: Path, tmp_path: Path, spi
         assert content.digital == 0
         assert content.writes == 2 + 15 + 1 + 12  # start, OPEN, APPLYs, begin of the ramp, 560 codes by 50
         answer = exchange(drive(5, 1000, APPLY | ANSWER, [560]))
-        assert answer == Refusal(1000, 5, node.boot, WATCHDOG, 1)
+        assert answer == Refusal(1000, 5, node.boot, WATCHDOG, opening=1)
         assert node.stop()["watchdog_trips"] == 1
 
 
@@ -112,7 +125,31 @@ def test_a_killed_and_restarted_node_has_another_boot(programs: Path):
         node.stop(signal.SIGKILL)
         with running(programs, "--port", str(node.port)) as restarted:
             assert restarted.boot != node.boot
-            assert exchange(drive(5, 3, APPLY | ANSWER, [100])) == Refusal(3, 5, restarted.boot, UNKNOWN, 1)
+            assert exchange(drive(5, 3, APPLY | ANSWER, [100])) == Refusal(3, 5, restarted.boot, UNKNOWN)
+
+
+def write_key(path: Path, text: str = KEY.hex() + "\n", mode: int = 0o600) -> Path:
+    """Write a file with a key, and return its path."""
+    path.write_text(text, encoding="ascii")
+    path.chmod(mode)
+    return path
+
+
+def test_a_node_with_a_key_obeys_the_loop_that_has_it(programs: Path, tmp_path: Path):
+    options = ("--port", "0", "--hold", str(LONG_US), "--key", write_key(tmp_path / "key"))
+    with running(programs, *options) as node, udp_client(node.port) as exchange:
+        seal = Seal(KEY, node.boot)
+        welcome = exchange(hello(5), seal)
+        assert isinstance(welcome, Welcome)
+        assert (welcome.flags, welcome.opening) == (KEYED, 0)
+        frames = [drive(5, 1 + i, act | ANSWER, [0], hold_us=LONG_US, seal=seal) for i, act in enumerate((OPEN, PARK))]
+        assert isinstance(exchange(frames[0], seal), Sample)
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger:
+            for forged in (frames[1][:-12], drive(5, 2, APPLY, [9]), drive(5, 2, APPLY, [9], seal=seal)):
+                stranger.sendto(forged, ("127.0.0.1", node.port))
+        assert isinstance(exchange(frames[1], seal), Sample)
+        counters = node.stop()
+    assert counters == dict(counters, sessions=1, invalid=1, foreign=2, old=0, refused=0)
 
 
 def test_a_session_over_a_pseudo_terminal(programs: Path, tmp_path: Path):
@@ -121,7 +158,7 @@ def test_a_session_over_a_pseudo_terminal(programs: Path, tmp_path: Path):
         with serial_client(link) as exchange:
             assert isinstance(exchange(hello(5)), Welcome)
             open_and_set(exchange, [1, 2, 3])
-            assert exchange(hello(5, version=2)) == Refusal(1, 5, node.boot, 1, 1)
+            assert exchange(hello(5, version=1)) == Refusal(1, 5, node.boot, VERSION)
         with link.open("wb", buffering=0) as line:
             line.write(b"\3garbage\0" + bytes(100) + b"\5cut\0" + b"\x09begun" + b"\0")
         with serial_client(link) as exchange:
@@ -136,9 +173,9 @@ def test_a_session_over_a_pseudo_terminal(programs: Path, tmp_path: Path):
 def test_many_frames_in_one_write_are_all_answered(programs: Path, tmp_path: Path):
     link = tmp_path / "line"
     with running(programs, "--pty", str(link)) as node, serial_line(link) as exchange_bytes:
-        frames = [hello(5, version=2, sequence=i) for i in range(60)]
+        frames = [hello(5, version=1, sequence=i) for i in range(60)]
         answers = exchange_bytes(b"".join(map(cobs, frames)), len(frames))
-        assert [parse(answer) for answer in answers] == [Refusal(i, 5, node.boot, 1, 1) for i in range(60)]
+        assert [parse(answer) for answer in answers] == [Refusal(i, 5, node.boot, VERSION) for i in range(60)]
 
 
 def test_a_serial_device_that_goes_away_parks_the_outputs(programs: Path, tmp_path: Path):
@@ -153,7 +190,7 @@ def test_a_serial_device_that_goes_away_parks_the_outputs(programs: Path, tmp_pa
         wait_until(lambda: read_witness(witness).outputs[0].code == 250)
         os.close(line_fd)
         output, errors = node.process.communicate(timeout=10)
-    assert (node.process.returncode, errors) == (1, f"--tty: {name}: the device is gone\n")
+    assert (node.process.returncode, errors) == (1, f"{NO_KEY}--tty: {name}: the device is gone\n")
     assert json.loads(output)["sessions"] == 1
     assert read_witness(witness).outputs[0] == (0, 250, 250)
 
@@ -194,6 +231,7 @@ def test_a_node_is_reached_by_both_versions_of_ip(programs: Path):
         (["--bind"], "--bind: value is missing\n"),
         (["--tty", "/nowhere"], "--tty: /nowhere: No such file or directory\n"),
         (["--tty", "a", "--pty", "b"], "--pty: value is b; allowed: either --tty or --pty\n"),
+        (["--key", "/nowhere"], "--key: /nowhere: No such file or directory\n"),
         (["--witness", "/nowhere/file"], "--witness: /nowhere/file: No such file or directory\n"),
         (["--speed", "9"], "--speed: is no option; --help lists them\n"),
     ],
@@ -201,6 +239,28 @@ def test_a_node_is_reached_by_both_versions_of_ip(programs: Path):
 def test_a_mistake_on_the_command_line_is_named(programs: Path, options: list[str], message: str):
     result = subprocess.run([programs / "rtloop-node", *options], capture_output=True, text=True, timeout=10)
     assert (result.returncode, result.stderr, result.stdout) == (1, message, "")
+
+
+@pytest.mark.parametrize(
+    ("text", "mode", "message"),
+    [
+        (KEY.hex(), 0o640, "has mode 640; allowed: no right for group and others; run chmod 600 {path}"),
+        (KEY.hex(), 0o602, "has mode 602; allowed: no right for group and others; run chmod 600 {path}"),
+        (KEY.hex()[1:], 0o600, "is no key; allowed: a file of 32 hexadecimal digits"),
+        (KEY.hex() + "0", 0o600, "is no key; allowed: a file of 32 hexadecimal digits"),
+        (KEY.hex()[2:] + "0x", 0o600, "is no key; allowed: a file of 32 hexadecimal digits"),
+        ("", 0o400, "is no key; allowed: a file of 32 hexadecimal digits"),
+    ],
+)
+@pytest.mark.parametrize("program", [["rtloop-node"], ["exchange", "localhost", "1"]])
+def test_a_key_that_others_can_read_or_that_is_none_is_named(
+    programs: Path, tmp_path: Path, program: list[str], text: str, mode: int, message: str
+):
+    path = write_key(tmp_path / "key", text, mode)
+    command = [programs / program[0], *program[1:], "--key", path]
+    result = subprocess.run(command, capture_output=True, text=True, timeout=10)
+    assert (result.returncode, result.stdout) == (1, "")
+    assert result.stderr == f"--key: {path} {message.format(path=path)}\n"
 
 
 def test_the_simulated_resonator_overshoots_and_settles_as_its_equation_says(programs: Path):
@@ -220,9 +280,21 @@ def test_the_simulated_resonator_overshoots_and_settles_as_its_equation_says(pro
 
 
 @pytest.mark.parametrize("mode", [["--rate", "1000"], ["--rate", "0"], ["--rate", "1000", "--next-tick"]])
-def test_the_benchmark_client_exchanges_and_parks(programs: Path, mode: list[str]):
-    with running(programs, "--port", "0", "--hold", str(LONG_US)) as node:
-        command = [programs / "exchange", "127.0.0.1", str(node.port), "--count", "50", "--hold", str(LONG_US), *mode]
+@pytest.mark.parametrize("has_key", [False, True])
+def test_the_benchmark_client_exchanges_and_parks(programs: Path, tmp_path: Path, mode: list[str], has_key: bool):
+    key = ["--key", write_key(tmp_path / "key")] if has_key else []
+    with running(programs, "--port", "0", "--hold", str(LONG_US), *key) as node:
+        command = [
+            programs / "exchange",
+            "127.0.0.1",
+            str(node.port),
+            "--count",
+            "50",
+            "--hold",
+            str(LONG_US),
+            *mode,
+            *key,
+        ]
         result = subprocess.run(command, capture_output=True, text=True, timeout=30)
         assert result.returncode == 0, result.stderr
         figures = json.loads(result.stdout)
@@ -240,6 +312,7 @@ def test_the_help_lists_the_options(programs: Path):
         "--bind",
         "--tty",
         "--pty",
+        "--key",
         "--spin",
         "--priority",
         "--witness",

@@ -24,7 +24,7 @@ from rtloop.recording.views.steps import step_metrics
 from rtloop.workbench.tables import table
 from tests.drivers.can_bench import GROUP, free_port
 from tests.drivers.installing import install
-from tests.drivers.node_bench import free_udp_port
+from tests.drivers.node_bench import free_udp_port, make_key
 from tests.stage_text import one_axis
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -65,6 +65,7 @@ def backends(folder: Path) -> list[Backend]:
     A node on a busy machine answers late now and then: PATIENT lets the loop hold its last sample meanwhile. An
     exchange over a pseudo-terminal often takes longer than 100 µs, so that serial backends run at 2 kHz only.
     """
+    key = make_key(folder)
     bus = f'interface = "udp_multicast"\nchannel = "{GROUP}"\nsettings = {{ port = {free_port()}, hop_limit = 0 }}\n'
     return [
         Backend("sim", 'kind = "sim"\n'),
@@ -72,11 +73,11 @@ def backends(folder: Path) -> list[Backend]:
         Backend("can", f'kind = "can"\n{bus}hold_ticks = 800\nwatchdog_ms = 1000\nwait_s = 60\n',
                 board=("hil", "serve", "--can"), rates_hz=(2_000,)),
         Backend("third party", 'kind = "bench_card"\n', channels=("in", "out")),
-        Backend("udp", f'kind = "udp"\n{address(free_udp_port())}{PATIENT}', board=("hil", "serve", "--udp"),
-                rates_hz=(2_000,)),
+        Backend("udp", f'kind = "udp"\n{address(free_udp_port())}key = "{key}"\n{PATIENT}',
+                board=("hil", "serve", "--udp"), rates_hz=(2_000,)),
         Backend("serial", f'kind = "serial"\ndevice = "{folder}/tty"\n{PATIENT}', board=("hil", "serve", "--serial"),
                 rates_hz=(2_000,)),
-        *c_nodes(folder),
+        *c_nodes(folder, key),
     ]  # fmt: skip
 
 
@@ -85,8 +86,8 @@ def address(port: int) -> str:
     return f'host = "127.0.0.1"\nport = {port}\n'
 
 
-def c_nodes(folder: Path) -> list[Backend]:
-    """Compile the node in C below the folder; return it behind UDP and behind a pseudo-terminal.
+def c_nodes(folder: Path, key: str) -> list[Backend]:
+    """Compile the node in C below the folder; return it behind UDP, and behind a pseudo-terminal with a key's file.
 
     The list is empty without a compiler.
     """
@@ -100,8 +101,8 @@ def c_nodes(folder: Path) -> list[Backend]:
     return [
         Backend("udp, node in C", f'kind = "udp"\n{address(port)}{channels}{PATIENT}',
                 program=(*program, "--port", str(port))),
-        Backend("serial, node in C", f'kind = "serial"\ndevice = "{line}"\n{channels}{PATIENT}',
-                program=(*program, "--pty", line), rates_hz=(2_000,)),
+        Backend("serial, node in C", f'kind = "serial"\ndevice = "{line}"\nkey = "{key}"\n{channels}{PATIENT}',
+                program=(*program, "--pty", line, "--key", key), rates_hz=(2_000,)),
     ]  # fmt: skip
 
 

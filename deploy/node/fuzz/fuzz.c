@@ -1,7 +1,8 @@
-/* Random datagrams through the library: mutations of valid frames, with a model of the rules that judges each outcome.
+/* Random datagrams through the library: mutations of valid frames, frames of other keys, recorded frames of earlier sessions and
+ * boots, with a model of the rules that judges each outcome.
  *
- * Arguments: number of datagrams, seed. The model reads frames by itself; it shares the check's function alone, which the
- * tests in Python compare with zlib's. */
+ * Arguments: number of datagrams, seed, and `keyed` for a node with a key. The model reads frames by itself; it shares the functions
+ * of check and tag alone, which the tests in Python compare with zlib's and with the paper's. */
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
@@ -10,7 +11,7 @@
 #include "../rtloop_cobs.h"
 #include "../rtloop_node.h"
 
-enum { INPUTS = 3, OUTPUTS = 2, DIGITAL = 5, SENDERS = 3, MEMORY = 64, LONGEST_HOLD_US = 20000, DRIVE_BYTES = 28 + 4 * OUTPUTS };
+enum { INPUTS = 3, OUTPUTS = 2, DIGITAL = 5, SENDERS = 3, MEMORY = 64, LIBRARY = 4096, PERIOD_US = 50, LONGEST_HOLD_US = 20000, DRIVE_BYTES = 36 + 4 * OUTPUTS };
 
 static const struct rtloop_node_channel input_channels[INPUTS] = {
     {-32768, 32767, 0, 0, 10.0 / 32768, 0.0}, {0, 65535, 0, 0, 1e-4, -1.0}, {INT32_MIN, INT32_MAX, 0, 0, 1.0, 0.0}};
@@ -30,6 +31,13 @@ static struct {
     uint16_t wanted_digital;
     bool followed;
 } board;
+
+/* The session by the model's own account; its number and address are the node's. */
+static struct {
+    uint32_t boot;
+    uint32_t openings;
+    uint64_t newest;        /* sequence beyond 32 bits, from the OPEN on */
+} model = {.boot = 7};
 
 static struct rtloop_node node;
 static uint64_t datagram;
@@ -105,30 +113,38 @@ static void write_board(void *context, const int32_t *codes, uint16_t digital)
     board.writes++;
 }
 
-static const struct rtloop_node_config config = {
+static const uint8_t key[RTLOOP_KEY_BYTES] = "a key of a loop";
+static const uint8_t other_key[RTLOOP_KEY_BYTES] = "another's key..";
+static struct rtloop_node_config config = {
     .inputs = INPUTS, .outputs = OUTPUTS, .digital_inputs = DIGITAL, .digital_outputs = DIGITAL,
-    .longest_hold_us = LONGEST_HOLD_US, .shortest_period_us = 50, .input = input_channels, .output = output_channels,
+    .longest_hold_us = LONGEST_HOLD_US, .shortest_period_us = PERIOD_US, .input = input_channels, .output = output_channels,
     .read_inputs = read_board, .write_outputs = write_board};
 
 /* Senders, as a loop that behaves would be, and the last frames of all of them. */
 static struct {
     uint32_t session;
-    uint32_t sequence;
+    uint64_t sequence;
+    uint32_t opening;
 } loops[SENDERS];
-static struct {
+
+/* Frames that were sent: the last ones, and a selection of all times, with their sender. */
+struct recorded {
     uint8_t bytes[256];
     size_t length;
     uint64_t sender;
-} memory[MEMORY];
+};
+static struct recorded memory[MEMORY];
+static struct recorded library[LIBRARY];
 
 /* Write the next frame of a loop that behaves, and return its length. */
 static size_t valid_frame(uint8_t *frame, uint32_t sender)
 {
     uint32_t kind = below(64);
-    rtloop_frame_begin(frame, kind == 0 ? RTLOOP_HELLO : RTLOOP_DRIVE, ++loops[sender].sequence);
+    uint64_t sequence = ++loops[sender].sequence;
+    rtloop_frame_begin(frame, kind == 0 ? RTLOOP_HELLO : RTLOOP_DRIVE, (uint32_t)(sequence & UINT32_MAX));
     rtloop_put32(frame + 8, loops[sender].session);
     if (kind == 0) {
-        rtloop_put32(frame + 12, 1);
+        rtloop_put32(frame + 12, 2);
         return rtloop_frame_end(frame, 20);
     }
     uint32_t act = RTLOOP_APPLY;
@@ -136,6 +152,10 @@ static size_t valid_frame(uint8_t *frame, uint32_t sender)
         act = RTLOOP_PARK;
     } else if (kind < 10 || (node.session == 0 && kind < 32)) {
         act = node.session == 0 && below(4) != 0 ? RTLOOP_OPEN : below(8) == 0 ? RTLOOP_OPEN : 0;
+    }
+    if (act == RTLOOP_OPEN && node.session != loops[sender].session) {
+        loops[sender].opening = model.openings;
+        loops[sender].sequence &= UINT32_MAX;
     }
     frame[12] = (uint8_t)(act | (below(4) ? RTLOOP_ANSWER : 0));
     frame[13] = OUTPUTS;
@@ -152,14 +172,19 @@ static size_t valid_frame(uint8_t *frame, uint32_t sender)
         }
         rtloop_put32(frame + 24 + 4 * i, (uint32_t)code);
     }
-    return rtloop_frame_end(frame, DRIVE_BYTES);
+    struct rtloop_course course = {model.boot, loops[sender].opening, (uint32_t)(loops[sender].sequence >> 32)};
+    uint32_t *numbers[] = {&course.boot, &course.opening, &course.turn};
+    if (below(32) == 0) {
+        *numbers[below(3)] += below(2) ? 1 : UINT32_MAX;
+    }
+    return rtloop_frame_seal(frame, DRIVE_BYTES, below(32) ? config.key : other_key, course);
 }
 
 /* Change a frame at random, and return its new length. */
 static size_t mutate(uint8_t *frame, size_t length, uint64_t *sender)
 {
-    static const uint8_t fields[] = {0, 2, 3, 4, 8, 12, 13, 14, 16, 20, 24, 28};
-    uint32_t how = below(12);
+    static const uint8_t fields[] = {0, 2, 3, 4, 8, 12, 13, 14, 16, 20, 24, 28, 32, 36};
+    uint32_t how = below(14);
     if (how == 0) {
         frame[below((uint32_t)length)] ^= (uint8_t)(1u << below(8));
     } else if (how == 1) {
@@ -176,38 +201,85 @@ static size_t mutate(uint8_t *frame, size_t length, uint64_t *sender)
         return rtloop_frame_end(frame, extended);
     } else if (how == 8) {
         *sender = below(SENDERS);
+    } else if (how == 9 && length == DRIVE_BYTES) {
+        rtloop_put32(frame + 4, rtloop_get32(frame + 4) + (1u << below(32)));
+        struct rtloop_course course = {model.boot, loops[*sender].opening, (uint32_t)(loops[*sender].sequence >> 32)};
+        return rtloop_frame_seal(frame, length, config.key, course);
     } else {
-        uint32_t earlier = below(MEMORY);
-        if (memory[earlier].length != 0) {
-            memcpy(frame, memory[earlier].bytes, memory[earlier].length);
-            *sender = memory[earlier].sender;
-            return memory[earlier].length;
+        const struct recorded *earlier = how < 12 ? &memory[below(MEMORY)] : &library[below(LIBRARY)];
+        if (earlier->length != 0) {
+            memcpy(frame, earlier->bytes, earlier->length);
+            *sender = earlier->sender;
+            return earlier->length;
         }
     }
     return length;
 }
 
-/* Note whether a frame may set its codes, as the document says it, from the node's session before the frame. */
+/* Return the sequence of a DRIVE beyond 32 bits: the first one from the newest on, if that is as near as a newer one may be. */
+static uint64_t long_sequence(const uint8_t *frame)
+{
+    uint64_t sequence = (model.newest >> 32 << 32) + rtloop_get32(frame + 4);
+    uint64_t next = sequence + (sequence > model.newest ? 0 : 1ull << 32);
+    return next - model.newest <= 2000000 / PERIOD_US ? next : sequence;
+}
+
+/* Return whether a DRIVE has the tag that the document demands of one of the session that is open. */
+static bool has_tag(const uint8_t *frame)
+{
+    struct rtloop_course course = {model.boot, model.openings - 1, (uint32_t)(long_sequence(frame) >> 32)};
+    return config.key == NULL || rtloop_get64(frame + DRIVE_BYTES - 12) == rtloop_frame_tag(frame, DRIVE_BYTES, key, course);
+}
+
+/* Return whether a frame is a DRIVE whose content is allowed, with acts of OPEN, APPLY and PARK. */
+static bool is_drive(const uint8_t *frame, size_t length, int acts)
+{
+    bool is_one = length == DRIVE_BYTES && frame[0] == 0x7B && frame[1] == 5 && frame[2] == 0x72 && frame[3] == 1
+                  && rtloop_get32(frame + length - 4) == rtloop_crc32(frame, length - 4) && (frame[12] & 11) == acts
+                  && frame[13] == OUTPUTS && rtloop_get32(frame + 16) != 0;
+    for (int i = 0; is_one && i < OUTPUTS; i++) {
+        int32_t code = (int32_t)rtloop_get32(frame + 24 + 4 * i);
+        is_one = code >= output_channels[i].lowest && code <= output_channels[i].highest;
+    }
+    return is_one;
+}
+
+/* What the document says of a frame, from the session before it. */
+static struct {
+    bool opens;
+    bool parks;
+} expected;
+
+/* Note whether a frame may set its codes, open a session, or must end the one that is open, and advance the newest sequence. */
 static void expect(const uint8_t *frame, size_t length, uint64_t sender)
 {
     bool alive = node.session != 0 && board.now_us < node.accepted_us + node.hold_us;
-    board.may_follow = alive && length == DRIVE_BYTES && frame[0] == 0x7B && frame[1] == 5 && frame[2] == 0x72 && frame[3] == 1
-                       && rtloop_get32(frame + length - 4) == rtloop_crc32(frame, length - 4)
-                       && rtloop_get32(frame + 8) == node.session && sender == node.sender && (frame[12] & 11) == 2
-                       && frame[13] == OUTPUTS && rtloop_get32(frame + 16) != 0
-                       && (int32_t)(rtloop_get32(frame + 4) - node.newest) > 0;
+    bool own = alive && length == DRIVE_BYTES && rtloop_get32(frame + 8) == node.session && has_tag(frame);
+    bool near = own && sender == node.sender && long_sequence(frame) - model.newest - 1 < 2000000 / PERIOD_US;
+    struct rtloop_course next = {model.boot, model.openings, 0};
+    expected.opens = !alive && is_drive(frame, length, RTLOOP_OPEN) && rtloop_get32(frame + 8) != 0
+                     && (config.key == NULL || rtloop_get64(frame + length - 12) == rtloop_frame_tag(frame, length, key, next));
+    expected.parks = own && is_drive(frame, length, RTLOOP_PARK) && (sender == node.sender || config.key != NULL);
+    board.may_follow = near && is_drive(frame, length, RTLOOP_APPLY);
     for (int i = 0; board.may_follow && i < OUTPUTS; i++) {
         board.wanted[i] = (int32_t)rtloop_get32(frame + 24 + 4 * i);
-        board.may_follow = board.wanted[i] >= output_channels[i].lowest && board.wanted[i] <= output_channels[i].highest;
     }
     board.wanted_digital = (uint16_t)(board.may_follow ? rtloop_get16(frame + 14) & 31u : 0);
     board.followed = false;
+    if (expected.opens) {
+        model.openings++;
+        model.newest = rtloop_get32(frame + 4);
+    } else if (near && (is_drive(frame, length, RTLOOP_APPLY) || is_drive(frame, length, RTLOOP_OPEN) || is_drive(frame, length, 0))) {
+        model.newest = long_sequence(frame);
+    } else if (expected.parks) {
+        model.newest = long_sequence(frame);
+    }
 }
 
 /* Judge the answer to a frame, and the session after it. */
-static void judge(const uint8_t *frame, const uint8_t *answer, size_t length, const struct rtloop_node *before, bool ramping)
+static void judge(const uint8_t *frame, size_t frame_length, const uint8_t *answer, size_t length, const struct rtloop_node *before, bool ramping)
 {
-    require(length == 0 || length == 28 || length == 32 + 4 * INPUTS || length == 40 + 32 * (INPUTS + OUTPUTS),
+    require(length == 0 || length == 28 || length == 44 || length == 40 + 4 * INPUTS || length == 52 + 32 * (INPUTS + OUTPUTS),
             "an answer has a length that the protocol does not know");
     require(length == 0 || (rtloop_frame_valid(answer, length) && rtloop_get32(answer + 4) == rtloop_get32(frame + 4)),
             "an answer is not valid");
@@ -215,6 +287,11 @@ static void judge(const uint8_t *frame, const uint8_t *answer, size_t length, co
     require(!refused || !board.followed, "a refused frame moved an output");
     require(!board.may_follow || board.followed || ramping, "an accepted APPLY moved no output");
     require(!(board.followed && ramping && node.ramping), "a frame moved an output in a ramp");
+    require(node.counters.sessions == model.openings, "a session was opened by a frame that may not, or not by one that may");
+    require(!expected.opens || node.session == rtloop_get32(frame + 8), "an OPEN opened no session");
+    require(!expected.parks || node.session == 0, "a PARK of the session was not obeyed");
+    require(node.session == 0 || node.newest == (uint32_t)(model.newest & UINT32_MAX), "another sequence is the newest one");
+    require(!refused || length == 28 || memcmp(answer + 24, frame + frame_length - 12, 8) == 0, "a REFUSAL has another frame's tag");
     bool another = node.session != 0 && before->session != 0 && node.session != before->session;
     require(!another || board.now_us >= before->accepted_us + before->hold_us, "a session took another's place");
     require(node.session == 0 || node.hold_us <= LONGEST_HOLD_US, "a hold is too long");
@@ -242,6 +319,32 @@ static void through_cobs(struct rtloop_cobs *receiver, const uint8_t *frame, siz
     require(received == length && memcmp(receiver->frame, frame, length) == 0, "a frame was changed on the line");
 }
 
+/* Counters of all starts of the node. */
+static struct rtloop_node_counters totals;
+
+static void note_counters(void)
+{
+    totals.invalid += node.counters.invalid;
+    totals.old += node.counters.old;
+    totals.refused += node.counters.refused;
+    totals.sessions += node.counters.sessions;
+    totals.watchdog_trips += node.counters.watchdog_trips;
+    totals.foreign += node.counters.foreign;
+}
+
+/* Start the node again, with a boot that it has not had. */
+static void restart(void)
+{
+    for (int i = 0; i < OUTPUTS; i++) {
+        board.codes[i] = output_channels[i].safe;
+    }
+    note_counters();
+    board.stepped = false;
+    model.boot++;
+    model.openings = 0;
+    require(rtloop_node_init(&node, &config, model.boot, board.now_us), "no start");
+}
+
 /* Process one random datagram. The frame and the answer end where their memory ends, so that any overrun is seen. */
 static void run(uint8_t *frame_memory, uint8_t *answer, struct rtloop_cobs *receiver)
 {
@@ -254,19 +357,25 @@ static void run(uint8_t *frame_memory, uint8_t *answer, struct rtloop_cobs *rece
     memcpy(memory[datagram % MEMORY].bytes, built, length);
     memory[datagram % MEMORY].length = length;
     memory[datagram % MEMORY].sender = sender;
+    if (below(16) == 0) {
+        library[below(LIBRARY)] = memory[datagram % MEMORY];
+    }
     uint8_t *frame = frame_memory + sizeof built - length;
     memcpy(frame, built, length);
     board.now_us += below(200) ? below(400) : below(60000);
     const struct rtloop_node before = node;
     expect(frame, length, sender);
     size_t answered = rtloop_node_receive(&node, frame, length, sender, board.now_us, answer);
-    judge(frame, answer, answered, &before, before.ramping);
+    judge(frame, length, answer, answered, &before, before.ramping);
     board.may_follow = false;
     if (below(1000) == 0) {
         loops[below(SENDERS)].session = below(16) ? draw() : 0;
     }
     if (below(2000) == 0) {
         loops[below(SENDERS)].sequence = 0xFFFFFFF0u;
+    }
+    if (config.key != NULL && below(20000) == 0) {
+        restart();
     }
     if (datagram % 16 == 0 && length > 0) {
         through_cobs(receiver, frame, length);
@@ -277,18 +386,21 @@ int main(int argc, char **argv)
 {
     uint64_t count = argc > 1 ? strtoull(argv[1], NULL, 10) : 100000;
     state = argc > 2 ? strtoull(argv[2], NULL, 10) : 1;
+    config.key = argc > 3 ? key : NULL;
     uint8_t *frame = malloc(256);
-    uint8_t *answer = malloc(40 + 32 * (INPUTS + OUTPUTS));
+    uint8_t *answer = malloc(52 + 32 * (INPUTS + OUTPUTS));
     struct rtloop_cobs *receiver = calloc(1, sizeof *receiver);
-    require(frame != NULL && answer != NULL && receiver != NULL && rtloop_node_init(&node, &config, 7, 0), "no start");
+    require(frame != NULL && answer != NULL && receiver != NULL && rtloop_node_init(&node, &config, model.boot, 0), "no start");
     clock_t start = clock();
     for (datagram = 0; datagram < count; datagram++) {
         run(frame, answer, receiver);
     }
     double seconds = (double)(clock() - start) / CLOCKS_PER_SEC;
-    printf("{\"datagrams\": %llu, \"per_second\": %.0f, \"sessions\": %u, \"watchdog_trips\": %u, \"old\": %u, \"refused\": %u, "
-           "\"invalid\": %u, \"writes\": %u}\n", (unsigned long long)count, (double)count / seconds, node.counters.sessions,
-           node.counters.watchdog_trips, node.counters.old, node.counters.refused, node.counters.invalid, board.writes);
+    note_counters();
+    printf("{\"datagrams\": %llu, \"keyed\": %s, \"per_second\": %.0f, \"sessions\": %u, \"watchdog_trips\": %u, \"old\": %u, \"refused\": %u, "
+           "\"invalid\": %u, \"foreign\": %u, \"writes\": %u}\n", (unsigned long long)count, config.key != NULL ? "true" : "false",
+           (double)count / seconds, totals.sessions, totals.watchdog_trips, totals.old, totals.refused, totals.invalid, totals.foreign,
+           board.writes);
     free(frame);
     free(answer);
     free(receiver);

@@ -14,6 +14,7 @@
 #include <time.h>
 #include <unistd.h>
 
+#include "key.h"
 #include "option.h"
 #include "rtloop_frame.h"
 
@@ -24,6 +25,7 @@ static const char help[] =
     "  --same-tick       ask for a sample, wait for it without sleep, then send the codes (the default)\n"
     "  --next-tick       send the codes; take the sample that answers them in the next tick\n"
     "  --hold US         hold of the node's watchdog (100000)\n"
+    "  --key FILE        the node's key: 32 hexadecimal digits\n"
     "  --priority N      real-time priority, 1 to 99, and locked memory\n";
 
 static struct {
@@ -32,6 +34,7 @@ static struct {
     double hold_us;
     double priority;
     bool next_tick;
+    const uint8_t *key;
 } options = {.count = 10000, .rate_hz = 1000, .hold_us = 100000};
 
 enum { LONGEST_WAIT_NS = 10000000, TRIES = 2000 };
@@ -42,6 +45,7 @@ static size_t drive_length;
 static uint8_t answer[2048];
 static uint32_t sequence;
 static uint32_t session;
+static struct rtloop_course course;
 
 /* Return CLOCK_MONOTONIC in ns. */
 static int64_t clock_ns(void)
@@ -70,8 +74,24 @@ static void fail(const char *what, const char *why)
 static void send_drive(void)
 {
     rtloop_put32(drive + 4, ++sequence);
-    rtloop_frame_end(drive, drive_length);
+    rtloop_frame_seal(drive, drive_length, options.key, course);
     send(file, drive, drive_length, MSG_DONTWAIT);
+}
+
+/* Return whether the answer has the right tag, by the boot and opening in a WELCOME or REFUSAL; a REFUSAL must name the last DRIVE. */
+static bool answer_tagged(size_t length)
+{
+    struct rtloop_course own = course;
+    if (length < 44) {
+        return answer[2] == RTLOOP_REFUSAL && rtloop_get16(answer + 16) == RTLOOP_VERSION;
+    }
+    if (answer[2] == RTLOOP_WELCOME) {
+        own = (struct rtloop_course){.boot = rtloop_get32(answer + 20), .opening = rtloop_get32(answer + 36)};
+    } else if (answer[2] == RTLOOP_REFUSAL) {
+        own = (struct rtloop_course){.boot = rtloop_get32(answer + 12), .opening = rtloop_get32(answer + 20)};
+    }
+    bool mine = answer[2] != RTLOOP_REFUSAL || memcmp(answer + 24, drive + drive_length - RTLOOP_END_BYTES, 8) == 0;
+    return mine && rtloop_frame_tagged(answer, length, options.key, own);
 }
 
 /* Take one frame if there is one; return whether it is a valid one of this session and of a format. A REFUSAL ends the program. */
@@ -79,7 +99,8 @@ static bool take(enum rtloop_format format)
 {
     static const char *const reasons[] = {"?", "VERSION", "BUSY", "UNKNOWN", "WATCHDOG", "SIZE", "RANGE", "FLAGS"};
     ssize_t length = recv(file, answer, sizeof answer, MSG_DONTWAIT);
-    if (length <= 0 || !rtloop_frame_valid(answer, (size_t)length) || rtloop_get32(answer + 8) != session) {
+    if (length <= 0 || !rtloop_frame_valid(answer, (size_t)length) || rtloop_get32(answer + 8) != session
+        || !answer_tagged((size_t)length)) {
         return false;
     }
     if (answer[2] == RTLOOP_REFUSAL) {
@@ -126,15 +147,37 @@ static void prepare_drive(void)
     drive[13] = outputs;
     rtloop_put32(drive + 16, (uint32_t)options.hold_us);
     for (size_t i = 0; i < outputs; i++) {
-        memcpy(drive + 24 + 4 * i, answer + 36 + 32 * (inputs + i) + 8, 4);
+        memcpy(drive + 24 + 4 * i, answer + 40 + 32 * (inputs + i) + 8, 4);
     }
-    drive_length = 28 + 4 * (size_t)outputs;
+    drive_length = 36 + 4 * (size_t)outputs;
+}
+
+/* Ask the node what it is, and prepare the DRIVE for it. */
+static void greet(void)
+{
+    uint8_t hello[20];
+    bool answered = false;
+    rtloop_frame_begin(hello, RTLOOP_HELLO, 0);
+    rtloop_put32(hello + 8, session);
+    rtloop_put32(hello + 12, RTLOOP_PROTOCOL_VERSION);
+    rtloop_frame_end(hello, sizeof hello);
+    for (int i = 0; i < 100 && !answered; i++) {
+        send(file, hello, sizeof hello, 0);
+        answered = wait_for(RTLOOP_WELCOME);
+    }
+    if (!answered) {
+        fail("node", options.key != NULL ? "no WELCOME with the key's tag within 1 s" : "no WELCOME within 1 s");
+    }
+    if ((options.key != NULL) != ((answer[32] & RTLOOP_KEYED) != 0)) {
+        fail("--key", options.key != NULL ? "the node has no key" : "is missing: the node has a key");
+    }
+    course = (struct rtloop_course){.boot = rtloop_get32(answer + 20), .opening = rtloop_get32(answer + 36)};
+    prepare_drive();
 }
 
 /* Greet the node, open the session, and wait for the end of the opening ramp. */
 static void open_session(void)
 {
-    uint8_t hello[20];
     bool answered = false;
     bool ready = false;
     while (session == 0) {
@@ -142,21 +185,10 @@ static void open_session(void)
             fail("getrandom", strerror(errno));
         }
     }
-    rtloop_frame_begin(hello, RTLOOP_HELLO, 0);
-    rtloop_put32(hello + 8, session);
-    rtloop_put32(hello + 12, RTLOOP_PROTOCOL_VERSION);
-    rtloop_frame_end(hello, sizeof hello);
-    for (int i = 0; i < 100; i++) {
-        send(file, hello, sizeof hello, 0);
-        if (wait_for(RTLOOP_WELCOME)) {
-            break;
-        }
-    }
-    if (answer[2] != RTLOOP_WELCOME) {
-        fail("node", "no WELCOME within 1 s");
-    }
-    prepare_drive();
     for (int i = 0; i < TRIES && !ready; i++) {
+        if (!answered) {
+            greet();
+        }
         drive[12] = answered ? RTLOOP_ANSWER : RTLOOP_OPEN | RTLOOP_ANSWER;
         send_drive();
         if (wait_for(RTLOOP_SAMPLE)) {
@@ -294,6 +326,11 @@ static int take_option(const char *name, const char *value)
     if (strcmp(name, "--same-tick") == 0 || strcmp(name, "--next-tick") == 0) {
         options.next_tick = name[2] == 'n';
         return 1;
+    }
+    static uint8_t key[RTLOOP_KEY_BYTES];
+    if (strcmp(name, "--key") == 0 && value != NULL) {
+        options.key = key;
+        return key_read(value, key) ? 2 : 0;
     }
     const struct {
         const char *name;

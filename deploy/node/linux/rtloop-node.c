@@ -12,6 +12,7 @@
 #include <time.h>
 
 #include "board.h"
+#include "key.h"
 #include "option.h"
 #include "transport.h"
 #include "witness.h"
@@ -24,6 +25,7 @@ static const char help[] =
     "  --bind ADDRESS    own IPv4 or IPv6 address (all)\n"
     "  --tty PATH        a serial device instead of UDP\n"
     "  --pty LINK        a pseudo-terminal instead of UDP, and a symbolic link to it\n"
+    "  --key FILE        32 hexadecimal digits that the loop has too; without, whoever reaches the node may drive it\n"
     "  --spin            never sleep: one processor for this program\n"
     "  --priority N      real-time priority, 1 to 99, and locked memory\n"
     "  --witness FILE    a file of the outputs for tests (linux/witness.h)\n";
@@ -34,6 +36,7 @@ static struct {
     const char *bind;
     const char *tty;
     const char *pty;
+    const char *key;
     const char *witness;
     bool spin;
 } options = {.port = 5747};
@@ -82,7 +85,7 @@ static int program_option(const char *name, const char *value)
     const struct {
         const char *name;
         const char **text;
-    } texts[] = {{"--bind", &options.bind}, {"--tty", &options.tty}, {"--pty", &options.pty}, {"--witness", &options.witness}};
+    } texts[] = {{"--bind", &options.bind}, {"--tty", &options.tty}, {"--pty", &options.pty}, {"--key", &options.key}, {"--witness", &options.witness}};
     for (size_t i = 0; i < sizeof texts / sizeof *texts; i++) {
         if (strcmp(name, texts[i].name) == 0) {
             if (value == NULL) {
@@ -161,7 +164,12 @@ static void catch_signals(sigset_t *while_waiting)
 /* Open the board, the transport and the node; return false, after a message, if one fails. */
 static bool start(struct rtloop_node_config *config)
 {
+    static uint8_t key[RTLOOP_KEY_BYTES];
     uint32_t boot = 0;
+    if (options.key != NULL && !key_read(options.key, key)) {
+        return false;
+    }
+    config->key = options.key != NULL ? key : NULL;
     if (!board_open(config) || (options.witness != NULL && !witness_open(options.witness, config->outputs))) {
         return false;
     }
@@ -171,17 +179,19 @@ static bool start(struct rtloop_node_config *config)
     if (!opened || !take_priority()) {
         return false;
     }
-    while (boot == 0) {
-        if (getrandom(&boot, sizeof boot, 0) != sizeof boot) {
-            boot = (uint32_t)clock_ns(NULL);
-        }
+    if (getrandom(&boot, sizeof boot, 0) != sizeof boot) {
+        fprintf(stderr, "boot: no random number: %s\n", strerror(errno));
+        return false;
     }
     if (!rtloop_node_init(&node, config, boot, clock_us())) {
-        fprintf(stderr, "the board's channels are not allowed; rtloop_node.h says what is\n");
+        fprintf(stderr, "the board's channels, or a key of 16 equal bytes, are not allowed; rtloop_node.h says what is\n");
         return false;
     }
     printf("{\"port\": %u, \"boot\": %u}\n", transport.port, boot);
     fflush(stdout);
+    if (config->key == NULL) {
+        fprintf(stderr, "no key: whoever reaches the node may drive it; --key FILE keeps others off\n");
+    }
     return true;
 }
 
@@ -249,9 +259,9 @@ int main(int argc, char **argv)
     }
     run(&while_waiting);
     const struct rtloop_node_counters *counters = &node.counters;
-    printf("{\"invalid\": %u, \"old\": %u, \"refused\": %u, \"sessions\": %u, \"watchdog_trips\": %u, \"damaged\": %u, \"unsent\": %u}\n",
+    printf("{\"invalid\": %u, \"old\": %u, \"refused\": %u, \"sessions\": %u, \"watchdog_trips\": %u, \"foreign\": %u, \"damaged\": %u, \"unsent\": %u}\n",
            counters->invalid, counters->old, counters->refused, counters->sessions, counters->watchdog_trips,
-           transport.receiver.damaged, transport.unsent);
+           counters->foreign, transport.receiver.damaged, transport.unsent);
     transport_close(&transport);
     if (transport.lost) {
         fprintf(stderr, "--tty: %s: the device is gone\n", options.tty);

@@ -96,3 +96,15 @@ def load_word(compiler: ModuleType, address: Type) -> tuple[Signature, Callable[
         return builder.load(builder.inttoptr(arguments[0], ir.IntType(64).as_pointer()), align=1)
 
     return types.uint64(types.intp), codegen
+
+
+@intrinsic_like(uncompiled.add_words)
+def add_words(compiler: ModuleType, first: Type, second: Type) -> tuple[Signature, Callable[..., Value]]:
+    """Add two uint64 modulo 2⁶⁴. The operator + would warn of an overflow where kernels run uncompiled."""
+    types = compiler.types
+
+    def codegen(context: BaseContext, builder: IRBuilder, signature: Signature, arguments: Sequence[Value]) -> Value:
+        """Emit the LLVM code of the sum and return its value; numba defines the parameters."""
+        return builder.add(arguments[0], arguments[1])
+
+    return types.uint64(types.uint64, types.uint64), codegen

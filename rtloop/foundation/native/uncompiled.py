@@ -73,6 +73,11 @@ def load_word(address: int) -> np.uint64:
     return np.uint64(ctypes.c_uint64.from_buffer_copy(ctypes.string_at(int(address), 8)).value)
 
 
+def add_words(first: int, second: int) -> np.uint64:
+    """Return the sum of two uint64 modulo 2⁶⁴."""
+    return np.uint64((int(first) + int(second)) & 0xFFFF_FFFF_FFFF_FFFF)
+
+
 def carray(pointer: int, shape: int | tuple[int, ...], dtype: npt.DTypeLike = np.float64) -> Any:
     """Return an array over the memory at address `pointer`, not a copy; the fields of its records are attributes.
 

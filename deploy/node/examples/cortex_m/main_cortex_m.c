@@ -6,7 +6,8 @@
 
 /* Replace the stubs by the board's functions. */
 uint32_t board_clock_us(void);      /* a free-running clock of 32 bits that wraps */
-uint32_t board_random(void);        /* another number at each start: a generator in hardware, or a counter in flash */
+uint32_t board_random(void);        /* never the same number twice: a generator in hardware, or a counter in flash */
+extern const uint8_t board_key[RTLOOP_KEY_BYTES]; /* of this board and its loop alone, in flash that nobody reads out */
 int board_take_byte(void);          /* a byte from the serial line; -1: none */
 void board_send(const uint8_t *bytes, size_t length);
 volatile int32_t board_dac;         /* in place of the DAC's register */
@@ -31,7 +32,7 @@ static const struct rtloop_node_channel input = {
 static const struct rtloop_node_channel output = {
     .lowest = -32768, .highest = 32767, .safe = 0, .change_per_ms = 33, .volts_per_code = 10.0 / 32768.0, .volts_at_zero = 0.0};
 static const struct rtloop_node_config config = {
-    .inputs = 1, .outputs = 1, .longest_hold_us = 100000, .shortest_period_us = 100, .input = &input, .output = &output,
+    .inputs = 1, .outputs = 1, .longest_hold_us = 100000, .shortest_period_us = 100, .input = &input, .output = &output, .key = board_key,
     .read_inputs = read_inputs, .write_outputs = write_outputs};
 
 static struct rtloop_node node;
@@ -64,7 +65,9 @@ int main(void)
     }
 }
 
-/* The stubs: a line on which nothing comes, and a clock that counts its calls. */
+/* The stubs: a line on which nothing comes, a clock that counts its calls, and a key with which no node starts. */
+const uint8_t board_key[RTLOOP_KEY_BYTES] = {0};
+
 uint32_t board_clock_us(void)
 {
     static volatile uint32_t calls;

@@ -15,6 +15,10 @@ enum { PORT = 5747 };
 /* Chip selects, pins of port D: of the DAC, then of the ADCs. */
 static const uint16_t selects[3] = {GPIO_PIN_14, GPIO_PIN_15, GPIO_PIN_0};
 
+static const uint8_t key[RTLOOP_KEY_BYTES] = {
+#include "node_key.inc" /* README.md says how to make it */
+};
+
 static bool failed;
 
 bool board_failed(void)
@@ -82,7 +86,7 @@ void board_start(void)
     static const struct rtloop_node_channel output[2] = {
         {0, 65535, 32768, 33, 20.0 / 65536.0, -10.0}, {0, 65535, 32768, 33, 20.0 / 65536.0, -10.0}};
     static const struct rtloop_node_config config = {
-        .inputs = 2, .outputs = 2, .longest_hold_us = 100000, .shortest_period_us = 100, .input = input, .output = output,
+        .inputs = 2, .outputs = 2, .longest_hold_us = 100000, .shortest_period_us = 100, .input = input, .output = output, .key = key,
         .read_inputs = board_read, .write_outputs = board_write};
     static const uint8_t range[4] = {0xD0, 0x14, 0x00, 0x01}; /* of the ADCs: -10.24 V to 10.24 V */
     uint32_t boot = 0;

@@ -22,6 +22,10 @@ static const struct rtloop_node_channel outputs[2] = {
     {0, 65535, 32768, 33, 20.0 / 65536.0, -10.0},
 };
 
+static const uint8_t key[RTLOOP_KEY_BYTES] = {
+#include "node_key.inc"  // README.md says how to make it
+};
+
 static struct rtloop_node node;
 static struct rtloop_cobs line;
 static uint64_t now_us;
@@ -86,6 +90,7 @@ void setup()
     config.shortest_period_us = 100;
     config.input = inputs;
     config.output = outputs;
+    config.key = key;
     config.read_inputs = board_read;
     config.write_outputs = board_write;
     prepare_select(DAC_SELECT);
