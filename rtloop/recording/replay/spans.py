@@ -114,7 +114,7 @@ def _is_plain(recording: Recording) -> bool:
     """Whether a recording may be replayed in spans: all its files are finished, and nothing in it needs an explanation.
 
     Excluded are recovered files, gaps, ticks that two files hold or that overviews replace, problems of the reader, and
-    commands that are recorded twice or out of order.
+    commands that are recorded twice, out of order or after the end.
     """
     return (
         all(extent.totals and extent.totals["result"] != RECOVERED for extent in recording.extents)
@@ -122,7 +122,7 @@ def _is_plain(recording: Recording) -> bool:
         and not recording.problems
         and not recording.skipped
         and not any(event["kind"] == GAP for event in recording.events)
-        and misplaced_command(recording.events) is None
+        and misplaced_command(recording) is None
     )
 
 
