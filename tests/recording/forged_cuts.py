@@ -8,7 +8,10 @@ the good one has must not be identical.
 from __future__ import annotations
 
 import copy
+import hashlib
 import json
+import subprocess
+import sys
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -42,7 +45,7 @@ from tests.recording.forging import (
 from tests.recording.real_loop import RecordedRun
 
 JOBS = (1, 2, 3, 4, 16)
-TICKS, CHUNK_TICKS, SNAPSHOT_TICKS, KILL_TICK = 600, 40, 60, 360
+TICKS, CHUNK_TICKS, SNAPSHOT_TICKS, KILL_TICK = 600, 20, 60, 360
 AROUND = {"format": 2, "around": {"before_s": 0.002, "after_s": 0.002, "every_s": 0.003, "on": ["mode"]}}
 DRIVE_V = 9.99
 NOWHERE = 77
@@ -176,12 +179,13 @@ def record_originals(folder: Path) -> list[Original]:
     text, two_axes = configuration_texts()
     other_text = text.replace("at_tick = 100", "at_tick = 90")
     originals = []
-    for name, this_text, options in (
+    kinds: list[tuple[str, str, dict[str, Any]]] = [
         ("one axis", text, {}),
         ("two axes", two_axes, {}),
         ("rotated", text, {"rotate_s": 0.012}),
         ("around", text, {"header": AROUND}),
-    ):
+    ]
+    for name, this_text, options in kinds:
         runs = [
             _record(folder / f"{name}-{place}.mcap", a_text, **options)
             for place, a_text in enumerate((this_text, other_text))
@@ -231,20 +235,17 @@ def _execute(run: RecordedRun, end: int) -> None:
 
 
 def _with_gap(part: Part) -> Part:
-    """Return the file without the ticks of one chunk, which is followed by a snapshot, with the event of the gap."""
-    lost = part.tick_chunks[7]
-    first = int(part.records(lost)["tick"][0])
+    """Return the file without the ticks of two chunks before the snapshot of tick 320, with the event of the gap."""
+    lost = part.tick_chunks[14:16]
+    first = int(part.records(lost[0])["tick"][0])
     assert first == 280
-    part = _change_totals(part, lambda totals: totals.update(ticks_logged=TICKS - 40, ticks_lost=40, complete=False))
+    part = change_totals(part, lambda totals: totals.update(ticks_logged=TICKS - 40, ticks_lost=40, complete=False))
     gap = {"tick": 320, "time_ns": 0, "kind": "gap", "who": "recorder", "axis": None}
-    content = json.dumps({**gap, "what": {"first_tick": first, "count": CHUNK_TICKS}}).encode()
-    chunk = Chunk(pack_message(format.EVENTS, 0, content), (format.EVENTS,))
-    chunks = [*part.base.chunks[:lost], chunk, *part.base.chunks[lost + 1 :]]
-    # The ticks up to the next snapshot cannot be executed: they are missing as well.
-    return part.with_chunks(chunks)
-
-
-# Forgers: each takes the files, and returns a description and the changed files.
+    content = json.dumps({**gap, "what": {"first_tick": first, "count": 40}}).encode()
+    part = part._replace(
+        base=part.base.replace_chunk(lost[0], Chunk(pack_message(format.EVENTS, 0, content), (format.EVENTS,)))
+    )
+    return part.with_chunks([chunk for place, chunk in enumerate(part.base.chunks) if place != lost[1]])
 
 
 def double_chunk(original: Original, run: Run, random: Random) -> tuple[str, Run]:
@@ -427,7 +428,7 @@ def change_claims(original: Original, run: Run, random: Random) -> tuple[str, Ru
     kind, amount = int(random.integers(4)), int(_choose([-200, -40, -1, 1, 40, 200], random))
     if kind == 0:
         key = _choose(["ticks_executed", "ticks_logged"], random)
-        return f"{key} {amount:+}", replaced(_change_totals(part, lambda totals: _add(totals, key, amount)))
+        return f"{key} {amount:+}", replaced(change_totals(part, lambda totals: _add(totals, key, amount)))
     if kind == 1:
         key = _choose(["first_tick", "sequence", "repeats_before"], random)
         header = {**part.base.header, key: max(part.base.header.get(key, 0) + amount, 0)}
@@ -436,13 +437,13 @@ def change_claims(original: Original, run: Run, random: Random) -> tuple[str, Ru
         files = random.permutation(len(run))[:2]
         forged = [*run]
         for file, sign in zip(files, (1, -1), strict=True):
-            forged[file] = _change_totals(run[file], lambda totals, s=sign: _add(totals, "ticks_logged", s * amount))
+            forged[file] = change_totals(run[file], lambda totals, s=sign: _add(totals, "ticks_logged", s * amount))
         return f"ticks of the files {amount:+}", tuple(forged)
     count = int(random.integers(1, 5))  # As if the first chunks had never been.
     first = part.tick_chunks[min(count, len(part.tick_chunks) - 1)]
     lost = int(part.records(first)["tick"][0]) - int(part.records(part.tick_chunks[0])["tick"][0])
     chunks = [chunk for place, chunk in enumerate(part.base.chunks) if place >= first or chunk.channels]
-    part = _change_totals(part.with_chunks(chunks), lambda totals: _add(totals, "ticks_logged", -lost))
+    part = change_totals(part.with_chunks(chunks), lambda totals: _add(totals, "ticks_logged", -lost))
     return f"without its first {lost} ticks", replaced(part)
 
 
@@ -510,8 +511,6 @@ def _alternate(one: Sequence[Chunk], other: Sequence[Chunk]) -> list[Chunk]:
 
 def _digest(data: bytes | bytearray) -> bytes:
     """Return the payload of a snapshot."""
-    import hashlib
-
     return hashlib.sha256(data).digest() + bytes(data)
 
 
@@ -520,7 +519,7 @@ def _add(totals: dict[str, Any], key: str, amount: int) -> None:
     totals[key] += amount
 
 
-def _change_totals(part: Part, change: Callable[[dict[str, Any]], object]) -> Part:
+def change_totals(part: Part, change: Callable[[dict[str, Any]], object]) -> Part:
     """Return the file with other totals in the event that ends it, if it has one."""
     for i, j in reversed(part.base.messages(format.EVENTS)):
         event = json.loads(part.base.chunks[i].messages[j].payload)
@@ -530,7 +529,51 @@ def _change_totals(part: Part, change: Callable[[dict[str, Any]], object]) -> Pa
     return part
 
 
-# Replays
+def add_command(part: Part, tick: int) -> Part:
+    """Return the file with its last command repeated at another tick, before the event that ends the file."""
+    i, j = next(
+        (i, j) for i, j in reversed(part.base.messages(format.EVENTS))
+        if json.loads(part.base.chunks[i].messages[j].payload)["kind"] in EFFECTIVE
+    )  # fmt: skip
+    message = part.base.chunks[i].messages[j]
+    payload = json.dumps({**json.loads(message.payload), "tick": tick}).encode()
+    chunk = Chunk(pack_message(*message._replace(payload=payload)), (format.EVENTS,))
+    return part.with_chunks([*part.base.chunks[:-1], chunk, part.base.chunks[-1]])
+
+
+def check(originals: Sequence[Original], folder: Path, number: int, processes: bool = False) -> tuple[str, bool]:
+    """Replay a forgery by all numbers of jobs; with `processes`, also by the command. Returns (fault, is identical).
+
+    The fault is "" without one.
+    """
+    original, change, run = forge(originals, number)
+    paths = [folder / f"{number}-{file}.mcap" for file in range(len(run))]
+    for path, part in zip(paths, run, strict=True):
+        path.write_bytes(part.pack())
+    answers = [answer(paths, jobs) for jobs in JOBS]
+    if processes:
+        answers += [_command_answer(paths, jobs) for jobs in JOBS]
+    for path in paths:
+        path.unlink()
+    first = answers[0]
+    is_identical = not isinstance(first, str) and first["identical"]
+    if any(other != first for other in answers):
+        return f"{number} ({change}): the answer depends on the jobs: {answers}", is_identical
+    if is_identical and not may_be_identical(run, read_contents(original.run)):
+        return f"{number} ({change}): wrongly identical", True
+    return "", is_identical
+
+
+def _command_answer(paths: Sequence[Path], jobs: int) -> dict[str, Any] | str:
+    """Return the report of `rtloop replay`, or the message of its error; its exit code must agree with the report."""
+    command = [sys.executable, "-m", "rtloop", "replay", *map(str, paths), "--json", "--jobs", str(jobs)]
+    process = subprocess.run(command, capture_output=True, text=True, check=False)
+    if not process.stdout:
+        assert process.returncode == 66, process
+        return process.stderr.removeprefix("rtloop: ").rstrip("\n")
+    report = json.loads(process.stdout)
+    assert process.returncode == (0 if report["identical"] else 1), process
+    return report
 
 
 def answer(paths: Sequence[Path], jobs: int) -> dict[str, Any] | str:
