@@ -209,7 +209,7 @@ def _record(path: Path, text: str, **options: Any) -> Run:
     """Record a short run. Returns its files."""
     run = (SelectiveRun if "header" in options else RecordedRun)(path, text, paced=False, **options)
     _execute(run, TICKS)
-    totals = run.session.finish("finished")
+    totals: dict[str, Any] = run.session.finish("finished")
     return _take_apart([Path(name) for name in totals["paths"]])
 
 
