@@ -110,9 +110,10 @@ def misplaced_command(recording: Recording) -> int | None:
 
 
 def _command_key(event: Event) -> tuple[object, ...]:
-    """Return the fields by which two events are the same command."""
+    """Return the fields by which two events are the same command; numbers as text, in which NaN equals NaN."""
     details = event["what"]
-    return event["tick"], event["kind"], event["axis"], details["identity"], *map(float, details["values"])
+    values = (repr(float(value)) for value in details["values"])
+    return event["tick"], event["kind"], event["axis"], details["identity"], *values
 
 
 def split_at_gaps(rows: Rows) -> list[Rows]:
