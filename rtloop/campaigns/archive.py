@@ -29,55 +29,54 @@ def examine(
 ) -> dict[str, Any]:
     """Examine recordings on workers; with `folder`, store their rows in its file, and use the rows that count there.
 
-    A stored row counts if the recording is unchanged, this version of rtloop wrote the row, and its verdict depends on
-    the recording alone. A recording whose row counts is not examined again.
+    A stored row counts if the recording has the same bytes, this version of rtloop wrote the row, and its verdict
+    depends on the recording alone. A recording whose row counts is read for its digest and not examined again.
     Returns {recordings, pending, stored, counts, duration_s, rate_per_s, verdicts}: `verdicts` is the list of rows, in
     the order of `recordings`, `counts` the number of rows by verdict, `stored` the number of rows from earlier calls,
     `pending` the number of recordings without a row after a stop. A row is {path, files, size, mtime_ns, rtloop,
-    verdict, the columns of the examination, reason}.
+    sha256, verdict, the columns of the examination, reason}.
     After a request to stop, the recordings that were submitted end and no other one starts. `on_progress` receives the
-    number of rows, stored ones included.
+    number of rows.
 
     Raises UnavailableError if the scheduler is gone, a worker has another version or another process uses the folder,
     OutputError if the folder or a row cannot be written. Rows that were stored before the error stay in `folder`.
     """
     start_s = time.monotonic()
     with open_table(recordings, examination.columns, folder, examination.file_name) as table:
-        stored = len(table.rows)
         Archive(examination, table, workers).run(on_progress, is_stop_requested)
         duration_s = time.monotonic() - start_s
         return {
             "recordings": len(recordings),
             "pending": len(table.missing()),
-            "stored": stored,
+            "stored": table.confirmed,
             "counts": table.counts(),
             "duration_s": duration_s,
-            "rate_per_s": (len(table.rows) - stored) / duration_s,
+            "rate_per_s": (len(table.rows) - table.confirmed) / duration_s,
             "verdicts": table.ordered_rows(),
         }
 
 
 class Archive:
-    """Examines the recordings that `table` lacks on `workers`."""
+    """Examines the recordings of `table` on `workers`."""
 
     def __init__(self, examination: Examination, table: VerdictTable, workers: Workers) -> None:
         """Store the arguments; `run` begins the work."""
         self._examination, self._table, self._workers = examination, table, workers
 
     def run(self, on_progress: Callable[[int], None], is_stop_requested: Callable[[], bool]) -> None:
-        """Examine the recordings that the table lacks, and add their rows; `on_progress` receives the number of rows.
+        """Examine the recordings, and add or confirm their rows; `on_progress` receives the number of rows.
 
         After a request to stop, the recordings that were submitted end and no other one starts. Raises UnavailableError
         if the scheduler is gone or a worker has another version, OutputError if a verdict cannot be stored.
         """
         tasks = [Task((recording,)) for recording in self._table.missing()]
-        stored = len(self._table.rows)
-        on_progress(stored)
-        Dispatcher(self._workers, self).run(tasks, lambda done: on_progress(stored + done), is_stop_requested)
+        on_progress(0)
+        Dispatcher(self._workers, self).run(tasks, on_progress, is_stop_requested)
 
     def submit(self, items: tuple[ArchivedRecording, ...]) -> Future[Row]:
         """Start the examination of one recording in a worker; return the future of its row."""
-        return self._workers.submit(self._examination.function, items[0].paths, __version__)
+        stored_sha256 = self._table.stored_sha256(items[0])
+        return self._workers.submit(self._examination.function, items[0].paths, __version__, stored_sha256)
 
     def store(self, items: tuple[ArchivedRecording, ...], result: Row) -> None:
         """Add `result`, the row of the single recording in `items`, to the table and its file. Raises OutputError."""

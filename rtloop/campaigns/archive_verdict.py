@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+import os
 from collections.abc import Callable, Sequence
 from contextlib import closing
 from dataclasses import asdict
@@ -10,6 +12,7 @@ from typing import Any, NamedTuple
 
 from rtloop.campaigns.archive_files import UNFINISHED_SUFFIX
 from rtloop.errors import RtloopError, UnavailableError, one_line_error
+from rtloop.foundation.trusted import open_user_file
 from rtloop.recording.errors import RecordingError
 from rtloop.recording.file.conversion import forget_copies
 from rtloop.recording.file.recover import is_being_written
@@ -39,39 +42,43 @@ class Examination(NamedTuple):
     Rows of a call with a folder are stored in the file `file_name`.
     """
 
-    function: Callable[[Sequence[str], str], Row]
+    function: Callable[[Sequence[str], str, str | None], Row]
     columns: tuple[str, ...]
     good_verdict: str
     file_name: str
 
 
-def replay_files(paths: Sequence[str], version: str) -> Row:
-    """Replay the files of a recording in this process. Returns {verdict, tick, column, reason}.
+def replay_files(paths: Sequence[str], version: str, stored_sha256: str | None = None) -> Row:
+    """Replay the files of a recording in this process. Returns {sha256, verdict, tick, column, reason}.
 
+    `sha256` is that of all bytes of the files; if it is `stored_sha256`, there is no replay, and only {sha256}.
     `verdict` is a text such as "identical", `reason` a text, "" without one. `tick` and `column` name the first
     difference; without one, they are left out. An error, as for an unreadable file, becomes a verdict. Raises
     UnavailableError alone, if this worker's version of rtloop is not `version`.
     """
-    return _examine(paths, version, _replay)
+    return _examine(paths, version, stored_sha256, _replay)
 
 
-def summarise_files(paths: Sequence[str], version: str) -> Row:
-    """Summarise the files of a recording. Returns {verdict, ticks, duration_s, lost, trips, reason}.
+def summarise_files(paths: Sequence[str], version: str, stored_sha256: str | None = None) -> Row:
+    """Summarise the files of a recording. Returns {sha256, verdict, ticks, duration_s, lost, trips, reason}.
 
+    `sha256` is that of all bytes of the files; if it is `stored_sha256`, there is no summary, and only {sha256}.
     `verdict` is a text such as "readable", `reason` a text, "" without one; `ticks` and `lost` are numbers of ticks,
-    `trips` a list of {tick, causes, reason}. An error becomes a verdict: of a recording that cannot be read, verdict
-    and reason alone are returned. Raises UnavailableError alone, if this worker's version of rtloop is not `version`.
+    `trips` a list of {tick, causes, reason}. An error becomes a verdict: of a recording that cannot be read, sha256,
+    verdict and reason alone are returned. Raises UnavailableError alone, if this worker's version of rtloop is not
+    `version`.
     """
-    return _examine(paths, version, _summarise)
+    return _examine(paths, version, stored_sha256, _summarise)
 
 
 REPLAY = Examination(replay_files, ("tick", "column"), IDENTICAL, "verdicts.jsonl")
 INFO = Examination(summarise_files, ("ticks", "duration_s", "lost", "trips"), READABLE, "info.jsonl")
 
 
-def _examine(paths: Sequence[str], version: str, judge: Callable[[list[Path]], Row]) -> Row:
-    """Return the row that `judge` makes of a recording; any error that it raises becomes a verdict.
+def _examine(paths: Sequence[str], version: str, stored_sha256: str | None, judge: Callable[[list[Path]], Row]) -> Row:
+    """Return the row that `judge` makes of a recording, with its `sha256`; any error that it raises becomes a verdict.
 
+    The row has `sha256` alone if that is `stored_sha256`; a file that cannot be read has None.
     In its reason, the paths of the files are left out, and characters that cannot be printed become "?". Raises
     UnavailableError if this worker's version of rtloop is not `version`.
     """
@@ -80,6 +87,9 @@ def _examine(paths: Sequence[str], version: str, judge: Callable[[list[Path]], R
             f"a worker process has rtloop {__version__}; allowed: {version}, the version of this command; "
             "install equal versions on all workers"
         )
+    sha256 = _content_sha256(paths)
+    if sha256 is not None and sha256 == stored_sha256:
+        return {"sha256": sha256}
     try:
         row = judge([Path(path) for path in paths])
     except RtloopError as error:
@@ -91,7 +101,19 @@ def _examine(paths: Sequence[str], version: str, judge: Callable[[list[Path]], R
     for path in paths:
         row["reason"] = row["reason"].replace(f"{path}: ", "")
     row["reason"] = "".join(letter if letter.isprintable() else "?" for letter in row["reason"])
-    return row
+    return {"sha256": sha256, **row}
+
+
+def _content_sha256(paths: Sequence[str]) -> str | None:
+    """Return the SHA-256 (hexadecimal) over those of the files, in their order; None if one cannot be read."""
+    digest = hashlib.sha256()
+    try:
+        for path in paths:
+            with os.fdopen(open_user_file(Path(path)), "rb") as file:
+                digest.update(hashlib.file_digest(file, "sha256").digest())
+    except OSError:
+        return None
+    return digest.hexdigest()
 
 
 def _row(verdict: str, reason: str = "", **values: object) -> Row:

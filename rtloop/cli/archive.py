@@ -145,7 +145,7 @@ def _print_report(report: Mapping[str, Any], columns: tuple[str, ...], good_verd
                         rows=cells, words=words))  # fmt: skip
     counts = ", ".join(f"{count:,} {verdict}" for verdict, count in report["counts"].items())
     done = report["recordings"] - report["pending"] - report["stored"]
-    stored = f", {report['stored']:,} stored earlier" if report["stored"] else ""
+    stored = f", {report['stored']:,} stored earlier, unchanged by their SHA-256" if report["stored"] else ""
     out.print(f"{count_text(report['recordings'], 'recording')}: {counts or 'no verdict'}")
     out.print(f"{done:,} in {report['duration_s']:.1f} s, {report['rate_per_s']:.1f} recordings/s{stored}")
 

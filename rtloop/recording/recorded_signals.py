@@ -45,8 +45,9 @@ class RecordedSignals:
 
     All arrays lack the same missing ticks; the signal `tick` holds the numbers of the ticks present. `problems` lists
     the faults found in the files read so far. Damaged parts are skipped; `left_out` lists the faults that removed data.
-    `extents` holds the tick range of each file. `skipped` holds the ranges (first tick, count) that a recording around
-    events omits by intention; `overview` holds their extremes and means.
+    `extents` holds the tick range of each file, `repeated_events` the loop's events that are read from another file of
+    the run instead. `skipped` holds the ranges (first tick, count) that a recording around events omits by intention;
+    `overview` holds their extremes and means.
 
     >>> run = rtloop.load("run.mcap")
     >>> run.keys()[:3]
@@ -71,6 +72,7 @@ class RecordedSignals:
             self.header: Header = readers[0].header
             self.columns: tuple[str, ...] = readers[0].columns
             self.events: list[Event] = [event for reader in readers for event in reader.events]
+            self.repeated_events: list[Event] = [event for reader in readers for event in reader.repeated_events]
             self.extents = tuple(Extent(reader.first_tick, reader.totals, reader.repeated_ticks) for reader in readers)
             self.skipped: list[Range] = [tick_range for reader in readers for tick_range in reader.skipped_ranges]
             self.problems += missing_parts(readers)

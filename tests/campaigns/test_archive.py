@@ -16,9 +16,10 @@ from typing import Any
 
 import pytest
 
+from rtloop.campaigns.archive import examine
 from rtloop.campaigns.archive_files import find_recordings
-from rtloop.campaigns.archive_table import open_table
-from rtloop.campaigns.archive_verdict import UNREADABLE, replay_files, summarise_files
+from rtloop.campaigns.archive_table import REPEATED, open_table
+from rtloop.campaigns.archive_verdict import INFO, REPLAY, Examination, replay_files, summarise_files
 from rtloop.campaigns.dispatcher import Dispatcher, Task
 from rtloop.campaigns.workers import WorkerDied
 from rtloop.errors import UnavailableError
@@ -93,8 +94,10 @@ def hook_environment(tmp_path: Path, name: str, slow_s: str = "0") -> dict[str, 
 
 
 def replay_verdict(*paths: Path) -> dict[str, Any]:
-    """Return the verdict of a replay of the files of one recording."""
-    return replay_files([str(path) for path in paths], __version__)
+    """Return the verdict of a replay of the files of one recording, without the digest of its content."""
+    row = replay_files([str(path) for path in paths], __version__)
+    del row["sha256"]
+    return row
 
 
 def stored_lines(out: Path) -> list[bytes]:
@@ -157,15 +160,15 @@ def test_a_call_whose_coordinator_was_killed_continues(folder, report, tmp_path)
     await_lines(out, 5, process)
     os.kill(process.pid, signal.SIGKILL)  # The workers notice the kill, and end.
     process.communicate(timeout=60)
-    before = [line for line in stored_lines(out) if json.loads(line)["verdict"] != UNREADABLE]
+    before = [line for line in stored_lines(out) if json.loads(line)["verdict"] not in REPEATED]
     code, continued = archive("replay", folder, "--out", out, folder=tmp_path)
     after = stored_lines(out)
     assert (code, continued["verdicts"], continued["stored"]) == (1, report["verdicts"], len(before))
     assert after[: len(before)] == before
     assert len({json.loads(line)["path"] for line in after}) == len(after) == GOOD + len(BAD)
     _, again = archive("replay", folder, "--out", out, folder=tmp_path)
-    # A recording that cannot be read is tried again.
-    assert (again["verdicts"], again["stored"]) == (report["verdicts"], GOOD + len(BAD) - 1)
+    # A recording that cannot be read, or whose law is of another version, is tried again.
+    assert (again["verdicts"], again["stored"]) == (report["verdicts"], GOOD + len(BAD) - 2)
     assert sorted(stored_lines(out)) == sorted(after)
 
 
@@ -250,8 +253,8 @@ def test_a_damaged_index_is_named_although_all_ticks_are_identical(good_recordin
 
 def test_a_later_format_is_another_version(good_recording, tmp_path):
     change_header(good_recording, tmp_path / "run.mcap", format=99)
-    for examine in (replay_files, summarise_files):
-        row = examine([str(tmp_path / "run.mcap")], __version__)
+    for judge in (replay_files, summarise_files):
+        row = judge([str(tmp_path / "run.mcap")], __version__)
         assert (row["verdict"], row["reason"].startswith("header of the recording")) == ("other version", True)
 
 
@@ -316,6 +319,131 @@ def test_ticks_without_a_snapshot_are_not_verified_and_a_file_without_an_end_is_
     path.write_bytes(pack_file(drop_chunks(base, len(base.chunks) - 1)))
     for row in (replay_verdict(path), summarise_files([str(path)], __version__)):
         assert (row["verdict"], "no recorded end" in row["reason"]) == ("damaged", True)
+
+
+class WorkersHere:
+    """Workers that run each function in the test's process, at once."""
+
+    count, name = 1, "this process"
+
+    def submit(self, function: Any, *arguments: Any) -> Future[Any]:
+        future: Future[Any] = Future()
+        future.set_result(function(*arguments))
+        return future
+
+    def explain(self, error: BaseException) -> BaseException:
+        return error
+
+    def recover(self) -> None:
+        raise NotImplementedError
+
+    def close(self) -> None:
+        raise NotImplementedError
+
+
+class StoredArchive:
+    """An archive below `folder`, whose verdicts are stored."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder, self.out = folder, folder / "out"
+
+    def examine(self, examination: Examination = REPLAY) -> tuple[int, list[str]]:
+        """Examine the archive. Returns the number of stored rows that count, and all verdicts."""
+        recordings = find_recordings([self.folder])
+        report = examine(examination, recordings, WorkersHere(), self.out, lambda _: None, lambda: False)
+        return report["stored"], [row["verdict"] for row in report["verdicts"]]
+
+
+@pytest.fixture
+def stored(good_recording, tmp_path) -> StoredArchive:
+    """An archive of two recordings with stored verdicts, both identical."""
+    for name in ("a.mcap", "b.mcap"):
+        shutil.copy(good_recording, tmp_path / name)
+    archive = StoredArchive(tmp_path)
+    assert archive.examine() == (0, ["identical"] * 2)
+    assert archive.examine() == (2, ["identical"] * 2)
+    return archive
+
+
+def change_unnoticed(path: Path, data: bytes) -> None:
+    """Write other bytes of equal length into a file, with its old times."""
+    before = path.stat()
+    assert len(data) == before.st_size
+    path.write_bytes(data)
+    os.utime(path, ns=(before.st_atime_ns, before.st_mtime_ns))
+
+
+@pytest.mark.parametrize("place", [0.001, 0.3, 0.5, 0.9, 0.9999])
+@pytest.mark.parametrize("examination", [REPLAY, INFO], ids=["replay", "info"])
+def test_a_stored_verdict_does_not_count_after_a_flipped_bit(place: float, examination, stored: StoredArchive):
+    """The size and the times are those of the file that was examined."""
+    stored.examine(examination)
+    path = stored.folder / "b.mcap"
+    data = bytearray(path.read_bytes())
+    data[int(place * len(data))] ^= 16
+    change_unnoticed(path, bytes(data))
+    count, verdicts = stored.examine(examination)
+    assert (count, verdicts[0]) == (1, examination.good_verdict)
+    assert verdicts[1] == examination.function([str(path)], __version__, None)["verdict"]
+
+
+def test_a_stored_verdict_counts_for_equal_content_alone(good_recording, stored: StoredArchive, tmp_path):
+    first, second = stored.folder / "a.mcap", stored.folder / "b.mcap"
+    os.utime(second, (1, 1))
+    assert stored.examine() == (2, ["identical"] * 2)
+    changed = tmp_path / "changed"
+    flip_tick_byte(good_recording, changed)
+    for replace_file in (os.link, os.symlink):
+        first.unlink()
+        replace_file(changed, first)
+        assert stored.examine() == (1, ["damaged", "identical"])
+        first.unlink()
+        replace_file(second, first)
+        assert stored.examine() == (1, ["identical"] * 2)
+    first.unlink()
+    shutil.move(changed, first)
+    stored.examine()
+    first.rename(changed)
+    second.rename(first)
+    changed.rename(second)
+    assert stored.examine() == (0, ["identical", "damaged"])
+
+
+def test_every_file_of_a_rotated_run_is_part_of_its_stored_verdict(tmp_path):
+    record(tmp_path / "run.mcap", eventful_configuration(), 25_000, rotate_s=1.0)
+    archive = StoredArchive(tmp_path)
+    assert (archive.examine(), archive.examine()) == ((0, ["identical"]), (1, ["identical"]))
+    for number in (2, 3):
+        path = tmp_path / f"run-000{number}.mcap"
+        good = path.read_bytes()
+        data = bytearray(good)
+        data[len(data) // 2] ^= 1
+        change_unnoticed(path, bytes(data))
+        assert archive.examine() == (0, ["damaged"])
+        change_unnoticed(path, good)
+        assert archive.examine() == (0, ["identical"])
+
+
+def test_a_damaged_line_of_the_stored_verdicts_does_not_count(good_recording, stored: StoredArchive):
+    flip_tick_byte(good_recording, stored.folder / "b.mcap")
+    assert stored.examine() == (1, ["identical", "damaged"])
+    path = stored.out / REPLAY.file_name
+    whole = path.read_bytes()
+    for change in (
+        whole.replace(b'"damaged"', b'"identical"'),
+        whole.replace(b'"check": "', b'"check": "0'),
+        whole[: -len(whole) // 4],
+    ):
+        assert change != whole
+        path.write_bytes(change)
+        assert stored.examine()[1] == ["identical", "damaged"]
+
+
+def test_a_verdict_of_another_version_does_not_count(stored: StoredArchive, monkeypatch):
+    monkeypatch.setattr("rtloop.campaigns.archive_table.__version__", "99.0")
+    (recording, _) = find_recordings([stored.folder])
+    with open_table([recording], REPLAY.columns, stored.out, REPLAY.file_name) as table:
+        assert table.stored_sha256(recording) is None
 
 
 class PoolBrokenOnce:

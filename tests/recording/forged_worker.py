@@ -61,7 +61,7 @@ def read_executed(path: Path, axes: int) -> ExecutedData:
     with path.open("rb") as file:
         for _, channel, message in NonSeekingReader(file).iter_messages(log_time_order=False):
             if channel.topic == "/ticks":
-                data.ticks.append(_computed_bytes(message.data, axes))
+                data.ticks.append(computed_bytes(message.data, axes))
             elif channel.topic == "/law":
                 data.snapshots.append(message.data)
             elif channel.topic == "/events":
@@ -73,7 +73,7 @@ def read_executed(path: Path, axes: int) -> ExecutedData:
     return data
 
 
-def _computed_bytes(data: bytes, axes: int) -> bytes:
+def computed_bytes(data: bytes, axes: int) -> bytes:
     """Return the bytes of tick, mode and computed signals of a message, whose fields are a tag and eight bytes each."""
     tags = [1 if field < SHORT_TAGS else 2 for field in range(COMMON_COUNT + axes * PER_AXIS_COUNT)]
     starts = [sum(tags[: field + 1]) + 8 * field for field in range(len(tags))]

@@ -5,9 +5,10 @@ from __future__ import annotations
 import copy
 import hashlib
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import fields, replace
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, NamedTuple
 from unittest.mock import patch
 
@@ -19,7 +20,6 @@ from rtloop.engine.commands import send
 from rtloop.engine.messages import Kind, message
 from rtloop.kernel.memory import slot_view
 from rtloop.laws.shipped import transfer
-from rtloop.recording.capture.session import Session
 from rtloop.recording.file.mcap.container import CHUNK_HEAD, MAGIC, pack_chunk, pack_end, pack_message, pack_records
 from rtloop.recording.file.reader import Reader
 from rtloop.recording.file.topics import format
@@ -110,33 +110,42 @@ class Base(NamedTuple):
         return self.replace_payload(i, j, hashlib.sha256(data).digest() + data)
 
 
-def record_bases(folder: Path) -> list[Base]:
-    """Record two good runs and return their parts: one axis with a pre-filter, commands and a trip; two axes."""
+def configuration_texts() -> list[str]:
+    """Return two configurations: one axis with a pre-filter, commands and a trip; two axes."""
     one_axis = changed_configuration(("# taps = [", "taps = ["), ("# [axis.prefilter]", "[axis.prefilter]"))
     entries = ((100, 'mode = "feedforward"'), (180, 'mode = "closed_loop"'),
                (300, 'reference = { kind = "sine", amplitude = 20.0, frequency_hz = 50.0 }'),
                (400, 'mode = "off"'), (450, "reset_trip = true"), (500, 'mode = "raw"'))  # fmt: skip
-    texts = (one_axis + schedule(*entries), TWO_AXES)
-    return [take_apart(_record(folder / f"{i}.mcap", text)) for i, text in enumerate(texts)]
+    return [one_axis + schedule(*entries), TWO_AXES]
 
 
-def _record(path: Path, text: str) -> Path:
-    """Record a short run in many chunks, with a change of the controller. Returns its path."""
-    run = RecordedRun(path, text, paced=False)
+def record_bases(folder: Path) -> list[Base]:
+    """Record a good run of each of `configuration_texts`, and return their parts."""
+    bases = []
+    for number, text in enumerate(configuration_texts()):
+        run = RecordedRun(folder / f"{number}.mcap", text, paced=False)
+        record_run(run)
+        run.session.finish("finished")
+        bases.append(take_apart(run.path))
+    return bases
+
+
+def record_run(
+    run: RecordedRun, end: int = TICKS, chunk_ticks: int = CHUNK_TICKS, snapshot_ticks: int = SNAPSHOT_TICKS
+) -> None:
+    """Execute and record the ticks of a run before `end` in short chunks, with a change of the controller."""
     loop, session = run.loop, run.session
-    loop.take_snapshots_every(SNAPSHOT_TICKS)
-    with patch.object(Session, "write_due", Session._write_all):
-        while loop.tick < TICKS:
+    loop.take_snapshots_every(snapshot_ticks)
+    with patch.object(type(session), "write_due", type(session)._write_all):
+        while loop.tick < end:
             if loop.tick == SWAP_TICK:
                 changed_law = loop.prepared.plan.coefficients.copy()
                 slot_view(changed_law[0], "controller", transfer.COEFFICIENTS).d *= 0.9
                 loop.block["staged"][: changed_law.nbytes] = np.frombuffer(changed_law.tobytes(), np.uint8)
                 send(loop.block, message(Kind.LOAD_LAW, axis=0, values=[1.0]))
-            loop.run(CHUNK_TICKS)
+            loop.run(chunk_ticks)
             session.drain()
             session.write_due()
-    session.finish("finished")
-    return path
 
 
 def take_apart(path: Path) -> Base:
@@ -149,22 +158,29 @@ def take_apart(path: Path) -> Base:
 
 
 def pack_file(
-    base: Base, first: bytes | None = None, forge: Callable[[list[ChunkIndex]], object] = lambda index: None
+    base: Base,
+    first: bytes | None = None,
+    forge: Callable[[list[ChunkIndex]], object] = lambda index: None,
+    hidden: Mapping[int, bytes] = MappingProxyType({}),
+    appended: bytes = b"",
 ) -> bytes:
-    """Pack the file with `first` as the content of its first chunk, if given; `forge` may change the index."""
+    """Pack the file with `first` as the content of its first chunk, if given; `forge` may change the index.
+
+    `hidden` are the records that take the place of the message indexes of some chunks, `appended` those in the summary.
+    """
     start = first_chunk(base.header, base.header["columns"]) if first is None else first
     compressor, index = zstandard.ZstdCompressor(level=1), []
     data = MAGIC + pack_records([Header(format.PROFILE, format.LIBRARY)])
-    for content, channels in (Chunk(start, (format.CONFIGURATION,)), *base.chunks):
-        chunk = pack_chunk(content, 0, LAST_LOG_TIME, compressor)
+    for number, (content, channels) in enumerate((Chunk(start, (format.CONFIGURATION,)), *base.chunks)):
+        chunk, records = pack_chunk(content, 0, LAST_LOG_TIME, compressor), hidden.get(number, b"")
         places = dict.fromkeys(channels, len(data))
-        size = len(chunk) - CHUNK_HEAD.size
-        index.append(ChunkIndex(len(chunk), len(data), "zstd", size, LAST_LOG_TIME, 0, places, 0, len(content)))
-        data += chunk
+        size, start, end = len(chunk) - CHUNK_HEAD.size, len(data), LAST_LOG_TIME
+        index.append(ChunkIndex(len(chunk), start, "zstd", size, end, len(records), places, 0, len(content)))
+        data += chunk + records
     forge(index)
     repeated = [*format.schemas(base.header["columns"]), *format.channels()]
     statistics = Statistics(0, 4, {}, len(index), 0, 0, 0, 0, 3)
-    return data + pack_end(0, len(data), repeated, statistics, pack_records(index))
+    return data + pack_end(0, len(data), repeated, statistics, pack_records(index) + appended)
 
 
 def pack_changed_snapshot(base: Base, field: str, value: float, which: int = 0) -> bytes:

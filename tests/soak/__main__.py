@@ -21,7 +21,7 @@ LONG_TESTS = {
     "fault-mutants": ("tests.faults.mutants", "each planted mistake must fail a row of the fault table; 5 minutes"),
     "fault-pairs": ("tests.faults.pairs", "two faults at once, 100 random pairs; 15 minutes"),
     "flagship": ("tests.soak.flagship", "the paper's loop and the shipped design on one rig; 10 minutes"),
-    "forged": ("tests.soak.forged", "10,000 forged recordings through every command; 1 hour"),
+    "forged": ("tests.soak.forged", "500 forged recordings by 1 to 16 jobs, 10,000 through every command; 1 hour"),
     "laws": ("tests.soak.laws", "1,000 live changes of every shipped controller; 15 minutes a seed"),
     "live-changes": ("tests.soak.live_changes", "random changes for 10^8 ticks; 10 minutes, 1 GB"),
     "netem": ("tests.soak.netem", "the driver udp behind tc netem, counted on both sides (root); 5 minutes"),

@@ -1,6 +1,8 @@
-"""Thousands of forged recordings through every command, in worker processes: `… [COUNT] [FIRST]`.
+"""Hundreds of recordings forged for replays by several jobs, then thousands through every command: `… [COUNT] [FIRST]`.
 
-When a worker dies, the file that it had begun is reported, and another worker continues with the next file.
+The first ones get the same answer for 1, 2, 3, 4 and 16 jobs, and none that is too good; COUNT 0 leaves the others out.
+The others run in worker processes. When a worker dies, the file that it had begun is reported, and another worker
+continues with the next file.
 """
 
 from __future__ import annotations
@@ -14,11 +16,14 @@ import time
 from collections import Counter, defaultdict
 from pathlib import Path
 
+from tests.recording.forged_cuts import JOBS, check, record_originals
 from tests.recording.forged_worker import CODES
 
 ROOT = Path(__file__).resolve().parents[2]
 COUNT, BATCH, EVERY = 10_000, 500, 40
 """Files; files of a worker; one in so many also runs the slow commands."""
+CUT_COUNT, CUT_EVERY = 500, 25
+"""Recordings for replays by several jobs; one in so many is replayed by the command, too."""
 MAX_MIB = 600
 
 
@@ -75,6 +80,25 @@ def run_worker(table: Table, first: int, count: int) -> int:
     return max(last_done, int(str(current["number"]))) + 1
 
 
+def check_jobs(count: int) -> int:
+    """Replay `count` recordings, forged where spans are cut, by several jobs. Returns the number of wrong answers."""
+    faults, identical, begin_s = [], 0, time.monotonic()
+    with tempfile.TemporaryDirectory(dir=_memory_folder()) as name:
+        originals = record_originals(Path(name))
+        for number in range(count):
+            fault, is_identical = check(originals, Path(name), number, number % CUT_EVERY == 0)
+            identical += is_identical
+            if fault:
+                faults.append(fault)
+                print(fault, flush=True)
+    print(
+        f"{count} recordings by {', '.join(map(str, JOBS))} jobs in {time.monotonic() - begin_s:.0f} s: "
+        f"{identical} identical, {len(faults)} wrong",
+        flush=True,
+    )
+    return len(faults)
+
+
 def _memory_folder() -> str | None:
     """Return a folder in memory, None where there is none."""
     return "/dev/shm" if Path("/dev/shm").is_dir() else None
@@ -83,6 +107,7 @@ def _memory_folder() -> str | None:
 def main() -> int:
     """Print the outcomes; return 1 for a fault, or a worker that needed more than MAX_MIB."""
     count, first = (int(word) for word in (*sys.argv[1:], *(str(COUNT), "0")[len(sys.argv) - 1 :]))
+    wrong = check_jobs(CUT_COUNT)
     table, number, begin_s = Table(), first, time.monotonic()
     while number < first + count:
         number = run_worker(table, number, min(BATCH, first + count - number))
@@ -90,7 +115,7 @@ def main() -> int:
             f"{number - first} of {count} in {time.monotonic() - begin_s:.0f} s, {len(table.faults)} wrong", flush=True
         )
     table.show()
-    return 1 if table.faults or table.peak_mib > MAX_MIB else 0
+    return 1 if wrong or table.faults or table.peak_mib > MAX_MIB else 0
 
 
 if __name__ == "__main__":

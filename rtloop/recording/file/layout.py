@@ -8,7 +8,7 @@ from rtloop.recording.file.mcap.chunks import ChunkEntry, McapSource, read_chunk
 from rtloop.recording.file.mcap.container import MAGIC, DamagedChunk, unpack_chunk
 from rtloop.recording.file.mcap.stock import library_name
 from rtloop.recording.file.topics import format
-from rtloop.recording.file.topics.contents import read_chunk
+from rtloop.recording.file.topics.contents import may_hold, read_chunk, starts_with_tick
 from rtloop.recording.file.topics.header import header_payload, read_header
 
 OWN_LIBRARIES = (format.LIBRARY, "")
@@ -38,7 +38,10 @@ class OwnLayout:
 
         Raises DamagedChunk if it is damaged or contradicts the index, RecordingError if the file cannot be read.
         """
-        return unpack_chunk(read_chunk(self._source, entry))
+        content = unpack_chunk(read_chunk(self._source, entry))
+        if entry.index and starts_with_tick(content) != may_hold(entry, format.TICKS):
+            raise DamagedChunk("ticks are where the index of the file names other messages, or the reverse")
+        return content
 
     @property
     def is_mixed(self) -> bool:

@@ -224,7 +224,16 @@ class Reader:
         Events of the loop that are read from another file of the run are left out. Damage is listed in `problems`, or
         raises RecordingError unless the reader is tolerant.
         """
-        return [event for event in self._events if event["who"] == RECORDER or self.owns(event["tick"])]
+        return [event for event in self._events if self._is_own(event)]
+
+    @property
+    def repeated_events(self) -> list[Event]:
+        """Events of the loop that are read from another file of the run; see `events`."""
+        return [event for event in self._events if not self._is_own(event)]
+
+    def _is_own(self, event: Event) -> bool:
+        """Whether an event is read from this file of the run."""
+        return event["who"] == RECORDER or self.owns(event["tick"])
 
     @cached_property
     def _events(self) -> list[Event]:
@@ -359,6 +368,8 @@ class Reader:
                     _require_digest(message)
                 elif message.channel == format.OVERVIEW:
                     self._overview_layout.require_overview(message.payload)
+                elif message.channel != format.CONFIGURATION:
+                    raise MalformedText(f"a message of channel {message.channel} is none of the recording's topics")
                 valid.append(message)
             except ValueError as reason:
                 is_event = message.channel == format.EVENTS

@@ -7,8 +7,10 @@ the next snapshot.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import closing, contextmanager
+from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
@@ -24,7 +26,7 @@ from rtloop.recording.file.run_readers import ReportTicks
 from rtloop.recording.file.topics.events import GAP, RECOVERED, Event, json_value, message_from_event
 from rtloop.recording.file.topics.overview import uncovered_ranges
 from rtloop.recording.file.topics.validation import header_extras
-from rtloop.recording.load import Recording
+from rtloop.recording.load import Recording, load
 from rtloop.recording.replay.kernels import first_unequal
 from rtloop.recording.replay.laws import NO_TRUST, TrustedLaws, recorded_laws
 from rtloop.recording.replay.rerun import RecordedInputs, Rerun, Rows
@@ -85,19 +87,33 @@ def recorded_commands(recording: Recording, kinds: Sequence[Kind]) -> npt.NDArra
     return schedule
 
 
-def misplaced_command(events: Sequence[Event]) -> int | None:
-    """Tick of the first command to the law that is recorded twice, or after one of a later tick; None if none is."""
+def misplaced_command(recording: Recording) -> int | None:
+    """Tick of the first command to the law that is recorded twice, after one of a later tick, or after the run's end.
+
+    None if none is. A command that a second file of the run holds too must be equal there.
+    """
+    last = recording.extents[-1].totals
+    end_tick = last["ticks_executed"] if last and last["result"] != RECOVERED else math.inf
     last_tick, executed_keys = 0, set()
-    for event in events:
+    for event in recording.events:
         if event["kind"] not in LAW_COMMAND_NAMES:
             continue
-        details = event["what"]
-        key = (event["tick"], event["kind"], event["axis"], details["identity"], *map(float, details["values"]))
-        if key in executed_keys or event["tick"] < last_tick:
+        key = _command_key(event)
+        if key in executed_keys or not last_tick <= event["tick"] <= end_tick:
             return int(event["tick"])
         executed_keys.add(key)
         last_tick = event["tick"]
+    for event in recording.repeated_events:
+        if event["kind"] in LAW_COMMAND_NAMES and _command_key(event) not in executed_keys:
+            return int(event["tick"])
     return None
+
+
+def _command_key(event: Event) -> tuple[object, ...]:
+    """Return the fields by which two events are the same command; numbers as text, in which NaN equals NaN."""
+    details = event["what"]
+    values = (repr(float(value)) for value in details["values"])
+    return event["tick"], event["kind"], event["axis"], details["identity"], *values
 
 
 def split_at_gaps(rows: Rows) -> list[Rows]:
@@ -131,8 +147,10 @@ class Replay:
         self.report = ReplayReport(problems=recording.problems, not_judged=unjudged_contents(recording.header))
         self._tick_count = 0
         self._gaps = [event["what"] for event in recording.events if event["kind"] == GAP]
-        if (tick := misplaced_command(recording.events)) is not None:
-            self.report.add_unverified(tick, None, "a command is recorded twice, or after a later command")
+        if (tick := misplaced_command(recording)) is not None:
+            self.report.add_unverified(
+                tick, None, "a command is recorded twice, after a later command, or after the end of the run"
+            )
 
     def run(self) -> ReplayReport:
         """Replay all ticks, up to the first difference; without one, check the totals too. Returns `report`.
@@ -162,6 +180,7 @@ class Replay:
                 "where a replay starts; record at least a second more"
             )
         self._check_totals(expected)
+        self._check_repetitions()
         return self.report
 
     def run_rows(self, blocks: Iterable[Rows], first_tick: int) -> int | None:
@@ -226,6 +245,32 @@ class Replay:
         if self._tick_count == ticks_logged and last["result"] != RECOVERED:  # The rest was never recorded.
             self._gaps.append({"first_tick": expected, "count": last["ticks_executed"] - expected})
         self._account_gap(expected, last["ticks_executed"])
+
+    def _check_repetitions(self) -> None:
+        """Report the ticks that a file repeats, and that differ there from those of the earlier file.
+
+        The file is replayed alone, from its first snapshot to the first one after the repetition.
+        """
+        for path, extent in zip(self._recording.paths, self._recording.extents, strict=True):
+            if extent.repeated and not self._is_identical_alone(path, extent.first_tick):
+                first_tick = extent.first_tick - extent.repeated
+                reason = f"{path.name} repeats these ticks of an earlier file, and they are not identical there"
+                self.report.add_unverified(first_tick, extent.repeated, reason)
+
+    def _is_identical_alone(self, path: Path, end: int) -> bool:
+        """Whether a file alone is identical, from its first tick to the first snapshot after `end`, or to its end."""
+        part = load(path)
+        tick, snapshots = part.extents[0].first_tick, -1
+        with closing(part.snapshots()) as recorded, closing(part.blocks(ahead=False)) as blocks:
+            part_replay = Replay(part, self._laws, recorded, None)
+            for rows in blocks:
+                if tick >= end and snapshots < 0:
+                    snapshots = part_replay.report.snapshots
+                if 0 <= snapshots < part_replay.report.snapshots:
+                    break
+                if (tick := part_replay.run_rows([rows], tick) or -1) < 0:
+                    return False
+        return part_replay.report.identical and not part.left_out
 
     def _replay_rows(self, rows: Rows) -> None:
         """Replay consecutive rows from snapshot to snapshot, up to the first difference.

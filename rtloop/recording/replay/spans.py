@@ -1,9 +1,10 @@
 """Replay of a whole recording in spans at once, one process each.
 
-A span runs from the law's snapshot at its first tick, and ends by comparing its state with the snapshot from which the
-next span starts, in bytes: all spans together compare the same data as a replay in one piece. Only a recording that is
-finished, complete and identical gets its answer here; any other one is replayed in one piece, which finds the first
-difference and reports it.
+A cut between two spans is a place in the files: a chunk, and in it the tick of a snapshot. The earlier span executes
+all chunks up to that one, in the order of the files, and in it the ticks up to the snapshot, whose state it compares in
+bytes; the later span starts there. So no chunk is left out, whatever its ticks claim, and all spans together compare
+the same data as a replay in one piece. Only a recording that is finished, complete and identical gets its answer here;
+any other one is replayed in one piece, which finds the first difference and reports it.
 """
 
 from __future__ import annotations
@@ -12,12 +13,15 @@ import multiprocessing
 import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import closing
+from itertools import groupby
 from multiprocessing.connection import Connection
+from operator import itemgetter
 from typing import NamedTuple
 
 from rtloop import signals
 from rtloop.errors import RtloopError
 from rtloop.laws.registry import LawReference
+from rtloop.recording.file.mcap.chunks import ChunkEntry
 from rtloop.recording.file.reader import Reader, Snapshot
 from rtloop.recording.file.run_readers import ReportTicks, open_run
 from rtloop.recording.file.topics.events import GAP, RECOVERED
@@ -32,22 +36,31 @@ LEAST_CHUNKS = 8
 """Chunks of ticks of a span, at least: a process costs as much as the replay of a few of them."""
 
 
-class Span(NamedTuple):
-    """Ticks from the snapshot at `first_tick` up to the one at `last_tick`, at which the next span begins.
+class Cut(NamedTuple):
+    """The beginning of a span: its first `tick`, which has a snapshot, in chunk number `chunk`.
 
-    Both spans execute `last_tick`, which is None for the last span. `first_tick` lies in chunk number `chunk` or a
-    later one; chunks with ticks are counted from 0 over all files.
+    Chunks with ticks are counted from 0 over all files.
     """
 
     chunk: int
-    first_tick: int
-    last_tick: int | None
+    tick: int
+
+
+class Span(NamedTuple):
+    """Ticks from one cut up to and including that of the next one, which both spans execute; None for the last span."""
+
+    begin: Cut
+    end: Cut | None
 
 
 class SpanCounts(NamedTuple):
-    """Counts of an identical span without the next one's first tick: ticks, snapshots, and the tick after the last."""
+    """Counts of an identical span: ticks, ticks of each file, and snapshots; then the tick after the last one.
+
+    The tick of the next span's cut is left out.
+    """
 
     ticks: int
+    file_ticks: list[int]
     snapshots: int
     end_tick: int
 
@@ -74,7 +87,7 @@ def _replay_in_spans(
     if not _is_plain(recording):
         return None
     totals = [extent.totals for extent in recording.extents if extent.totals]
-    ticks_logged, ticks_executed = sum(total["ticks_logged"] for total in totals), totals[-1]["ticks_executed"]
+    logged, ticks_executed = [total["ticks_logged"] for total in totals], totals[-1]["ticks_executed"]
     with closing(recording.snapshots()) as recorded:
         snapshot_ticks = [snapshot.tick for snapshot in recorded]
     inner_ticks = [tick for tick in snapshot_ticks if tick < ticks_executed]
@@ -82,18 +95,17 @@ def _replay_in_spans(
     if len(spans) < 2:
         return None
     counts = _run_spans(recording, laws, spans, progress)
-    if any(count is None for count in counts):
-        return None
     done = [count for count in counts if count is not None]
-    ends = [span.last_tick for span in spans[:-1]] + [ticks_executed]
+    ends = [*(span.end.tick for span in spans if span.end), ticks_executed]
+    if [count.end_tick for count in done] != ends:
+        return None
     ticks, snapshots = sum(count.ticks for count in done), sum(count.snapshots for count in done)
+    file_ticks = [sum(numbers) for numbers in zip(*(count.file_ticks for count in done), strict=True)]
     # the first span starts from the first snapshot; one that follows the last tick is not compared
     compared = len(inner_ticks) - 1
-    if [count.end_tick for count in done] != ends or ticks != ticks_logged or snapshots != compared:
+    if ticks != sum(logged) or file_ticks != logged or snapshots != compared:
         return None
-    if snapshot_ticks[-1] > ticks_executed:
-        return None
-    if recording.problems:
+    if snapshot_ticks[-1] > ticks_executed or recording.problems:
         return None
     return ReplayReport(ticks=ticks, stretches=1, snapshots=snapshots, not_judged=unjudged_contents(recording.header))
 
@@ -102,7 +114,7 @@ def _is_plain(recording: Recording) -> bool:
     """Whether a recording may be replayed in spans: all its files are finished, and nothing in it needs an explanation.
 
     Excluded are recovered files, gaps, ticks that two files hold or that overviews replace, problems of the reader, and
-    commands that are recorded twice or out of order.
+    commands that are recorded twice, out of order or after the end.
     """
     return (
         all(extent.totals and extent.totals["result"] != RECOVERED for extent in recording.extents)
@@ -110,33 +122,52 @@ def _is_plain(recording: Recording) -> bool:
         and not recording.problems
         and not recording.skipped
         and not any(event["kind"] == GAP for event in recording.events)
-        and misplaced_command(recording.events) is None
+        and misplaced_command(recording) is None
     )
 
 
 def _find_spans(recording: Recording, jobs: int, snapshot_ticks: Sequence[int]) -> list[Span]:
     """Return up to `jobs` spans of about equally many chunks, at least LEAST_CHUNKS each.
 
-    [] for fewer chunks in all, a damaged chunk in which a span would begin, or a first tick without a snapshot.
-    `snapshot_ticks` are the ticks of the snapshots, ascending, without a snapshot that follows the last tick.
+    [] for fewer chunks in all, a damaged chunk in which a span would begin, or a first tick that has no snapshot or is
+    not the first one of the recording. `snapshot_ticks` are the ticks of the snapshots, ascending, without a snapshot
+    that follows the last tick.
     """
-    starts: list[tuple[int, int]] = []
     with open_run(recording.paths) as readers:
-        chunks = [(reader, entry) for reader in readers for entry in reader.tick_chunks]
+        chunks = _tick_chunks(readers)
         count = min(jobs, len(chunks) // LEAST_CHUNKS)
+        cuts: list[Cut] = []
         for number in range(count):
-            chunk = number * len(chunks) // count
-            reader, entry = chunks[chunk]
-            ticks = reader.chunk(entry)
-            if not isinstance(ticks, Ticks):
+            cut = _find_cut(chunks, number * len(chunks) // count, snapshot_ticks)
+            if number == 0 and cut != Cut(0, recording.extents[0].first_tick):
                 return []
-            start = next((tick for tick in snapshot_ticks if tick >= ticks.first), None)
-            if number == 0 and start != ticks.first:
-                return []
-            if start is not None and (not starts or start > starts[-1][1]):
-                starts.append((chunk, start))
-    ends = [*(start for _, start in starts[1:]), None]
-    return [Span(chunk, first_tick, end) for (chunk, first_tick), end in zip(starts, ends, strict=False)]
+            if cut and (not cuts or cut.tick > cuts[-1].tick):
+                cuts.append(cut)
+    return [*map(Span, cuts, [*cuts[1:], None])]
+
+
+def _tick_chunks(readers: Sequence[Reader]) -> list[tuple[Reader, ChunkEntry]]:
+    """Return all chunks that may hold ticks, each with its reader; `readers` and chunks are in the order of the run."""
+    return [(reader, entry) for reader in readers for entry in reader.tick_chunks]
+
+
+def _find_cut(chunks: Sequence[tuple[Reader, ChunkEntry]], number: int, snapshot_ticks: Sequence[int]) -> Cut | None:
+    """Return the first snapshot in chunk `number` or a later one, with the chunk that holds its tick.
+
+    None without one, and for a damaged or missing chunk up to there.
+    """
+    tick = None
+    for place, (reader, entry) in enumerate(chunks[number:], number):
+        ticks = reader.chunk(entry)
+        if not isinstance(ticks, Ticks):
+            return None
+        if tick is None:
+            tick = next((tick for tick in snapshot_ticks if tick >= ticks.first), None)
+        if tick is None or tick < ticks.first:
+            return None
+        if tick <= ticks.last:
+            return Cut(place, tick)
+    return None
 
 
 def _run_spans(
@@ -195,38 +226,42 @@ def _replay_span(
     try:
         with closing(recording.snapshots()) as snapshots, open_run(recording.paths) as readers:
             span_replay = Replay(recording, laws, _within(snapshots, span), progress)
-            end_tick = span_replay.run_rows(_span_rows(readers, span), span.first_tick)
+            file_ticks = [0] * len(readers)
+            end_tick = span_replay.run_rows(_span_rows(readers, span, file_ticks), span.begin.tick)
             is_clean = not any(reader.problems or reader.left_out for reader in readers)
     except RtloopError:
         return None
     report = span_replay.report
     if end_tick is None or not report.identical or not is_clean:
         return None
-    if span.last_tick is None:
-        return SpanCounts(report.ticks, report.snapshots, end_tick)
-    return SpanCounts(report.ticks - 1, report.snapshots, end_tick - 1)
+    repeated = int(span.end is not None)
+    return SpanCounts(report.ticks - repeated, file_ticks, report.snapshots, end_tick - repeated)
 
 
 def _within(snapshots: Iterator[Snapshot], span: Span) -> Iterator[Snapshot]:
     """Yield those of `snapshots` (ascending) that belong to a span, both ends included."""
     for snapshot in snapshots:
-        if span.last_tick is not None and snapshot.tick > span.last_tick:
+        if span.end is not None and snapshot.tick > span.end.tick:
             return
-        if snapshot.tick >= span.first_tick:
+        if snapshot.tick >= span.begin.tick:
             yield snapshot
 
 
-def _span_rows(readers: Sequence[Reader], span: Span) -> Iterator[Rows]:
-    """Yield blocks of rows for the ticks of a span, both ends included; `readers` are in the order of the run."""
-    chunks_before = span.chunk
-    for reader in readers:
-        entries = reader.tick_chunks[chunks_before:]
-        chunks_before = max(chunks_before - len(reader.tick_chunks), 0)
-        for rows in reader.blocks(None, entries, ahead=False):
-            ticks = rows[:, signals.TICK]
-            begin = int((ticks < span.first_tick).sum())
-            end = len(rows) if span.last_tick is None else int((ticks <= span.last_tick).sum())
-            if begin < end:
-                yield rows[begin:end]
-            if end < len(rows):
-                return
+def _span_rows(readers: Sequence[Reader], span: Span, file_ticks: list[int]) -> Iterator[Rows]:
+    """Yield blocks of rows: all ticks of the chunks of a span, but of its first and last chunk only those inside it.
+
+    `readers` are in the order of the run. Adds the number of ticks before the span's end to `file_ticks`, by file.
+    """
+    chunks, (begin, end) = _tick_chunks(readers), span
+    parts = [(chunks[begin.chunk : end and end.chunk], False)] + ([([chunks[end.chunk]], True)] if end else [])
+    is_first = True
+    for part, is_last in parts:
+        for reader, group in groupby(part, itemgetter(0)):
+            for rows in reader.blocks(None, [entry for _, entry in group], ahead=False):
+                if is_first:
+                    rows, is_first = rows[int((rows[:, signals.TICK] < begin.tick).sum()) :], False
+                if end and is_last:
+                    rows = rows[: int((rows[:, signals.TICK] <= end.tick).sum())]
+                file_ticks[readers.index(reader)] += len(rows) - is_last
+                if len(rows):
+                    yield rows

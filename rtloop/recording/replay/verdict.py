@@ -87,7 +87,7 @@ def unjudged_contents(header: Header) -> list[str]:
         "inputs, where no output depends on them: adc_v, reference_um, feed_um, deadline_ns, periods_missed, "
         "sample_age_us, enable_v",
         f"observed signals: {', '.join(header['observed']) or 'there are none'}",
-        "events other than commands to the law, such as generators of references; texts, who, time_ns and identity of "
-        "events",
+        "events other than commands to the law, such as generators of references; commands that change no output, or "
+        "up to the first recorded tick; texts, who, time_ns and identity of events",
         "the state that the first snapshot starts from; the configuration's text",
     ]

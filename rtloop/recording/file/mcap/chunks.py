@@ -137,6 +137,22 @@ def _require_contiguous(source: McapSource, indexes: Sequence[IndexedChunk], end
         raise DamagedChunk("the chunk index at the end of the file does not match its data")
 
 
+def require_message_indexes(source: McapSource, entry: ChunkEntry) -> None:
+    """Raise DamagedChunk unless only message indexes lie where the index of the file puts those of a chunk.
+
+    Without an entry of the index nothing is checked. Raises RecordingError if the file cannot be read.
+    """
+    position = entry.offset + entry.length
+    end = position + (entry.index.index_length if entry.index else 0)
+    while position < end:
+        chunk, length = _parse_record(source, position)
+        if chunk or not length:
+            break
+        position += length
+    if position != end:
+        raise DamagedChunk("the message indexes behind it are damaged, or other data")
+
+
 def scan_chunks(source: McapSource, position: int = len(MAGIC)) -> tuple[list[ChunkEntry], list[str]]:
     """Scan the file from the record at `position` to the end of its data. Returns the whole chunks and the faults.
 
@@ -153,6 +169,8 @@ def scan_chunks(source: McapSource, position: int = len(MAGIC)) -> tuple[list[Ch
             position += length
             continue
         if source.read(position, 1) == bytes([Opcode.DATA_END]):
+            if _next_chunk(source, position) is not None:
+                problems.append("chunks follow the end of the data")
             break
         next_offset = _next_chunk(source, position + 1)
         if next_offset is None:

@@ -147,7 +147,7 @@ def unpack_chunk(record: bytes) -> bytes:
         # The size in the frame is checked first, so that a damaged frame cannot allocate all the memory.
         if zstandard.get_frame_parameters(data).content_size != head.uncompressed:
             raise DamagedChunk("the compressed data and the header give different sizes")
-        content = _decompressors.of_thread.decompress(data)
+        content = _decompressors.of_thread.decompress(data, allow_extra_data=False)
     except zstandard.ZstdError:
         raise DamagedChunk("cannot be decompressed") from None
     if crc32(content) != head.crc:
@@ -203,18 +203,20 @@ def parse_summary(data: bytes) -> tuple[IndexedChunk, ...]:
     """Parse the chunk indexes in `data`: the summary section and the footer, without the magic bytes behind it.
 
     The result of the newest `data` is cached: a replay opens its file several times, and forked processes inherit the
-    cache. Raises DamagedChunk if the checksum differs or an index record cannot be read.
+    cache. Raises DamagedChunk if the checksum differs, an index record cannot be read, or the summary holds data.
     """
     (crc,) = struct.unpack_from("<I", data, len(data) - 4)
     if crc32(data[:-4]) != crc:
         raise DamagedChunk("the checksum of the index at the end of the file is wrong")
     known_channels: dict[tuple[int, ...], tuple[int, ...]] = {}
+    indexes = []
     try:
-        return tuple(
-            _parse_chunk_index(content, known_channels)
-            for opcode, content in split_records(data[:-FOOTER_BYTES])
-            if opcode == Opcode.CHUNK_INDEX
-        )
+        for opcode, content in split_records(data[:-FOOTER_BYTES]):
+            if opcode == Opcode.CHUNK_INDEX:
+                indexes.append(_parse_chunk_index(content, known_channels))
+            elif opcode in (Opcode.CHUNK, Opcode.MESSAGE):
+                raise DamagedChunk("chunks or messages follow the end of the data")
+        return tuple(indexes)
     except struct.error as error:
         raise DamagedChunk(f"the chunk index cannot be read ({error})") from None
 

@@ -11,7 +11,7 @@ from typing import NamedTuple
 from mcap.opcode import Opcode
 
 from rtloop.foundation.trusted import open_without_link
-from rtloop.recording.file.mcap.chunks import ChunkEntry, McapSource, scan_chunks
+from rtloop.recording.file.mcap.chunks import ChunkEntry, McapSource, require_message_indexes, scan_chunks
 from rtloop.recording.file.mcap.container import (
     MESSAGE_HEAD,
     PREFIX,
@@ -69,8 +69,9 @@ def overlaps(entry: ChunkEntry, start_ns: float, end_ns: float) -> bool:
 def read_chunk(source: McapSource, entry: ChunkEntry) -> bytes:
     """Return a chunk record of the file, still compressed.
 
-    Raises DamagedChunk if its beginning is damaged or contradicts the index, which has a checksum; without an index
-    entry it is not checked. Raises RecordingError if the file cannot be read.
+    Raises DamagedChunk if its beginning is damaged or contradicts the index, which has a checksum, or if other data
+    than message indexes follows it; without an index entry neither is checked. Raises RecordingError if the file cannot
+    be read.
     """
     record = source.read(entry.offset, entry.length)
     if entry.index:
@@ -79,6 +80,7 @@ def read_chunk(source: McapSource, entry: ChunkEntry) -> bytes:
             raise DamagedChunk(
                 "the header of a data block is damaged: its times or its size differ from the file's index"
             )
+        require_message_indexes(source, entry)
     return record
 
 
@@ -104,11 +106,16 @@ def accounts_for_ticks(content: bytes) -> bool:
 
 
 def split_messages(content: bytes) -> list[Message]:
-    """Split an unpacked chunk without ticks into its messages. Raises DamagedChunk for a cut-off record."""
-    head = MESSAGE_HEAD.size - PREFIX.size
+    """Split an unpacked chunk without ticks into its messages.
+
+    Raises DamagedChunk for a cut-off record, and one that no chunk may hold.
+    """
+    head, records = MESSAGE_HEAD.size - PREFIX.size, list(split_records(content))
+    if unknown := {opcode for opcode, _ in records} - {Opcode.MESSAGE, Opcode.SCHEMA, Opcode.CHANNEL}:
+        raise DamagedChunk(f"contains a record of type {min(unknown)}; allowed: messages, schemas and channels")
     return [
         Message(_channel(record), int.from_bytes(record[6:14], "little"), record[head:])
-        for opcode, record in split_records(content)
+        for opcode, record in records
         if opcode == Opcode.MESSAGE
     ]
 
