@@ -38,7 +38,7 @@ HEADERS = {
 
 
 class Session:
-    """The panel's token, and the secret of the session that the token opens; all pages share it until the panel ends."""
+    """The panel's token, and the secret of the session that it opens, which all pages share until the panel ends."""
 
     def __init__(self, token: str) -> None:
         self._token, self._secret = token, secrets.token_urlsafe(TOKEN_BYTES)
