@@ -85,7 +85,7 @@ def application(service: Service, session: Session, viewers_token: str | None = 
         except (ValueError, RequestRefused):
             message = None
         token = message.get("token") if isinstance(message, dict) else None
-        secret = session.open(token) if isinstance(token, str) else None
+        secret = session.secret_for(token) if isinstance(token, str) else None
         if secret is None:
             raise RequestRefused(
                 401, "token: not the token of the running panel; open the address that `rtloop panel` printed"

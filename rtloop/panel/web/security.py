@@ -43,7 +43,7 @@ class Session:
     def __init__(self, token: str) -> None:
         self._token, self._secret = token, secrets.token_urlsafe(TOKEN_BYTES)
 
-    def open(self, token: str) -> str | None:
+    def secret_for(self, token: str) -> str | None:
         """Return the secret of the session; None for a wrong token."""
         return self._secret if hmac.compare_digest(token.encode(errors="replace"), self._token.encode()) else None
 

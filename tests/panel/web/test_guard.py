@@ -11,7 +11,7 @@ from rtloop.panel.web.security import Guard, Session
 
 PANEL = "127.83.12.9:8321"
 SESSION = Session("the-token-of-this-panel")
-SECRET = SESSION.open("the-token-of-this-panel") or ""
+SECRET = SESSION.secret_for("the-token-of-this-panel") or ""
 PAGE = {"host": PANEL, "origin": f"http://{PANEL}", "sec-fetch-site": "same-origin"}
 COOKIES = {"cookie": f"rtloop-8321={SECRET}; rtloop={SECRET}; session={SECRET}"}
 
