@@ -91,7 +91,7 @@ def test_a_page_whose_panel_has_died_sends_its_secret_to_nobody_else(browser: An
     process.kill()
     process.wait()
     page.wait_for_selector("body.stale")
-    page.wait_for_function("sessionStorage.length === 0")  # A reload may load another server's page.
+    page.wait_for_function("() => sessionStorage.length === 0")  # A reload may load another server's page.
     with server_of_another_user(str(panel.hostname), int(panel.port or 0)) as (_, received):
         requests = [received.readline() for _ in range(8)]
         page.wait_for_selector("#token-dialog[open]")
@@ -121,5 +121,5 @@ def test_a_second_tab_and_a_reload_need_no_token_and_a_download_has_the_bytes_of
     file = next((bench.folder / "recordings").glob(f"{row.locator('th').inner_text().removesuffix('.part')}*"))
     assert download.value.path().read_bytes()[:8] == file.read_bytes()[:8] == b"\x89MCAP0\r\n"
     row.get_by_role("button", name="Plot of").click()
-    tab.wait_for_function("document.querySelector('#recording-shown img')?.naturalWidth > 0")
+    tab.wait_for_function("() => document.querySelector('#recording-shown img')?.naturalWidth > 0")
     tab.close()
