@@ -12,6 +12,7 @@ import threading
 from collections.abc import Callable
 from concurrent.futures import Executor, Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
+from ipaddress import ip_address
 from typing import Any, Literal, Protocol, TypeVar
 
 from rtloop.errors import MissingExtra, UnavailableError
@@ -20,6 +21,7 @@ from rtloop.version import __version__
 
 Result = TypeVar("Result")
 StartMethod = Literal["forkserver", "spawn"]
+START = "start it with `dask scheduler --host 127.0.0.1`"
 CONNECT_S = 10.0
 """Time after which a scheduler that does not answer counts as unreachable."""
 
@@ -144,19 +146,20 @@ class DaskWorkers:
         self._owns_client = not isinstance(scheduler, Client)
         if self._owns_client:
             _require_reachable(scheduler)
+            _require_encryption(scheduler)
             for name in NOISY_LOGGERS:
                 logging.getLogger(name).setLevel(logging.CRITICAL)
             try:
                 scheduler = Client(scheduler, timeout=CONNECT_S, set_as_default=False)
             except (OSError, ValueError, TimeoutError) as error:
-                raise UnavailableError(f"scheduler {scheduler}: {error}; start it with `dask scheduler`") from None
+                raise UnavailableError(f"scheduler {scheduler}: {error}; {START}") from None
         self._client: Any = scheduler
         self.count = sum(self._client.nthreads().values())
         self.name = f"Dask scheduler {self._client.scheduler.address}, dashboard {self._client.dashboard_link}"
         if not self.count:
             self.close()
             raise UnavailableError(
-                f"{self.name}: no worker is connected; start `dask worker --nthreads 1` with this scheduler's address"
+                f"{self.name}: no worker is connected; start `dask worker ADDRESS --host 127.0.0.1 --nthreads 1`"
             )
         self._require_versions()
         self._executor = self._client.get_executor(pure=False)
@@ -186,6 +189,17 @@ class DaskWorkers:
         if mismatches:
             self.close()
             raise UnavailableError(f"{self.name}: {'; '.join(mismatches)}; install rtloop {__version__} there")
+
+    def warnings(self) -> list[str]:
+        """Return a warning if other hosts may reach the scheduler or a worker, as Dask's default is, without TLS."""
+        addresses = [self._client.scheduler_info()["address"], *self._client.nthreads()]
+        if not (exposed := [address for address in addresses if is_exposed(address)]):
+            return []
+        more = f" and {len(exposed) - 1} more addresses" if len(exposed) > 1 else ""
+        return [
+            f"Dask at {exposed[0]}{more}: open to other hosts without TLS; who reaches it can run any program as the "
+            "user of the scheduler, of its workers and of this command; use --host 127.0.0.1 or TLS: docs/campaigns.md"
+        ]
 
     def submit(self, function: Callable[..., Result], *arguments: object) -> Future[Result]:
         """Start a function of a module in one of the scheduler's workers; return the future of its result."""
@@ -218,6 +232,38 @@ class DaskWorkers:
             self._client.close()
 
 
+def is_exposed(address: str) -> bool:
+    """Return whether another host may reach an address of Dask, such as tcp://HOST:PORT, that needs no certificate."""
+    scheme, _, place = address.partition("://")
+    if scheme in ("tls", "wss", "inproc"):
+        return False
+    host = place.rpartition(":")[0].strip("[]")
+    try:
+        return not ip_address(host).is_loopback
+    except ValueError:
+        return host != "localhost"
+
+
+def _require_encryption(address: str) -> None:
+    """Raise UnavailableError for an address with TLS if Dask's configuration has no usable certificate, and for one
+    without TLS if it requires TLS.
+    """
+    from distributed.security import Security
+
+    has_tls = address.startswith("tls:")
+    try:
+        security = Security()
+        has_certificate = security.get_connection_args("client").get("ssl_context") is not None
+    except (OSError, TypeError, ValueError) as error:
+        raise UnavailableError(f"scheduler {address}: Dask's certificate cannot be read: {error}") from None
+    if security.require_encryption and not has_tls:
+        raise UnavailableError(f"scheduler {address}: Dask's configuration requires TLS; allowed: tls://HOST:PORT")
+    if has_tls and not has_certificate:
+        raise UnavailableError(
+            f"scheduler {address}: Dask has no certificate here; set distributed.comm.tls, as docs/campaigns.md shows"
+        )
+
+
 def _require_reachable(address: str) -> None:
     """Raise UnavailableError unless `address` is tcp://HOST:PORT or tls://HOST:PORT, and a process listens there."""
     form = re.fullmatch(r"(?:tcp|tls)://(\[[^\]]+\]|[^:/]+):(\d{1,5})", address)
@@ -227,4 +273,4 @@ def _require_reachable(address: str) -> None:
         socket.create_connection((form[1].strip("[]"), int(form[2])), CONNECT_S).close()
     except (OSError, OverflowError) as error:
         reason = getattr(error, "strerror", None) or error
-        raise UnavailableError(f"scheduler {address}: {reason}; start it with `dask scheduler`") from None
+        raise UnavailableError(f"scheduler {address}: {reason}; {START}") from None

@@ -12,10 +12,11 @@ from pathlib import Path
 import click
 
 from rtloop.cli.exit_codes import report_errors
-from rtloop.cli.options import OUTPUT
+from rtloop.cli.options import OUTPUT, MatchingText
 from rtloop.errors import RtloopError
 
 PORT = 8321
+LOOPBACK = MatchingText("address", r"127(\.(25[0-5]|2[0-4]\d|1?\d?\d)){3}", "an address of this host alone, 127.x.x.x")
 
 
 def port_option(name: str) -> Callable[[Callable[..., object]], Callable[..., object]]:
@@ -55,18 +56,31 @@ def panel_process(config: Path, enabled: bool, port: int, name: str | None = Non
 @click.command()
 @click.argument("service", metavar="[NAME|SOCKET]", required=False)
 @port_option("--port")
+@click.option("--address", type=LOOPBACK,
+              help="Address of the panel in 127.0.0.0/8.  [default: another one at each start]")  # fmt: skip
 @click.option("--open", "opens", is_flag=True, help="Open the panel in the browser.")
-@click.option("--token-file", type=OUTPUT, help="File with the access token; a missing file is created.")
+@click.option(
+    "--token-file", type=OUTPUT, help="File that receives the address with the token, which is then not printed."
+)
 @click.option(
     "--foxglove", is_flag=True, help="Serve Foxglove viewers (WebSocket) too; these viewers cannot control the loop."
 )
 @click.option("--until-stdin-ends", "tied", is_flag=True, hidden=True)
 @report_errors
-def panel(service: str | None, port: int, opens: bool, token_file: Path | None, foxglove: bool, tied: bool) -> int:
+def panel(
+    service: str | None,
+    port: int,
+    address: str | None,
+    opens: bool,
+    token_file: Path | None,
+    foxglove: bool,
+    tied: bool,
+) -> int:
     """Show and drive a running loop in the browser.
 
     NAME is the name of a service, SOCKET the path of its control socket; without either, the only running service is
-    used. The panel is a separate process; no tick waits for it. The panel listens on 127.0.0.1 only.
+    used. The panel is a separate process; no tick waits for it. The panel listens on an address of this host that no
+    other host reaches.
     """
     from rtloop.client import Client
     from rtloop.client.control_socket import find_control_socket
@@ -80,7 +94,7 @@ def panel(service: str | None, port: int, opens: bool, token_file: Path | None, 
             Client(path).get("/status")
         except RtloopError as error:
             click.echo(f"{error}; the panel waits for the service", err=True)
-    return serve(path, port, token_file, lambda address: click.echo(f"panel: {address}", err=True), opens, foxglove)
+    return serve(path, port, token_file, lambda text: click.echo(f"panel: {text}", err=True), opens, foxglove, address)
 
 
 def terminate_at_stdin_end() -> None:

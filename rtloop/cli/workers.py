@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING
 
 import click
 
+from rtloop.cli.output import print_warnings
+
 if TYPE_CHECKING:
     from rtloop.campaigns.workers import Workers
 
@@ -18,7 +20,8 @@ WORKERS = (
     click.option(
         "--scheduler",
         metavar="ADDRESS",
-        help="Address of a Dask scheduler, such as tcp://HOST:8786, whose workers replace the local processes.",
+        help="Address of a Dask scheduler, such as tls://HOST:8786, whose workers replace the local processes; without "
+        "TLS, who reaches it can run any program.",
     ),
 )
 
@@ -38,7 +41,7 @@ def choose_workers(
 
     The workers are `jobs` processes of this host (None: one for each processor), each of which has imported the module
     `preload`; or, if `scheduler` is given, the workers of the Dask scheduler at this address. Raises UsageError if both
-    are given, and the errors of `DaskWorkers`.
+    are given, and the errors of `DaskWorkers`. Prints a warning for a scheduler that is open to other hosts.
     """
     if jobs and scheduler:
         raise click.UsageError(
@@ -47,6 +50,8 @@ def choose_workers(
     from rtloop.campaigns.workers import DaskWorkers, ProcessWorkers
 
     workers = DaskWorkers(scheduler) if scheduler else ProcessWorkers(jobs, preload=preload)
+    if isinstance(workers, DaskWorkers):
+        print_warnings(workers.warnings())
     try:
         yield workers
     finally:

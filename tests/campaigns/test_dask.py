@@ -160,4 +160,4 @@ def test_a_scheduler_without_a_worker_is_named(campaign, tmp_path):
         process = rtloop("campaign", "run", campaign, "--scheduler", address, folder=tmp_path)
         _, errors = process.communicate(timeout=60)
     assert process.returncode == 69
-    assert "no worker is connected; start `dask worker" in errors
+    assert "no worker is connected; start `dask worker ADDRESS --host 127.0.0.1" in errors

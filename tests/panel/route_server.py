@@ -32,13 +32,15 @@ class Response(NamedTuple):
         return json.loads(self.body)
 
 
-def exchange(port: int, method: str, path: str, body: Any, headers: Mapping[str, str | None]) -> Response:
-    """Send a request with these headers and its length alone; return the response.
+def exchange(
+    port: int, method: str, path: str, body: Any, headers: Mapping[str, str | None], host: str = "127.0.0.1"
+) -> Response:
+    """Send a request with these headers and its length alone to a port of `host`; return the response.
 
     The header Host is added unless `headers` has it; None leaves a header out; a body that is not bytes becomes JSON.
     """
     data = body if isinstance(body, bytes | None) else json.dumps(body).encode()
-    with closing(http.client.HTTPConnection("127.0.0.1", port, timeout=TIMEOUT_S)) as connection:
+    with closing(http.client.HTTPConnection(host, port, timeout=TIMEOUT_S)) as connection:
         connection.putrequest(method, path, skip_host="Host" in headers, skip_accept_encoding=True)
         for name, value in {"Content-Length": str(len(data or b"")), **headers}.items():
             if value is not None:

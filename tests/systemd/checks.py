@@ -28,7 +28,6 @@ from rtloop.hil.board import LSB_V, MISSED_WRITES, BoardMemory
 from rtloop.hil.witness import WINDOW_NS
 
 UNIT, BOARD, PANEL = "rtloop@board.service", "rtloop-board@board.service", "rtloop-panel@board.service"
-PAGE = "http://127.0.0.1:8321"
 RTLOOP = "/opt/rtloop/bin/rtloop"
 CONFIG = Path("/etc/rtloop/board.toml")
 RECORDINGS = Path("/var/lib/rtloop/recordings")
@@ -298,13 +297,15 @@ def panel() -> str:
     token = Path("/run/rtloop/board.panel-token")
     wait_until(token.exists, 30.0, "the panel's token", 0.2)
     require(stat.S_IMODE(token.stat().st_mode) == 0o640, f"{token} is {stat.S_IMODE(token.stat().st_mode):o}")
-    wait_until(lambda: _request("GET", "/")[0] == 200, 30.0, "the panel", 0.2)
-    require(_request("GET", "/api/status")[0] == 401, "data without a session")
-    code, cookie = _request("POST", "/session", json.dumps({"token": token.read_text().strip()}))
-    require(code == 204 and cookie, f"{code} for the token")
-    code, answer = _request("GET", "/api/status", cookie=cookie)
+    page, _, secret = token.read_text().strip().partition("/#token=")
+    wait_until(lambda: _request(page, "GET", "/")[0] == 200, 30.0, "the panel", 0.2)
+    require(_request(page, "GET", "/api/status")[0] == 401, "data without a session")
+    code, answer = _request(page, "POST", "/session", json.dumps({"token": secret}))
+    require(code == 200, f"{code} for the token")
+    session = json.loads(answer)["session"]
+    code, answer = _request(page, "GET", "/api/status", session=session)
     require(code == 200 and json.loads(answer)["state"] == "running", answer)
-    code, _ = _request("POST", "/api/stop", "{}", cookie, "http://elsewhere.example")
+    code, _ = _request(page, "POST", "/api/stop", "{}", session, "http://elsewhere.example")
     require(code == 403, f"{code} for a foreign page's request")
     level = _exposure(PANEL)
     require(level <= EXPOSURE_LIMIT, f"exposure {level}")
@@ -313,15 +314,17 @@ def panel() -> str:
     return f"data only in a session by token; exposure {level}; the service runs on after its end"
 
 
-def _request(method: str, path: str, body: str = "", cookie: str = "", origin: str = PAGE) -> tuple[int, str]:
-    """Send a request to the panel; return the status (0 without an answer) and a session's cookie, or the text."""
-    request = urllib.request.Request(PAGE + path, body.encode() or None, method=method)
-    for name, value in (("Origin", origin), ("Cookie", cookie), ("Content-Type", "application/json")):
+def _request(
+    page: str, method: str, path: str, body: str = "", session: str = "", origin: str | None = None
+) -> tuple[int, str]:
+    """Send a request to the panel at the address `page`; return the status (0 without an answer) and the text."""
+    request = urllib.request.Request(page + path, body.encode() or None, method=method)
+    headers = {"Origin": origin or page, "Authorization": f"Bearer {session}", "Content-Type": "application/json"}
+    for name, value in headers.items():
         request.add_header(name, value)
     try:
         with urllib.request.urlopen(request, timeout=10.0) as answer:
-            cookie = answer.headers.get("Set-Cookie", "").partition(";")[0]
-            return answer.status, cookie or answer.read().decode()
+            return answer.status, answer.read().decode()
     except urllib.error.HTTPError as error:
         return error.code, error.read().decode()
     except OSError as error:

@@ -5,8 +5,8 @@ Channels, both CDR with a schema of the kind ros2msg:
     /live     RATE_HZ times a second: extremes and last value of each signal since the previous message
     /events   commands, changes of mode and trips, when they happen
 
-https://github.com/foxglove/ws-protocol/blob/main/docs/spec.md. A viewer sends no cookie and runs in another page: a
-token in its address admits it, which is derived from the panel's token and allows no commands.
+https://github.com/foxglove/ws-protocol/blob/main/docs/spec.md. A viewer runs in another page and sends no header of
+ours: a token in its address admits it, which is derived from the panel's token and allows no commands.
 """
 
 from __future__ import annotations

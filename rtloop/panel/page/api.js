@@ -1,6 +1,7 @@
 // Requests to the panel's server, which forwards commands to the service.
 
 import { decode } from "./message.js";
+import { forgetProof, sessionSecret } from "./session.js";
 
 /** What the service, or the server, said against a request; `status` is 0 where nobody answered. */
 export class Refusal extends Error {
@@ -23,8 +24,11 @@ export const who = {
 async function ask(path, options = {}) {
   let response;
   try {
-    response = await fetch(path, { cache: "no-store", ...options });
+    const secret = await sessionSecret();
+    const headers = { ...options.headers, ...(secret && { Authorization: `Bearer ${secret}` }) };
+    response = await fetch(path, { cache: "no-store", credentials: "omit", ...options, headers });
   } catch {
+    forgetProof();
     throw new Refusal(0, "the panel's server does not answer, and the command may have had no effect");
   }
   if (response.ok) return response;
@@ -54,6 +58,8 @@ export const post = async (path, body = {}, options = {}) => {
   const response = await ask(path, { ...posted(body), ...options });
   return response.status === 204 ? {} : response.json();
 };
+
+export const getBlob = async (path) => (await ask(path)).blob();
 
 /** Arrays by name, as over the WebSocket. */
 export const getArrays = async (path) => decode(await (await ask(path)).arrayBuffer());

@@ -2,6 +2,7 @@
 
 import { get } from "./api.js";
 import { decode } from "./message.js";
+import { forgetProof, sessionSecret } from "./session.js";
 
 const SILENCE_MS = 600;
 /** State comes 20 times a second; without any for so long, what is shown is not the present. */
@@ -12,6 +13,7 @@ const AGAIN_MS = [250, 500, 1000, 2000];
 
 export class Live extends EventTarget {
   #socket = null;
+  #connecting = false;
   #wishes = {};
   #failures = 0;
   #heard_ms = -Infinity;
@@ -29,9 +31,16 @@ export class Live extends EventTarget {
 
   /** Once is enough: it comes again by itself. */
   connect() {
-    if (this.#socket) return;
+    if (this.#connecting) return;
+    this.#connecting = true;
+    this.#open();
+  }
+
+  async #open() {
+    const secret = await Promise.resolve(sessionSecret()).catch(() => null);
+    if (!secret) return this.#again();
     const scheme = location.protocol === "https:" ? "wss" : "ws";
-    const socket = new WebSocket(`${scheme}://${location.host}/live`);
+    const socket = new WebSocket(`${scheme}://${location.host}/live`, ["rtloop", `rtloop.session.${secret}`]);
     socket.binaryType = "arraybuffer";
     socket.onopen = () => {
       this.#failures = 0;
@@ -39,14 +48,17 @@ export class Live extends EventTarget {
     };
     socket.onmessage = ({ data }) => this.#take(decode(data));
     socket.onclose = () => {
-      if (this.#socket !== socket) return;
       this.#socket = null;
       this.#watch();
-      get("/api/panel").catch(() => {}); // says by itself where the session is over
-      const wait_ms = AGAIN_MS[Math.min(this.#failures++, AGAIN_MS.length - 1)];
-      setTimeout(() => this.connect(), wait_ms);
+      this.#again();
     };
     this.#socket = socket;
+  }
+
+  #again() {
+    forgetProof();
+    get("/api/panel").catch(() => {}); // says by itself where the session is over
+    setTimeout(() => this.#open(), AGAIN_MS[Math.min(this.#failures++, AGAIN_MS.length - 1)]);
   }
 
   /** What is wanted from now on, by key. */

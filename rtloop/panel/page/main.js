@@ -33,7 +33,7 @@ themes($("theme"), () => {
   views?.arrange();
   tuning?.arrange();
 });
-for (const id of ["port", "port-there"]) $(id).textContent = location.port || "80";
+$("tunnel").textContent = `ssh -o ExitOnForwardFailure=yes -L ${location.host}:${location.host} USER@HOST`;
 $("help").addEventListener("click", () => ($("help-dialog").open ? closeHelp() : $("help-dialog").show())); // not modal: STOP stays in reach
 $("close-help").addEventListener("click", closeHelp);
 live.addEventListener("refused", ({ detail }) => strip.tell(`${detail.wish}: ${detail.error}`));

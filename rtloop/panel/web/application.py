@@ -36,10 +36,10 @@ from rtloop.panel.web.responses import (
     with_error_responses,
 )
 from rtloop.panel.web.retuning import Retuning
-from rtloop.panel.web.security import Guard, Sessions, session_cookie
+from rtloop.panel.web.security import Guard, Session
 
 PAGE = Path(__file__).resolve().parents[1] / "page"
-MAX_TOKEN_BYTES = 4096
+MAX_TOKEN_BYTES, MAX_NONCE = 4096, 100
 
 
 class Pages(StaticFiles):
@@ -52,7 +52,7 @@ class Pages(StaticFiles):
         return response
 
 
-def application(service: Service, sessions: Sessions, viewers_token: str | None = None) -> Starlette:
+def application(service: Service, session: Session, viewers_token: str | None = None) -> Starlette:
     """Return the panel's web application for a service; its threads read the loop while the server runs.
 
     With `viewers_token` it also serves viewers of the Foxglove protocol whose address contains this token.
@@ -73,8 +73,8 @@ def application(service: Service, sessions: Sessions, viewers_token: str | None 
         return FileResponse(PAGE / "index.html", headers={"cache-control": "no-cache"})
 
     @with_error_responses
-    async def session(request: Request) -> Response:
-        """Exchange the `token` in the JSON body for the cookie of a new session, with status 204.
+    async def log_in(request: Request) -> Response:
+        """Exchange the `token` in the JSON body for the `session`, the secret that admits requests.
 
         401 for a wrong or missing token, 429 after too many tries of a client.
         """
@@ -85,14 +85,20 @@ def application(service: Service, sessions: Sessions, viewers_token: str | None 
         except (ValueError, RequestRefused):
             message = None
         token = message.get("token") if isinstance(message, dict) else None
-        secret = sessions.open_session(token) if isinstance(token, str) else None
+        secret = session.secret_for(token) if isinstance(token, str) else None
         if secret is None:
             raise RequestRefused(
                 401, "token: not the token of the running panel; open the address that `rtloop panel` printed"
             )
-        response = Response(status_code=204)
-        response.set_cookie(**session_cookie(sessions, secret))
-        return response
+        return JSONResponse({"session": secret})
+
+    @with_error_responses
+    async def prove(request: Request) -> Response:
+        """Respond with the `proof` for the `nonce` in the query, without which a page sends its secret to nobody."""
+        nonce = request.query_params.get("nonce", "")
+        if not 0 < len(nonce) <= MAX_NONCE:
+            raise RequestRefused(422, f"nonce: {len(nonce)} characters; allowed: 1 to {MAX_NONCE}")
+        return JSONResponse({"proof": session.prove(nonce)})
 
     def panel(_: Request) -> Response:
         """Respond with the description of the running loop; 503 without one."""
@@ -104,7 +110,8 @@ def application(service: Service, sessions: Sessions, viewers_token: str | None 
     routes: Sequence[BaseRoute] = [
         Route("/", index),
         Mount("/page", Pages(directory=PAGE)),
-        Route("/session", session, methods=["POST"]),
+        Route("/session", log_in, methods=["POST"]),
+        Route("/session", prove),
         Route("/api/panel", panel),
         Route("/api/measure", partial(measure, feed)),
         *Proxy(service).routes(),
@@ -112,8 +119,8 @@ def application(service: Service, sessions: Sessions, viewers_token: str | None 
         *Recordings(service, lambda: feed.run).routes(),
         WebSocketRoute("/live", Live(feed, state).serve),
     ]
-    guard = Middleware(Guard, sessions=sessions)
+    guard = Middleware(Guard, session=session)
     if viewers_token is not None:
         foxglove = Foxglove(feed, viewers_token)
-        routes, guard = [*routes, foxglove.route], Middleware(Guard, sessions=sessions, is_admitted=foxglove.admits)
+        routes, guard = [*routes, foxglove.route], Middleware(Guard, session=session, is_admitted=foxglove.admits)
     return Starlette(routes=routes, middleware=[guard], lifespan=lifespan)

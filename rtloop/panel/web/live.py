@@ -15,6 +15,7 @@ from rtloop.panel.feed.feed import Feed
 from rtloop.panel.protocol.frames import SEND_TIMEOUT_S
 from rtloop.panel.service.state import StateListener
 from rtloop.panel.views.viewer import FRAME_S, Viewer
+from rtloop.panel.web.security import PROTOCOL
 
 MAX_STREAMS = 16
 MESSAGES_PER_S = 50.0
@@ -63,7 +64,7 @@ class Live:
         self._streams += 1
         viewer = Viewer(self._feed, self._state)
         try:
-            await socket.accept()
+            await socket.accept(PROTOCOL)
             self._feed.add_viewer(viewer)
             try:
                 async with anyio.create_task_group() as tasks:

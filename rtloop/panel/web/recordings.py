@@ -6,7 +6,9 @@ Long work runs in separate processes, few at a time; a sweep reads only the part
 from __future__ import annotations
 
 import os
+import secrets
 import tempfile
+import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import IO, TypeVar
@@ -35,6 +37,7 @@ MAX_BODY_BYTES = 4096
 AHEAD_S = 60.0
 """Longest wait of a capture for ticks that are still to come."""
 BLOCK_BYTES = 1 << 16
+TICKET_BYTES, TICKET_S, MAX_TICKETS = 24, 30.0, 64
 
 
 class Recordings:
@@ -45,6 +48,7 @@ class Recordings:
         self._service, self._current_run = service, current_run
         self._processes, self._readers = ProcessRunner(), CapacityLimiter(MAX_READERS)
         self._folder_cache: RecordingFolder | None = None
+        self._tickets: dict[str, tuple[Path, float]] = {}
 
     def routes(self) -> Sequence[BaseRoute]:
         """Return the routes of all handlers."""
@@ -52,6 +56,8 @@ class Recordings:
         return [
             Route("/api/recordings", self.listing),
             Route(file_route, self.download),
+            Route(f"{file_route}/ticket", self.ticket, methods=["POST"]),
+            Route("/download/{ticket}", self.ticket_download),
             Route(f"{file_route}/info", self.info),
             Route(f"{file_route}/plot.png", self.plot),
             Route(f"{file_route}/sweep", self.sweep),
@@ -70,17 +76,29 @@ class Recordings:
         A request may name ranges of bytes of a finished file (.mcap). 404 for a file that is not in the folder of
         recordings, or was removed meanwhile.
         """
-        path = await self._recording_path(request)
-        name = shown_name(path.name)
-        try:
-            file = await self._run_in_thread(lambda: os.fdopen(open_without_link(path), "rb"))
-        except OSError as error:
-            raise RequestRefused(404, f"{name}: {error.strerror}") from None
-        if path.suffix == ".mcap":
-            return OpenFileResponse(file, name)
-        size = os.fstat(file.fileno()).st_size
-        headers = {"content-length": str(size), "content-disposition": f"attachment; filename*=utf-8''{quote(name)}"}
-        return StreamingResponse(_blocks(file, size), headers=headers, media_type="application/octet-stream")
+        return await self._send(await self._recording_path(request))
+
+    @with_error_responses
+    async def ticket(self, request: Request) -> Response:
+        """Respond with the `path` from which a browser downloads the recording once, within TICKET_S, without a header.
+
+        404 for a file that is not in the folder of recordings.
+        """
+        path, ticket = await self._recording_path(request), secrets.token_urlsafe(TICKET_BYTES)
+        self._tickets[ticket] = path, time.monotonic() + TICKET_S
+        while len(self._tickets) > MAX_TICKETS:
+            del self._tickets[next(iter(self._tickets))]
+        return JSONResponse({"path": f"/download/{ticket}"})
+
+    @with_error_responses
+    async def ticket_download(self, request: Request) -> Response:
+        """Respond like `download` with the recording of the ticket in the address; 404 for a used or old ticket."""
+        path, until_s = self._tickets.pop(request.path_params["ticket"], (Path(), 0.0))
+        if time.monotonic() > until_s:
+            raise RequestRefused(
+                404, f"used before, or older than {TICKET_S:g} s; start the download on the page again"
+            )
+        return await self._send(path)
 
     @with_error_responses
     async def info(self, request: Request) -> Response:
@@ -143,6 +161,22 @@ class Recordings:
         return JSONResponse(
             await self._processes.run("rtloop.client.capture.tick_capture", socket, run.file, first, end)
         )
+
+    async def _send(self, path: Path) -> Response:
+        """Return the response with the content of a recording.
+
+        Raises RequestRefused (404) for a file that was removed meanwhile.
+        """
+        name = shown_name(path.name)
+        try:
+            file = await self._run_in_thread(lambda: os.fdopen(open_without_link(path), "rb"))
+        except OSError as error:
+            raise RequestRefused(404, f"{name}: {error.strerror}") from None
+        if path.suffix == ".mcap":
+            return OpenFileResponse(file, name)
+        size = os.fstat(file.fileno()).st_size
+        headers = {"content-length": str(size), "content-disposition": f"attachment; filename*=utf-8''{quote(name)}"}
+        return StreamingResponse(_blocks(file, size), headers=headers, media_type="application/octet-stream")
 
     def _tick_range(self, body: CaptureBody, run: RecordedRun) -> tuple[int, int]:
         """Return the first tick of a capture, at least 0, and the tick after its last one.

@@ -1,28 +1,32 @@
 """Access to the panel: for clients on this host with its token, from the panel's own page.
 
-A browser sends requests for every page that is open in it. Therefore the Host header must name this host (any other
-name could resolve to it), the origin must be the panel's page, and the session is a cookie that other sites' pages
-cannot send.
+A browser sends requests for every page that is open in it. Therefore the Host header must be an address of this host
+(a name could resolve to it), the origin must be the panel's page, and each request carries the secret of the session in
+a header that only the panel's page can send. It is no cookie: browsers send cookies to all ports of a host, and another
+user may listen on each.
 """
 
 from __future__ import annotations
 
+import hashlib
 import hmac
 import secrets
-from collections import OrderedDict
 from collections.abc import Callable
-from http.cookies import CookieError, SimpleCookie
-from typing import Any
+from ipaddress import AddressValueError, IPv4Address
 from urllib.parse import urlsplit
 
 from starlette.datastructures import Headers, MutableHeaders
-from starlette.responses import JSONResponse
+from starlette.responses import JSONResponse, RedirectResponse, Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-LOOPBACK = frozenset(("127.0.0.1", "localhost", "::1"))
-MAX_SESSIONS = 256
+LOOPBACK_NAMES = frozenset(("localhost", "::1"))
 TOKEN_BYTES = 24
 SAFE_METHODS = frozenset(("GET", "HEAD"))
+PROTOCOL, SECRET_PROTOCOL = "rtloop", "rtloop.session."
+"""Protocols that a page offers for its WebSocket: the first is accepted, the second has the session's secret behind it.
+
+A page cannot give a WebSocket any other header.
+"""
 HEADERS = {
     "content-security-policy": "default-src 'self'; img-src 'self' blob: data:; object-src 'none'; base-uri 'none'; "
     "form-action 'self'; frame-ancestors 'none'",
@@ -33,37 +37,27 @@ HEADERS = {
 }
 
 
-class Sessions:
-    """The token, and the sessions opened with it: the newest MAX_SESSIONS, until the panel ends.
+class Session:
+    """The panel's token, and the secret of the session that it opens, which all pages share until the panel ends."""
 
-    `cookie` is the name of the sessions' cookie, with the panel's `port`: browsers send cookies to all ports of a host.
-    """
+    def __init__(self, token: str) -> None:
+        self._token, self._secret = token, secrets.token_urlsafe(TOKEN_BYTES)
 
-    def __init__(self, token: str, port: int) -> None:
-        """Store the token and name the cookie after the panel's port; no session is open yet."""
-        self._token, self.cookie = token, f"rtloop-{port}"
-        self._secrets: OrderedDict[str, None] = OrderedDict()
+    def secret_for(self, token: str) -> str | None:
+        """Return the secret of the session; None for a wrong token."""
+        return self._secret if hmac.compare_digest(token.encode(errors="replace"), self._token.encode()) else None
 
-    def open_session(self, token: str) -> str | None:
-        """Open a session and return its secret, the cookie's value; None, without a session, for a wrong token.
+    def prove(self, nonce: str) -> str:
+        """Return the HMAC-SHA256 of a page's `nonce`, in hexadecimal, by which the page knows this panel again."""
+        return hmac.new(self._secret.encode(), nonce.encode(errors="replace"), hashlib.sha256).hexdigest()
 
-        Beyond MAX_SESSIONS the oldest session ends.
-        """
-        if not hmac.compare_digest(token.encode(errors="replace"), self._token.encode()):
-            return None
-        session = secrets.token_urlsafe(TOKEN_BYTES)
-        self._secrets[session] = None
-        while len(self._secrets) > MAX_SESSIONS:
-            self._secrets.popitem(last=False)
-        return session
-
-    def has_session(self, headers: Headers) -> bool:
-        """Return whether a request's cookie belongs to an open session."""
-        try:
-            cookie = SimpleCookie(headers.get("cookie", "")).get(self.cookie)
-        except CookieError:
-            return False
-        return cookie is not None and cookie.value in self._secrets
+    def admits(self, scope: Scope) -> bool:
+        """Return whether a request has the secret: as `Authorization: Bearer SECRET`, or in a WebSocket's protocol."""
+        if scope["type"] == "websocket":
+            offered = [name.removeprefix(SECRET_PROTOCOL) for name in scope["subprotocols"] if name != PROTOCOL]
+        else:
+            offered = [text.removeprefix("Bearer ") for text in Headers(scope=scope).getlist("authorization")]
+        return len(offered) == 1 and hmac.compare_digest(offered[0].encode(errors="replace"), self._secret.encode())
 
 
 class Guard:
@@ -73,11 +67,9 @@ class Guard:
     must still name this host.
     """
 
-    def __init__(
-        self, app: ASGIApp, sessions: Sessions, is_admitted: Callable[[Scope], bool] = lambda _: False
-    ) -> None:
-        """Store the application behind the guard, its sessions and the test `is_admitted`, by default always False."""
-        self._app, self._sessions, self._is_admitted = app, sessions, is_admitted
+    def __init__(self, app: ASGIApp, session: Session, is_admitted: Callable[[Scope], bool] = lambda _: False) -> None:
+        """Store the application behind the guard, its session and the test `is_admitted`, by default always False."""
+        self._app, self._session, self._is_admitted = app, session, is_admitted
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Refuse a request with 403 or 401 (a WebSocket by closing it), or forward it; responses get the HEADERS.
@@ -99,40 +91,59 @@ class Guard:
         if refusal := self._refusal(scope):
             if scope["type"] == "websocket":
                 return await send({"type": "websocket.close", "code": 1008})
-            code, reason = refusal
-            return await JSONResponse({"error": reason}, status_code=code)(scope, receive, send_guarded)
+            return await refusal(scope, receive, send_guarded)
         return await self._app(scope, receive, send_guarded)
 
-    def _refusal(self, scope: Scope) -> tuple[int, str] | None:
-        """Return HTTP status and reason of a refusal; None to admit.
+    def _refusal(self, scope: Scope) -> Response | None:
+        """Return the response that refuses a request; None to admit.
 
-        403 for a Host header that does not name this host. Unless `is_admitted`: 403 for an origin that is not the
-        panel's page, 403 for a WebSocket or a command without an origin (a command with `sec-fetch-site: same-origin`
-        is admitted), 401 without a session on a path that is not public.
+        403 for a Host header that does not name this host. Unless `is_admitted`: the page under a name of this host
+        leads to its address, where no other server can listen, and other requests by name get 403; 403 for an origin
+        that is not the panel's page, and for a WebSocket or a command without an origin (a command with
+        `sec-fetch-site: same-origin` is admitted); 401 without the session's secret on a path that is not public.
         """
         headers, path = Headers(scope=scope), scope["path"]
         host, origin = headers.get("host", ""), headers.get("origin")
-        if len(headers.getlist("host")) != 1 or host_name(host) not in LOOPBACK:
-            return (
-                403,
-                f"host {host[:100]!r}: not allowed; allowed: 127.0.0.1 and localhost; from another computer use ssh -L",
-            )
+        name = host_name(host)
+        by_name = name in LOOPBACK_NAMES
+        if len(headers.getlist("host")) != 1 or not (by_name or is_loopback(name)):
+            return _refuse(403, f"host {host[:100]!r}: not allowed; allowed: 127.0.0.1; elsewhere use ssh -L")
         if self._is_admitted(scope):
             return None
+        if by_name:
+            port = urlsplit(f"//{host}").port
+            address = f"http://127.0.0.1{f':{port}' if port else ''}/"
+            if (path, scope.get("method")) == ("/", "GET"):
+                return RedirectResponse(address)
+            return _refuse(403, f"host {host[:100]!r}: not allowed; allowed: the address, such as {address}")
         if len(headers.getlist("origin")) > 1 or (origin is not None and origin.lower() != f"http://{host.lower()}"):
-            return 403, f"origin {str(origin)[:100]!r}: not allowed; allowed: http://{host}"
+            return _refuse(403, f"origin {str(origin)[:100]!r}: not allowed; allowed: http://{host}")
         if origin is None:
             is_same_origin = headers.get("sec-fetch-site") == "same-origin"
             if scope["type"] == "websocket" or (scope["method"] not in SAFE_METHODS and not is_same_origin):
-                return 403, "origin: missing; allowed: the origin of the panel's page"
-        if is_public(path) or self._sessions.has_session(headers):
+                return _refuse(403, "origin: missing; allowed: the origin of the panel's page")
+        if is_public(path) or self._session.admits(scope):
             return None
-        return 401, "no session: open the panel with the address that `rtloop panel` printed, token included"
+        return _refuse(401, "no session: open the panel with the address that `rtloop panel` printed, token included")
+
+
+def _refuse(code: int, reason: str) -> Response:
+    return JSONResponse({"error": reason}, status_code=code)
 
 
 def is_public(path: str) -> bool:
-    """Return whether a path needs no session: the pages, which contain no data, the log-in and the icon."""
-    return path in ("/", "/session", "/favicon.ico") or path.startswith("/page/")
+    """Return whether a path needs no session: the pages, which contain no data, the log-in, the icon, and downloads,
+    whose path is a ticket.
+    """
+    return path in ("/", "/session", "/favicon.ico") or path.startswith(("/page/", "/download/"))
+
+
+def is_loopback(name: str) -> bool:
+    """Return whether a host's name is an IPv4 address in 127.0.0.0/8, written in full."""
+    try:
+        return IPv4Address(name).is_loopback
+    except AddressValueError:
+        return False
 
 
 def host_name(host: str) -> str:
@@ -142,8 +153,3 @@ def host_name(host: str) -> str:
         return (parts.hostname or "") if parts.netloc == host and parts.port != 0 and "@" not in host else ""
     except ValueError:
         return ""
-
-
-def session_cookie(sessions: Sessions, session: str) -> dict[str, Any]:
-    """Return the arguments of `Response.set_cookie` for a session; `session` is its secret."""
-    return {"key": sessions.cookie, "value": session, "path": "/", "httponly": True, "samesite": "strict"}

@@ -30,7 +30,7 @@ def panel(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Panel]:
     with Bench(tmp_path_factory.mktemp("viewers")) as bench:
         bench.await_drive()
         bench.rtloop("panel", bench.client.path, "--port", "0", "--foxglove")
-        address = wait_for(lambda: re.search(r"ws://127\.0\.0\.1:\d+/foxglove\?token=\w+", bench.log()), "an address")
+        address = wait_for(lambda: re.search(r"ws://127\.[\d.]+:\d+/foxglove\?token=\w+", bench.log()), "an address")
         wait_for(lambda: is_admitted(address[0]), "a panel")
         yield bench, address[0]
 

@@ -62,7 +62,7 @@ def start_panel(bench: Bench, service: str | None = None) -> tuple[str, subproce
     """Start the panel of the bench's service, or of one named `service`; return its address and its process."""
     log_length = len(bench.log())
     process = bench.rtloop("panel", bench.folder / "run" / f"{service or bench.config.stem}.sock", "--port", "0")
-    find_addresses = lambda: re.findall(r"http://127\.0\.0\.1:\d+/#token=\S+", bench.log()[log_length:])
+    find_addresses = lambda: re.findall(r"http://127\.[\d.]+:\d+/#token=\S+", bench.log()[log_length:])
     addresses = wait_for(find_addresses, "the panel's address", TIMEOUT_S)
     return addresses[0], process
 

@@ -41,15 +41,16 @@ class Browser:
         log_length = len(bench.log())
         self.process: subprocess.Popen[str] = bench.rtloop("panel", bench.client.path, "--port", "0", *options)
         match = wait_for(
-            lambda: re.search(r"http://127\.0\.0\.1:(\d+)/#token=(\S+)", bench.log()[log_length:]), "a panel", 120
+            lambda: re.search(r"http://(127\.[\d.]+):(\d+)/#token=(\S+)", bench.log()[log_length:]), "a panel", 120
         )
-        self.port, self.token = int(match[1]), match[2]
-        self.origin = f"http://127.0.0.1:{self.port}"
-        self.cookie = ""
+        self.host, self.port, self.token = match[1], int(match[2]), match[3]
+        self.origin = f"http://{self.host}:{self.port}"
+        self.session = ""
 
     def request(self, method: str, path: str, body: Any = None, headers: dict[str, Any] | None = None) -> Response:
         """Send a request as a page does, with `headers` added or replaced; None leaves a header out."""
-        return exchange(self.port, method, path, body, {"Origin": self.origin, "Cookie": self.cookie} | (headers or {}))
+        all_headers = {"Origin": self.origin, "Authorization": f"Bearer {self.session}"} | (headers or {})
+        return exchange(self.port, method, path, body, all_headers, self.host)
 
     def json(self, method: str, path: str, body: Any = None) -> tuple[int, Any]:
         """Send a request as a page does; return the status and the JSON of the response, None if it is empty."""
@@ -58,18 +59,21 @@ class Browser:
 
     def log_in(self) -> Browser:
         """Exchange the token for a session; return this browser."""
-        status, headers, _ = self.request("POST", "/session", {"token": self.token})
-        assert status == 204
-        self.cookie = headers["set-cookie"].split(";")[0]
+        response = self.request("POST", "/session", {"token": self.token}, {"Authorization": None})
+        assert response.code == 200
+        self.session = response.json["session"]
         return self
 
     @contextmanager
-    def live(self, *subscriptions: dict[str, Any], headers: dict[str, str] | None = None) -> Iterator[ClientConnection]:
-        """Yield a connection to `/live`, after these subscriptions were sent."""
-        all_headers = {"Origin": self.origin, "Cookie": self.cookie} | (headers or {})
-        address = f"ws://127.0.0.1:{self.port}/live"
+    def live(
+        self, *subscriptions: dict[str, Any], headers: dict[str, str] | None = None, session: str | None = None
+    ) -> Iterator[ClientConnection]:
+        """Yield a connection to `/live`, after these subscriptions were sent; `session` replaces the own secret."""
+        all_headers = {"Origin": self.origin} | (headers or {})
+        address = f"ws://{self.host}:{self.port}/live"
         limits: dict[str, Any] = {
             "compression": None,
+            "subprotocols": ["rtloop", f"rtloop.session.{self.session if session is None else session}"],
             "max_size": None,
             "open_timeout": TIMEOUT_S,
             "close_timeout": 1.0,

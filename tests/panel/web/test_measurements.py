@@ -130,9 +130,11 @@ def test_nothing_changes_before_consent_and_then_the_taps_are_the_proposed_ones(
 def test_a_measurement_ends_with_its_page(browser: Browser, bench: Bench, path: str, body: dict[str, Any]):
     before = taps(bench)
     data = json.dumps(body).encode()
-    head = f"POST /api/{path}?as=ada HTTP/1.1\r\nHost: 127.0.0.1:{browser.port}\r\nOrigin: {browser.origin}\r\n"
-    with socket.create_connection(("127.0.0.1", browser.port)) as page:
-        page.sendall(f"{head}Cookie: {browser.cookie}\r\nContent-Length: {len(data)}\r\n\r\n".encode() + data)
+    head = f"POST /api/{path}?as=ada HTTP/1.1\r\nHost: {browser.host}:{browser.port}\r\nOrigin: {browser.origin}\r\n"
+    with socket.create_connection((browser.host, browser.port)) as page:
+        page.sendall(
+            f"{head}Authorization: Bearer {browser.session}\r\nContent-Length: {len(data)}\r\n\r\n".encode() + data
+        )
         wait_for(lambda: reference_um(bench) != SETPOINT_UM, "a motion")
     wait_for(lambda: bench.status()["measuring"] is None, "the end of the measurement", CANCEL_TIMEOUT_S)
     assert reference_um(bench) == SETPOINT_UM

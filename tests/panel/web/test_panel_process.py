@@ -20,7 +20,7 @@ from tests.faults.configuration import ROOT
 from tests.faults.evidence import wait_for
 from tests.paper_configuration import RATE, TEXT
 
-ADDRESS = re.compile(r"http://127\.0\.0\.1:(\d+)/#token=\S+")
+ADDRESS = re.compile(r"http://(127\.[\d.]+:\d+)/#token=\S+")
 
 
 def rig_configuration(folder: Path) -> str:
@@ -28,9 +28,11 @@ def rig_configuration(folder: Path) -> str:
     return TEXT.replace('folder = "recordings"', f'folder = "{folder}/recordings"').replace(RATE, "rate_hz = 2000\n")
 
 
-def is_listening(port: str) -> bool:
-    """Return whether a process listens on this port of 127.0.0.1."""
-    return f"0100007f:{int(port):04x} 00000000:0000 0a" in Path("/proc/net/tcp").read_text().lower()
+def is_listening(address: str) -> bool:
+    """Return whether a process listens on this address, such as 127.0.0.1:80."""
+    host, port = address.split(":")
+    kernels = bytes(reversed([int(part) for part in host.split(".")])).hex()
+    return f"{kernels}:{int(port):04x} 00000000:0000 0a" in Path("/proc/net/tcp").read_text().lower()
 
 
 def test_a_panel_that_hangs_ends_with_the_run(tmp_path: Path):

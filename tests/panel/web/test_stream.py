@@ -26,7 +26,7 @@ class WebSocketStub:
     def __init__(self, max_frames: int, disconnects: bool = False) -> None:
         self.max_frames, self.disconnects, self.sent, self.closed = max_frames, disconnects, 0, False
 
-    async def accept(self) -> None:
+    async def accept(self, _: str) -> None:
         """Accept the connection at once."""
 
     async def receive(self) -> dict[str, Any]:

@@ -1,6 +1,6 @@
 // The recordings: a summary of each, its plot, its download, and a sweep from it behind the scope.
 
-import { get, getArrays } from "../api.js";
+import { get, getArrays, getBlob, post } from "../api.js";
 import { $, complain, make, say } from "../dom.js";
 import { bytes, counted, duration, fromField, significant } from "../numbers.js";
 
@@ -49,7 +49,7 @@ export class Recordings {
         act("Info", () => this.#info(file)),
         act("Plot", () => this.#plot(file)),
         act("Compare", () => this.#offer(recording)),
-        make("a", { href: address(file), download: file.replace(/\.part$/, ""), "aria-label": `Download ${file}` }, "Download"))));
+        act("Download", () => this.#download(file)))));
   }
 
   async #try(action) {
@@ -103,13 +103,21 @@ export class Recordings {
 
   async #plot(file) {
     const note = this.#wait(file);
-    const picture = make("img", { src: address(file, "/plot.png"), alt: `Plot of ${file}: its signals over time` });
-    picture.addEventListener("load", () => note.replaceWith(picture));
-    picture.addEventListener("error", () => {
+    try {
+      const picture = make("img", { src: URL.createObjectURL(await getBlob(address(file, "/plot.png"))), alt: `Plot of ${file}: its signals over time` });
+      picture.addEventListener("load", () => URL.revokeObjectURL(picture.src));
+      note.replaceWith(picture);
+    } catch (error) {
       if (!note.isConnected) return;
       this.#close();
-      complain($("recordings-error"), `${file}: the plot cannot be drawn; it needs matplotlib (pip install 'rtloop[plot]')`);
-    });
+      throw error;
+    }
+  }
+
+  /** The browser itself downloads, however large the file is; it sends no header, so that the path admits it once. */
+  async #download(file) {
+    const { path } = await post(address(file, "/ticket"));
+    make("a", { href: path, download: file.replace(/\.part$/, "") }).click();
   }
 
   /** Where in the recording the sweep begins is asked for; from there as long as the scope's screen. */
