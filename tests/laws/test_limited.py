@@ -103,7 +103,7 @@ def assert_refused(sentence: str, *arguments: object, file: object = "mine.py") 
         (10.1, 10.0, 0.1, True, "used more than 10 s of processor time"),
         (3.0, 10.0, 0.1, True, "used more than 10 s of processor time"),  # on several threads
         (200.0, 10.0, 190.0, True, "used more than 10 s of processor time"),
-        (30.2, 0.1, 0.1, True, "for 30 s it did not compute"),
+        (30.5, 0.1, 0.1, True, "for 30 s it did not compute"),
         (600.0, 0.12, 599.0, False, "had only 0.12 s of processor time within 600 s, because the host is too busy"),
     ],
 )
