@@ -98,7 +98,7 @@ def test_a_starved_supervisor_that_beats_again_trips_nothing(tmp_path: Path):
 @pytest.mark.parametrize("text", ["", stat("T")])
 def test_a_starved_supervisor_that_then_dies_is_lost_at_the_next_look(tmp_path: Path, text: str):
     loop = SilentSupervisor(tmp_path, wakes(), stat("R"))
-    loop.run(300)
+    loop.run(250)
     loop.stat(text)
     flags = loop.run()
     assert np.flatnonzero(flags & Flag.HEARTBEAT_LOST)[0] <= 2
