@@ -126,6 +126,20 @@ class Flag(IntFlag):
     TRIP_LAW = 1 << 19
 
 
+class Silence(IntEnum):
+    """Cause of a lost heartbeat, in the event of its trip."""
+
+    UNKNOWN = 0
+    """The supervisor's state could not be read, or an older version recorded the trip."""
+    DEAD = 1
+    STOPPED = 2
+    """A signal or a debugger stopped the supervisor."""
+    UNWATCHED = 3
+    """The supervisor's process lives, but its watch of the loop stands still."""
+    STARVED = 4
+    """The supervisor was ready to run, and the host gave it no processor for several timeouts."""
+
+
 class Failure(IntEnum):
     """Code of the law's function that failed and tripped the loop; RAISED is added if it raised an exception."""
 

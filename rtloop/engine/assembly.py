@@ -10,6 +10,7 @@ import numpy.typing as npt
 from rtloop.drivers.base import Channel, Facts, Pointers, Wiring, channel_index
 from rtloop.engine.clock import Clock, clock_context, paced_clock
 from rtloop.engine.context import LOOP
+from rtloop.engine.heartbeat import STAT_BYTES
 from rtloop.engine.late_clock import virtual_clock
 from rtloop.engine.loop import Outcome, run_ticks
 from rtloop.engine.memory import SharedBlock
@@ -69,7 +70,7 @@ class Assembly:
         self._set_functions(pointers, clock)
         period_s = 1.0 / plan.pacing.rate_hz
         self.loop.period_s, self.loop.period_us = period_s, period_s * 1e6
-        self.loop.heartbeat_timeout_ns = plan.pacing.heartbeat_timeout_s * 1e9
+        self.loop.heartbeat_timeout_ns, self.loop.heart_fd = plan.pacing.heartbeat_timeout_s * 1e9, -1
         self.loop.snapshot_ticks = max(1, round(SNAPSHOT_SECONDS * plan.pacing.rate_hz))
         self.loop.record_limit = UNLIMITED if plan.ticks is None else plan.ticks
 
@@ -126,6 +127,7 @@ class Assembly:
             "outputs": np.array([channel.safe_v for channel in facts.outputs]),
             "timing": np.zeros(4),
             "conditions": np.zeros(1, CONDITIONS),
+            "heart_text": np.zeros(STAT_BYTES, np.uint8),
             **{name: np.zeros(len(axes)) for name in ("adc_v", "references", "feeds_um")},
             **{
                 field: np.array([channel_index(channels, channel) for channel in channel_names], np.int64)

@@ -23,7 +23,7 @@ _ADDRESSES = (
     *("inputs", "outputs", "timing"),
     # law
     *("law", "generators", "table", "adc_v", "references", "feeds_um", "input_index", "output_index"),
-    *("conditions", "extra_input_index", "extra_output_index"),
+    *("conditions", "extra_input_index", "extra_output_index", "heart_text"),
     # shared block
     *("words", "last_drive_v", "commands", "commands_marks", "schedule", "staged"),
     *(f"{ring}_{part}" for ring in ("ticks", "events", "snapshots") for part in ("head", "marks", "slots")),
@@ -41,6 +41,7 @@ _SETTINGS = (
     ("period_s", np.float64),
     ("period_us", np.float64),
     ("heartbeat_timeout_ns", np.float64),
+    ("heart_fd", np.int32),
     ("snapshot_ticks", np.int64),
     ("record_limit", np.int64),
 )
@@ -59,6 +60,7 @@ _COUNTERS = (
     "late_periods",
     "late_largest",
     "next_snapshot",
+    "silence",
 )
 
 LOOP = np.dtype(
@@ -67,6 +69,7 @@ LOOP = np.dtype(
         *((name, np.uint32) for name in _COUNTS),
         *_SETTINGS,
         *((name, np.int64) for name in _COUNTERS),
+        *((name, np.float64) for name in ("next_look_ns", "silence_s")),
     ],
     align=True,
 )

@@ -24,6 +24,7 @@ from rtloop.engine.context import (
     tick_conditions,
     tick_ring,
 )
+from rtloop.engine.heartbeat import is_heartbeat_lost
 from rtloop.engine.memory import Word
 from rtloop.engine.messages import ALL_AXES, Kind, Origin
 from rtloop.engine.ring import claim, publish
@@ -81,7 +82,7 @@ class Outcome(IntEnum):
 
 
 READ_FAILED, WRITE_FAILED = 1, 2
-STOP_WORD, HEARTBEAT_WORD = int(Word.STOP), int(Word.HEARTBEAT_NS)
+STOP_WORD = int(Word.STOP)
 OFF = int(Mode.OFF)
 TRIP_LAW = float(Flag.TRIP_LAW)
 OVERRUN, WRITE_FAILED_FLAG, TRIP_HEARTBEAT = int(Flag.OVERRUN), int(Flag.WRITE_FAILED), int(Flag.TRIP_HEARTBEAT)
@@ -91,7 +92,7 @@ TRIPPED, DRIVER_FAILED = int(Kind.TRIPPED), int(Kind.DRIVER_FAILED)
 LATENESS_BEGINS, LATENESS_OVER = int(Kind.PERIODS_MISSED), int(Kind.LATENESS_OVER)
 DONE, STOPPED, FAILURE, ORPHANED, BROKEN = (int(outcome) for outcome in Outcome)
 LOOP_STATE_BYTES = LOOP_STATE.itemsize
-US_PER_NS = 1e-3
+US_PER_NS, NS_PER_US = 1e-3, 1e3
 TICK_BYTES = 8
 """Bytes of the tick at the beginning of a snapshot."""
 GIVE_UP_S = 1.0
@@ -180,7 +181,9 @@ def _execute_tick(loop):
     read_ns = _elapsed_ns(loop)
 
     lateness_us = (wake_ns - deadline_ns) * US_PER_NS
-    _evaluate_law(loop, status, now_ns, lateness_us)
+    late_ns = wake_ns - deadline_ns + missed * loop.period_us * NS_PER_US
+    lost = is_heartbeat_lost(loop, now_ns, late_ns)
+    _evaluate_law(loop, status, lost, lateness_us)
     law_ns = _elapsed_ns(loop)
 
     write_status = call(loop.write, loop.driver_context, loop.outputs)
@@ -251,10 +254,10 @@ def _hold_outputs(loop):
 
 
 @jit
-def _evaluate_law(loop, status, now_ns, lateness_us):
+def _evaluate_law(loop, status, heartbeat_lost, lateness_us):
     """Compute references and the law from the inputs that were read; set the driver's outputs, in V.
 
-    `status` is the read's, below 0 for a failure, which trips; `now_ns` is the wake in ns of CLOCK_MONOTONIC.
+    `status` is the read's, below 0 for a failure, which trips, as a lost heartbeat does.
     """
     inputs = float_array(loop.inputs, loop.input_count + 1 + loop.observed_count)
     outputs = float_array(loop.outputs, loop.output_count)
@@ -272,10 +275,9 @@ def _evaluate_law(loop, status, now_ns, lateness_us):
         adc_v[a] = inputs[input_index[a]]
         references[a] = reference_sample(generators[a], loop.tick, loop.period_s, table, inputs)
         feeds_um[a] = generators[a].feed_um
-    heartbeat_ns = float(load_acquire(control_words(loop), HEARTBEAT_WORD))
     conditions = tick_conditions(loop)
     conditions.driver_status = status
-    conditions.heartbeat_lost = 1 if now_ns - heartbeat_ns > loop.heartbeat_timeout_ns else 0
+    conditions.heartbeat_lost = 1 if heartbeat_lost else 0
     conditions.sample_age_us = inputs[loop.input_count]
     conditions.lateness_us = lateness_us
     conditions.enable_v = inputs[loop.enable_index] if loop.enable_index >= 0 else 0.0
@@ -379,6 +381,10 @@ def _publish_trip(loop, causes):
     the number of its law.
     """
     trip = trip_record(law_record(loop))
+    if trip.cause == 0 and int(causes) & TRIP_HEARTBEAT != 0:
+        silence = (float(causes), loop.silence_s, loop.heartbeat_timeout_ns * 1e-9, 0.0, float(loop.silence))
+        publish_event(loop, TRIPPED, ALL_AXES, LOOP_ORIGIN, 0, silence)
+        return
     values = (float(causes), trip.value, trip.limit, float(trip.cause), float(trip.law))
     publish_event(loop, TRIPPED, trip.axis, LOOP_ORIGIN, 0, values)
 

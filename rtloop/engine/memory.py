@@ -74,6 +74,9 @@ class Word(IntEnum):
     ANNOUNCED_LOST = 20
     ANNOUNCED_BYTE = 21
     """Offset in its file at which that write begins."""
+    SUPERVISOR_PID = 22
+    HEART_THREAD = 23
+    """Number of the supervisor's thread that renews the heartbeat."""
 
 
 class ProcessState(IntEnum):

@@ -43,7 +43,8 @@ class Kind(IntEnum):
     TRIPPED = 101
     """values[0]: the new causes as Flag bits. values[3]: first cause of the axis, 0 without axis; values[1]: its value
     and values[2]: its limit, in the unit of the Flag member. Failure of a law: values[1] is the returned value,
-    values[2] the `Failure`, values[4] the law's number."""
+    values[2] the `Failure`, values[4] the law's number. A lost heartbeat alone: values[1] is the length of the silence
+    and values[2] the heartbeat's timeout, in s, values[4] the `Silence`."""
     PARKED = 102
     """All outputs are at their safe values."""
     DRIVER_FAILED = 103

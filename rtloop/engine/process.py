@@ -1,7 +1,7 @@
 """Process of the loop: `python -m rtloop.engine.process --fd N`, the plan on stdin, one JSON line per report on stdout.
 
 No thread, garbage collection or signal handler runs beside the compiled loop. The process ends after the stop word of
-the shared block, after its last tick, or when the supervisor's heartbeat stops; it always ramps down and closes the
+the shared block, after its last tick, or when the supervisor's heartbeat is lost; it always ramps down and closes the
 driver first.
 """
 
@@ -21,6 +21,7 @@ from rtloop.drivers.base import Driver, Facts, Pointers
 from rtloop.drivers.errors import DriverError
 from rtloop.engine.assembly import UNLIMITED, Assembly, law_at_rest, rehearse
 from rtloop.engine.clock import clock_context, paced_clock
+from rtloop.engine.heartbeat import open_heart_state
 from rtloop.engine.late_clock import virtual_clock
 from rtloop.engine.loop import WRITE_FAILED, Outcome
 from rtloop.engine.memory import ProcessState, SharedBlock, Word
@@ -127,7 +128,8 @@ def _open_driver(driver: Driver) -> Pointers:
 def _run_plan(plan: Plan, block: SharedBlock, driver: Driver, facts: Facts) -> Outcome:
     """Open the driver, ramp to safe, wait for GO, run all ticks, ramp down; return why the run ended.
 
-    A stop, or a lost heartbeat, before GO ends the run without a tick. Raises HostRefusal if real time is required and
+    A stop, or the supervisor's death, before GO ends the run without a tick: the outputs are safe by then, so that a
+    supervisor that only waits has no limit. Raises HostRefusal if real time is required and
     refused, DriverError if the driver cannot be opened or refuses the ramp, ValueError for a law that cannot be
     compiled, for a channel that the driver lacks and for a clock that `virtual_clock` refuses.
     """
@@ -141,6 +143,8 @@ def _run_plan(plan: Plan, block: SharedBlock, driver: Driver, facts: Facts) -> O
     virtual = None if plan.pacing.paced else virtual_clock(plan, facts, block, pointers, slack)
     clock = paced_clock(context, plan.pacing.spin_us) if virtual is None else virtual.clock
     assembly = Assembly(plan, block, facts, pointers, clock, law_at_rest(plan))
+    if plan.pacing.paced:
+        assembly.loop.heart_fd = open_heart_state(block)
     assembly.run(0)  # compiles, or loads the compiled loop, before anything is timed
     freeze_garbage_collection()
     realtime = prepare_realtime(plan.pacing)
@@ -155,7 +159,7 @@ def _run_plan(plan: Plan, block: SharedBlock, driver: Driver, facts: Facts) -> O
     while not block.load(Word.GO):
         if block.load(Word.STOP):
             return Outcome.STOPPED
-        if time.monotonic_ns() - block.load(Word.HEARTBEAT_NS) > plan.pacing.heartbeat_timeout_s * 1e9:
+        if os.getppid() != block.load(Word.SUPERVISOR_PID):
             return Outcome.HEARTBEAT_LOST
         time.sleep(GO_POLL_S)
     if plan.pacing.paced:

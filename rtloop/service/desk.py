@@ -150,7 +150,9 @@ class Desk:
         timeout_s = ANSWER_TIMEOUT_S + ANSWER_PERIODS * self._period_s
         ring, deadline = self._block.ring("events"), time.monotonic() + timeout_s
         events: npt.NDArray[np.void] = np.zeros(64, MESSAGE)
-        while time.monotonic() < deadline:
+        is_late = False
+        while not is_late:
+            is_late = time.monotonic() >= deadline  # Read first: a stalled service looks once more after the deadline.
             event_count, first, _ = drain(ring, cursor, events)
             cursor = int(first) + event_count
             for event in events[:event_count]:

@@ -412,8 +412,9 @@ class Service:
                 row = supervisor.latest()
                 causes = [] if row is None else signals.trip_causes(row[signals.FLAGS])
                 if state is State.TRIPPED:
-                    reason = supervisor.trip_reason if causes else None
-                    reasons = ", ".join([*causes, *([reason] if reason else [])])  # Faults are in the log already.
+                    # Faults are in the log already; a lost heartbeat ends the loop, and its fault is logged then.
+                    reason = supervisor.trip_reason if causes not in ([], ["heartbeat"]) else None
+                    reasons = ", ".join([*causes, *([reason] if reason else [])])
                     log.error("%s", f"{state}: {reasons}" if reasons else state)
                 else:
                     log.info("%s", state)
@@ -466,7 +467,8 @@ class Service:
         Returns True if the loop may be started again; False, without the pause, after more than service.restarts
         failures in service.restart_window_s.
         """
-        self.faults.append(reason)
+        if reason not in self.faults:
+            self.faults.append(reason)
         log.error("%s", reason)
         options, now_s = self.configuration.service, time.monotonic()
         self._deaths_s = [moment for moment in self._deaths_s if now_s - moment < options.restart_window_s] + [now_s]

@@ -8,9 +8,14 @@ import queue
 import subprocess
 import sys
 import threading
+from pathlib import Path
 from typing import Any
 
+from rtloop.foundation.processors import processor_time_s
+
 END_TIMEOUT_S = 5.0
+STATE_FIELD, READY_TO_RUN = 0, "R"
+"""Index of the state in `stat_fields`; state of a process that runs or waits for a processor."""
 
 
 class Child:
@@ -65,6 +70,19 @@ class Child:
         """Exit code of the child: None while it runs, negative (the signal's number) if a signal ended it."""
         return self.process.poll()
 
+    @property
+    def processor_s(self) -> float:
+        """Processor time that the child has used, in s; 0 once it has ended."""
+        return processor_time_s(self.process.pid)
+
+    @property
+    def is_ready_to_run(self) -> bool:
+        """Whether the child's main thread runs or waits for a processor; False if /proc cannot be read."""
+        try:
+            return stat_fields(self.process.pid)[STATE_FIELD] == READY_TO_RUN
+        except OSError:
+            return False
+
     def wait(self, timeout_s: float) -> int | None:
         """Wait for the child's end and last reports. Returns its exit code; None if it still runs after `timeout_s`."""
         try:
@@ -108,3 +126,8 @@ class Child:
                 continue
             if isinstance(report, dict):
                 self._reports.put(report)
+
+
+def stat_fields(pid: int) -> list[str]:
+    """Return the fields of /proc/PID/stat after the process's name. Raises OSError if it cannot be read."""
+    return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()

@@ -5,7 +5,9 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Callable
-from typing import TypedDict
+from typing import Any, Protocol, TypedDict
+
+import numpy as np
 
 from rtloop.engine.memory import SharedBlock, Word
 from rtloop.errors import LOW_SPACE
@@ -21,6 +23,18 @@ QUIET_S = 1.0
 """A gap ends after this time without a fault."""
 
 
+class ReadableBlock(Protocol):
+    """A shared block, of which control words and arrays can be read."""
+
+    def load(self, word: Word) -> int:
+        """Return a control word."""
+        ...
+
+    def __getitem__(self, name: str) -> np.ndarray[Any, Any]:
+        """Return an array by its name."""
+        ...
+
+
 class RecordingState(TypedDict):
     """Whether ticks are recorded now; the fields are described at `recording_state`."""
 
@@ -30,7 +44,7 @@ class RecordingState(TypedDict):
     ticks_lost: int
 
 
-def recording_state(block: SharedBlock) -> RecordingState:
+def recording_state(block: ReadableBlock) -> RecordingState:
     """Return {state: "recording" or "not recording", reason, since_tick: first tick without record, ticks_lost}.
 
     `ticks_lost` counts the ticks that are in no file although the recorder has passed them: ticks that still wait in

@@ -29,8 +29,9 @@ from rtloop.foundation.arrays import Real
 from rtloop.foundation.native.cache import stored_file_count
 from rtloop.recording.capture.requester_names import RequesterNames
 from rtloop.recording.file.topics.events import law_label, trip_reason
-from rtloop.supervision.child import Child
+from rtloop.supervision.child import Child, stat_fields
 from rtloop.supervision.description import recording_header
+from rtloop.supervision.heart import Heart
 from rtloop.supervision.host_delay import require_margins
 from rtloop.supervision.parking import park
 from rtloop.supervision.paths import create_file
@@ -40,9 +41,6 @@ from rtloop.supervision.stall import StallWatch, stall_limit_s
 
 POLL_S, START_POLL_S = 0.005, 0.002
 PROGRESS_PERIOD_S = 0.1
-HEARTBEAT_PERIOD_S = 0.02
-WATCH_TIMEOUT_S = 2.0
-"""The heartbeat continues while the last `poll` is not older than this."""
 LONGEST_STEP_S = 0.01
 END_TIMEOUT_S = 30.0
 START_TIMEOUT_S = 300.0
@@ -50,7 +48,7 @@ START_TIMEOUT_S = 300.0
 ATTENDED_STALL_S = 2.0
 """Longest time without a tick in a run that a user watches: a host that stalls for half a second must not end it."""
 START_TIME_FIELD = 19
-"""Index of the start time in /proc/PID/stat, counted after the process's name."""
+"""Index of the start time in `stat_fields`."""
 OUTCOME_MESSAGES = {
     "heartbeat_lost": "the loop received no heartbeat from its supervisor and parked the outputs",
     "law_failed": "the memory of the law is invalid (a count or an index is beyond its array, or an axis has not "
@@ -133,11 +131,9 @@ class Supervisor:
         self.names = processes.names
         self.recorder = RecorderKeeper(processes.recorder, self.block, self.names, recording, options)
         self._stall = StallWatch(stall_limit_s(stall_s, prepared.plan.pacing.rate_hz), LONGEST_STEP_S)
-        self._has_stalled = False
+        self._tick_processor_s, self._stall_text = 0.0, ""
         self._reports: dict[str, dict[str, Any]] = {}
-        self._watched_s, self._closed = time.monotonic(), threading.Event()
-        self._heart = threading.Thread(target=self._beat, daemon=True)
-        self._heart.start()
+        self._heart = Heart(self.block)
 
     def stop(self) -> None:
         """Tell the loop to ramp down and end; does not wait for it."""
@@ -213,10 +209,10 @@ class Supervisor:
         self.recorder.start(recording_header(self.prepared, self.realtime))
         deadline = time.monotonic() + START_TIMEOUT_S
         while not self.recorder.recording:
-            self._watched_s = time.monotonic()
+            self._heart.watch()
             if self.recorder.failure is not None:
                 raise self.recorder.failure
-            if self._watched_s > deadline:
+            if time.monotonic() > deadline:
                 raise UnavailableError(
                     f"the recording was not open within {START_TIMEOUT_S:g} s; its file system may not answer; check "
                     "the disk of recording.folder"
@@ -232,7 +228,7 @@ class Supervisor:
         Returns the result once loop and recorder have ended, None before. May take seconds when it kills the loop or
         parks its outputs, which ramp.
         """
-        self._watched_s = time.monotonic()
+        self._heart.watch()
         self._collect_reports()
         if not self.ended and (self._loop.exit_code is not None or self._kill_stalled_loop()):
             self._end_run()
@@ -248,19 +244,11 @@ class Supervisor:
         self.stop()
         deadline = time.monotonic() + END_TIMEOUT_S
         while self._loop.exit_code is None and time.monotonic() < deadline:
-            self._watched_s = time.monotonic()
+            self._heart.watch()
             time.sleep(START_POLL_S)
-        self._closed.set()
-        self._heart.join()
+        self._heart.end()
         self._loop.end()
         self.recorder.close()
-
-    def _beat(self) -> None:
-        """Renew the heartbeat until `close`, while the last `poll` is not older than WATCH_TIMEOUT_S."""
-        while not self._closed.is_set():
-            if time.monotonic() - self._watched_s < WATCH_TIMEOUT_S:
-                self.block.store(Word.HEARTBEAT_NS, time.monotonic_ns())
-            self._closed.wait(HEARTBEAT_PERIOD_S)
 
     def _collect_reports(self) -> None:
         """Store the newest report of each kind from the loop's process."""
@@ -274,9 +262,17 @@ class Supervisor:
             is_running and self.prepared.plan.pacing.paced and self.ticks and not self.block.load(Word.FINISHED_TICKS)
         ):
             return False
-        if not self._stall.has_stalled(self.ticks, time.monotonic()):
+        has_stalled = self._stall.has_stalled(self.ticks, time.monotonic())
+        if self._stall.stalled_s == 0.0:
+            self._tick_processor_s = self._loop.processor_s
+        if not has_stalled:
             return False
-        self._has_stalled = True
+        self._stall_text = "stood still and was killed"
+        if self._loop.is_ready_to_run and self._loop.processor_s - self._tick_processor_s < self._stall.stalled_s / 2:
+            self._stall_text = (
+                f"got too little of a processor on a busy host, had no tick for {self._stall.stalled_s:.2g} s, and was "
+                "killed"
+            )
         self._loop.end()
         return True
 
@@ -288,7 +284,7 @@ class Supervisor:
         """
         deadline, compiled = time.monotonic() + START_TIMEOUT_S, stored_file_count()
         while True:
-            self._watched_s = time.monotonic()
+            self._heart.watch()
             self._collect_reports()
             if "ready" in self._reports and self.recorder.state >= ProcessState.READY:
                 self.realtime = self._reports["ready"]["realtime"]
@@ -332,9 +328,7 @@ class Supervisor:
     def _end_run(self) -> None:
         """Set `ended` and let the recorder finish; park the outputs and set `error` if the loop's process died."""
         if not ProcessState.has_ended(self.block.load(Word.LOOP_STATE)):
-            death_text = (
-                "stood still and was killed" if self._has_stalled else f"died ({_ending_text(self._loop.exit_code)})"
-            )
+            death_text = self._stall_text or f"died ({_ending_text(self._loop.exit_code)})"
             self.error = f"the loop's process {death_text}; {self._park()}"
             self.block.store(Word.LOOP_STATE, ProcessState.FAILED)
         self.ended = True
@@ -351,6 +345,8 @@ class Supervisor:
         finished, failed = self._reports.get("finished", {}), self._reports.get("failed", {})
         outcome = finished.get("outcome", "failed" if failed else "killed")
         error = self.error or finished.get("driver_error") or failed.get("message") or OUTCOME_MESSAGES.get(outcome)
+        if outcome == "heartbeat_lost" and (reason := self.trip_reason) is not None:
+            error = f"{reason}; the loop parked the outputs"
         error = error or totals.get("error")
         code = self._loop.exit_code or 0
         if code <= 0 and (outcome not in ("done", "stopped") or not totals.get("complete")):
@@ -373,8 +369,7 @@ def process_age_s() -> float:
 
     Raises OSError if /proc cannot be read.
     """
-    fields = Path("/proc/self/stat").read_text().rpartition(")")[2].split()
-    started_s = int(fields[START_TIME_FIELD]) / os.sysconf("SC_CLK_TCK")
+    started_s = int(stat_fields(os.getpid())[START_TIME_FIELD]) / os.sysconf("SC_CLK_TCK")
     return time.clock_gettime(time.CLOCK_BOOTTIME) - started_s
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Callable
 from dataclasses import replace
 from types import SimpleNamespace
@@ -16,9 +15,10 @@ from rtloop.drivers.playback import Playback
 from rtloop.engine import in_process, process
 from rtloop.engine.loop import Outcome
 from rtloop.engine.memory import Word
-from rtloop.engine.messages import Kind, Origin
+from rtloop.engine.messages import Kind, Origin, message
 from rtloop.engine.plan import Pacing
 from rtloop.errors import ConfigError
+from rtloop.recording.file.topics.events import trip_reason
 from rtloop.signals import Flag, Mode
 from tests.drivers.bench_driver import LoopBack
 from tests.engine.failing_driver import ScriptedDriver
@@ -176,18 +176,27 @@ def test_a_lost_heartbeat_parks():
         flags[101:] & (Flag.TRIP_HEARTBEAT | Flag.HEARTBEAT_LOST) == Flag.TRIP_HEARTBEAT | Flag.HEARTBEAT_LOST
     )
     np.testing.assert_allclose(bench.column(rows, "x_drive_v")[101:], RAMP, rtol=0, atol=1e-12)
-    assert bench.events() == [(101, Kind.TRIPPED, Flag.TRIP_HEARTBEAT, 0.0)]
+    assert bench.events() == [(101, Kind.TRIPPED, Flag.TRIP_HEARTBEAT, pytest.approx(1.0001))]
 
 
 def test_the_trip_of_a_lost_heartbeat_tells_its_reason():
-    """The trip belongs to no axis, so its event has no value and no limit."""
     clock = ScriptedClock(np.column_stack([np.zeros((9, 3)), np.full(9, 9e9)]))
     bench = LoopBench(RAW, clock=clock)
     bench.block.store(Word.HEARTBEAT_NS, 5_000_000_000)
     bench.run(3)
     (event,) = bench.trips()
     assert (event["axis"], event["what"]["causes"]) == (None, ["heartbeat"])
-    assert re.match("the heartbeat of `rtloop run` or of the service stopped", event["what"]["reason"])
+    assert event["what"]["reason"] == (
+        "the heartbeat of `rtloop run` or of the service stopped for 4 s: that process died or stood still"
+    )
+
+
+def test_the_trip_of_a_lost_heartbeat_in_an_older_recording_tells_its_reason():
+    """Its event has the causes alone."""
+    event = message(Kind.TRIPPED, values=[Flag.TRIP_HEARTBEAT])
+    assert trip_reason(event[0], ["x"], []) == (
+        "the heartbeat of `rtloop run` or of the service stopped: that process died or stood still"
+    )
 
 
 @pytest.mark.parametrize(("status", "tripped"), [(2, False), (-7, True)])

@@ -15,6 +15,7 @@ from rtloop.cli import main
 from rtloop.configuration.file import parse
 from rtloop.configuration.prepare import prepare
 from rtloop.errors import ConfigError
+from rtloop.laws.limited import process as process_module
 from rtloop.laws.limited import trial
 from rtloop.laws.limited.process import MAX_OUTPUT_BYTES, PROCESS, LimitedProcess
 from rtloop.laws.registry import law_from_text
@@ -35,11 +36,17 @@ ENDED, CORRECT = (
     "correct the code, which exits, crashes or exhausts the memory",
 )
 STOPPED = (
-    f"the code took longer than {LIMIT_S:g} s and was stopped; make it faster, or correct a loop that does not end"
+    f"the code used more than {LIMIT_S:g} s of processor time and was stopped; make it faster, or correct a loop that "
+    "does not end"
+)
+SLEPT = (
+    f"the code was stopped, because for {3 * LIMIT_S:g} s it did not compute; correct code that sleeps, or waits for a "
+    "file, a lock or another process"
 )
 CHATTY = f"the code printed more than {MAX_OUTPUT_BYTES >> 10} KiB; let it print less"
 AT_IMPORT = {
     "never ends": ("while True:\n    pass\n", STOPPED),
+    "sleeps for ever": ("import time\ntime.sleep(1e6)\n", SLEPT),
     "exits": ("import sys\nsys.exit(0)\n", "raised SystemExit: 0, in line 2"),
     "is interrupted": ("raise KeyboardInterrupt\n", "raised KeyboardInterrupt, in line 1"),
     "raises what has no words": (NASTY, "raised OSError: no words, in line 3"),
@@ -87,11 +94,33 @@ def assert_refused(sentence: str, *arguments: object, file: object = "mine.py") 
     assert "Traceback" not in result.output
 
 
+@pytest.mark.parametrize(
+    ("passed_s", "computed_s", "waited_s", "is_by_law", "words"),
+    [
+        (120.0, 9.9, 110.0, None, ""),  # twenty other programs on two processors
+        (599.0, 0.1, 598.0, None, ""),
+        (29.0, 0.1, 0.0, None, ""),
+        (10.1, 10.0, 0.1, True, "used more than 10 s of processor time"),
+        (3.0, 10.0, 0.1, True, "used more than 10 s of processor time"),  # on several threads
+        (200.0, 10.0, 190.0, True, "used more than 10 s of processor time"),
+        (30.5, 0.1, 0.1, True, "for 30 s it did not compute"),
+        (600.0, 0.12, 599.0, False, "had only 0.12 s of processor time within 600 s, because the host is too busy"),
+    ],
+)
+def test_the_code_is_judged_by_its_processor_time(monkeypatch, passed_s, computed_s, waited_s, is_by_law, words):
+    """The limit is 10 s; None for a process that goes on."""
+    times = [(0.0, 2.0, 3.0), (passed_s, 2.0 + computed_s, 3.0 + waited_s)]
+    monkeypatch.setattr(process_module._Clock, "_times_s", property(lambda _: times.pop(0)))
+    remaining_s, blamed, excess = process_module._Clock(10.0, None).verdict
+    assert remaining_s <= 0.0 or is_by_law is None
+    assert (blamed, words in excess) == (is_by_law, True) or remaining_s > 0.0
+
+
 @pytest.mark.parametrize("name", AT_IMPORT)
 def test_a_file_that_does_as_it_is_read(name: str):
     """The test calls the function that commands use; tests with commands follow."""
     text, sentence = AT_IMPORT[name]
-    PROCESS.limit_s = LIMIT_S if "longer" in sentence else 10.0
+    PROCESS.limit_s = LIMIT_S if "was stopped" in sentence else 10.0
     with pytest.raises(ConfigError) as refusal:
         trial.try_limited("lab.toml", law_from_text, text + law_text(), "mine.py", "mine")
     assert refusal.value.faults == [f"law 'mine' (mine.py): {sentence}"]
@@ -101,7 +130,7 @@ def test_a_file_that_does_as_it_is_read(name: str):
 @pytest.mark.parametrize("name", IN_BUILD)
 def test_a_law_that_does_as_it_is_built(write_law: Callable[[str], Path], name: str):
     line, sentence = IN_BUILD[name]
-    PROCESS.limit_s = LIMIT_S if "longer" in sentence else 10.0
+    PROCESS.limit_s = LIMIT_S if "was stopped" in sentence else 10.0
     assert_refused(sentence, "design", "verify", write_law(law_text().replace(BUILD, f"{BUILD}        {line}\n")))
 
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import threading
-import time
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -23,7 +21,7 @@ from rtloop.service.status import status
 from rtloop.supervision import parking, recorder_keeper
 from rtloop.supervision.recorder_keeper import RecorderKeeper
 from rtloop.supervision.stall import StallWatch
-from rtloop.supervision.supervisor import WATCH_TIMEOUT_S, Supervisor
+from rtloop.supervision.supervisor import Supervisor
 from tests.laws.test_shipped import DEPLOY
 
 SIZES = Sizes(columns=1, axes=1, rate_hz=1000.0, snapshot_bytes=8, table_samples=1)
@@ -63,14 +61,26 @@ def test_a_loop_without_its_service_has_the_time_that_its_ramp_takes(block, monk
     assert killed_s[0] - 1000.0 == pytest.approx(1.0 + 5.0 + parking.MARGIN_S, abs=2 * parking.POLL_S)
 
 
-@pytest.mark.parametrize(("silent_s", "beats"), [(0.5 * WATCH_TIMEOUT_S, True), (1.5 * WATCH_TIMEOUT_S, False)])
-def test_the_heart_beats_only_while_the_loop_is_watched(block, silent_s, beats):
+@pytest.mark.parametrize(
+    ("is_ready", "processor_s", "text"),
+    [
+        (True, 0.1, "got too little of a processor on a busy host, had no tick for 1 s, and was killed"),
+        (True, 0.9, "stood still and was killed"),  # such as a law that does not return
+        (False, 0.0, "stood still and was killed"),
+    ],
+)
+def test_a_loop_that_got_no_processor_is_told_from_one_that_stood_still(block, is_ready, processor_s, text):
     supervisor: Any = object.__new__(Supervisor)
-    closed = threading.Event()
-    supervisor.block, supervisor._watched_s = block, time.monotonic() - silent_s
-    supervisor._closed = SimpleNamespace(is_set=closed.is_set, wait=lambda _: closed.set())
-    supervisor._beat()
-    assert (block.load(Word.HEARTBEAT_NS) != 0) == beats
+    supervisor.block, supervisor._stall = block, StallWatch(1.0, 1.0)
+    supervisor.prepared = SimpleNamespace(plan=SimpleNamespace(pacing=SimpleNamespace(paced=True)))
+    supervisor._loop = SimpleNamespace(end=lambda: None, processor_s=7.0, is_ready_to_run=is_ready)
+    block.store(Word.LOOP_STATE, ProcessState.RUNNING)
+    block["ticks_head"][0] = 100
+    assert not supervisor._kill_stalled_loop()
+    supervisor._loop.processor_s += processor_s
+    supervisor._stall._last_s -= 1.0
+    assert supervisor._kill_stalled_loop()
+    assert supervisor._stall_text == text
 
 
 def test_a_loop_that_ramps_down_behind_its_last_tick_does_not_stand_still(block):
@@ -79,7 +89,7 @@ def test_a_loop_that_ramps_down_behind_its_last_tick_does_not_stand_still(block)
     end_calls: list[bool] = []
     supervisor.block, supervisor._stall = block, StallWatch(0.0, 1.0)
     supervisor.prepared = SimpleNamespace(plan=SimpleNamespace(pacing=SimpleNamespace(paced=True)))
-    supervisor._loop = SimpleNamespace(end=lambda: end_calls.append(True))
+    supervisor._loop = SimpleNamespace(end=lambda: end_calls.append(True), processor_s=0.0, is_ready_to_run=False)
     block.store(Word.LOOP_STATE, ProcessState.RUNNING)
     block["ticks_head"][0] = 100
     block.store(Word.FINISHED_TICKS, 100)

@@ -22,6 +22,7 @@ from rtloop.recording.file.topics.recovery_steps import RecoveryStep, StepReason
 from rtloop.service.changing.active_references import NO_TRIP, Trip
 from rtloop.service.changing.references import Setting
 from rtloop.service.desk import Desk, Refusal, Requester, use_requester
+from rtloop.service.recovering import comeback
 from rtloop.service.recovering.comeback import BUMP_FACTOR, RunningLoop, raised_cosine, ramp_ticks
 from rtloop.service.recovering.recovery import HOUR_S, LONGEST_PAUSE_S, Recovery
 from rtloop.service.recovering.soundness import unsound_reason
@@ -487,3 +488,17 @@ def test_a_policy_that_cannot_be_is_refused(keys, message):
 def test_recovery_is_off_by_default():
     configuration: Configuration = PREPARED.configuration
     assert configuration.service.recover is None
+
+
+def test_a_record_that_came_while_the_service_stalled_is_found(monkeypatch):
+    """The first pause ends long after the deadline."""
+    now_s, rows = [0.0], np.zeros((0, 10))
+
+    def sleep(_: float) -> None:
+        nonlocal rows
+        now_s[0] += 60.0
+        rows = np.full((1, 10), 7.0)
+
+    supervisor: Any = SimpleNamespace(newest=lambda _: rows, ticks=8)
+    monkeypatch.setattr(comeback, "time", SimpleNamespace(monotonic=lambda: now_s[0], sleep=sleep))
+    assert comeback._await_record(supervisor, 7)[0] == 7.0

@@ -4,19 +4,26 @@ from __future__ import annotations
 
 import json
 import os
+import pickle
 import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 import rtloop
+from rtloop.configuration.file import load
+from rtloop.configuration.prepare import prepare
+from rtloop.engine.memory import SharedBlock, Word
 from rtloop.errors import UnavailableError
 from rtloop.recording.replay.replay import replay
 from rtloop.supervision import supervisor
+from rtloop.supervision.child import Child
 from tests.recording.real_loop import read_rows, record
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -165,16 +172,69 @@ def test_a_loop_without_its_supervisor_parks_and_ends(tmp_path: Path) -> None:
     process = start("run", PAPER, "--out", tmp_path, "--json")
     pids = process_ids(process)
     wait_for_ticks(tmp_path)
+    kill_and_await_end(process, pids)
+    recording = rtloop.load(next(tmp_path.glob("*.mcap")))
+    assert recording["x_drive_v"][-1] == 0.0
+    tripped = [event for event in recording.events if event["kind"] == "tripped"]
+    assert tripped[0]["what"]["causes"] == ["heartbeat"]
+    assert "that process died" in tripped[0]["what"]["reason"]
+    assert replay(recording).identical
+
+
+def kill_and_await_end(process: subprocess.Popen[str], pids: dict[str, int]) -> None:
+    """Kill the supervisor, and wait until the processes of loop and recorder are gone."""
     process.kill()
     process.communicate(timeout=TIMEOUT_S)
     deadline = time.monotonic() + TIMEOUT_S
     while any(Path(f"/proc/{pid}").exists() for pid in pids.values()) and time.monotonic() < deadline:
         time.sleep(0.05)
     assert not any(Path(f"/proc/{pid}").exists() for pid in pids.values())
-    recording = rtloop.load(next(tmp_path.glob("*.mcap")))
-    assert recording["x_drive_v"][-1] == 0.0
-    tripped = [event for event in recording.events if event["kind"] == "tripped"]
-    assert tripped[0]["what"]["causes"] == ["heartbeat"]
+
+
+def test_an_unpaced_loop_without_its_supervisor_ends(tmp_path: Path) -> None:
+    process = start("run", PAPER, "--out", tmp_path, "--unpaced", "--json")
+    pids = process_ids(process)
+    wait_for_ticks(tmp_path)
+    kill_and_await_end(process, pids)
+
+
+def test_a_stopped_supervisor_is_told_from_a_dead_one(tmp_path: Path) -> None:
+    """The loop parks and ends while `rtloop run` is stopped, which then names the cause once."""
+    process = start("run", PAPER, "--out", tmp_path, "--json")
+    loop = process_ids(process)["engine.process"]
+    wait_for_ticks(tmp_path)
+    process.send_signal(signal.SIGSTOP)
+    deadline = time.monotonic() + TIMEOUT_S
+    while Path(f"/proc/{loop}/stat").read_text().rpartition(")")[2].split()[0] != "Z" and time.monotonic() < deadline:
+        time.sleep(0.05)
+    process.send_signal(signal.SIGCONT)
+    code, summary, err = finish(process)
+    assert (code, summary["outcome"]) == (1, "heartbeat_lost")
+    assert "was stopped by a signal" in summary["trips"][0]["reason"]
+    assert err.count("stopped by a signal") == 1, err
+
+
+@pytest.mark.parametrize(("supervisor_pid", "outcome"), [(os.getpid(), "done"), (1 << 22, "heartbeat_lost")])
+def test_before_its_first_tick_a_loop_in_virtual_time_waits_for_a_supervisor_that_lives(
+    supervisor_pid: int, outcome: str
+) -> None:
+    """The newest heartbeat is as old as the host; a number above the kernel's largest stands for a dead supervisor."""
+    plan = replace(prepare(load(PAPER), paced=False).plan, ticks=10)
+    block = SharedBlock.create(plan.sizes)
+    block.store(Word.SUPERVISOR_PID, supervisor_pid)
+    block.store(Word.HEARTBEAT_NS, 1)
+    loop = Child("rtloop.engine.process", block.fd)
+    loop.send(pickle.dumps(plan))
+    reports: list[dict[str, Any]] = []
+    while not reports and loop.exit_code is None:
+        time.sleep(0.001)
+        reports += loop.reports()
+    block.store(Word.GO, outcome == "done")
+    assert loop.wait(TIMEOUT_S) is not None
+    reports += loop.reports()
+    assert [report.get("outcome") for report in reports] == [None, outcome]
+    assert int(block["ticks_head"][0]) == (10 if outcome == "done" else 0)
+    loop.end()
 
 
 def test_a_trip_is_recorded_and_ends_with_exit_1(tmp_path: Path) -> None:

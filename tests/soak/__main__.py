@@ -10,6 +10,7 @@ LONG_TESTS = {
     "api-flood": ("tests.soak.api_flood", "eight clients call the control API beside a paced run"),
     "archive": ("tests.soak.archive", "500 recordings, 7 of them bad, on processes and on Dask; 2 minutes"),
     "backends": ("tests.soak.backends", "one configuration on every backend that needs no hardware; 2 minutes"),
+    "busy": ("tests.soak.busy", "runs, services and lost supervisors beside 20 busy loops; 2 hours"),
     "campaign": ("tests.soak.campaign", "campaigns against theory, coverage, efficiency, memory; 15 minutes"),
     "campaign-accidents": ("tests.soak.campaign_accidents", "killed schedulers and workers, a full disk; 3 minutes"),
     "chain": ("tests.soak.chain", "record, identify, design and run 40 random rigs; 10 minutes"),

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from rtloop.engine.memory import DIRECTORY_BYTES
+from rtloop.engine.memory import DIRECTORY_BYTES, Word
 from rtloop.engine.messages import MESSAGE
 from rtloop.engine.ring import Ring
 from rtloop.foundation.trusted import close_descriptor
@@ -33,6 +33,14 @@ class BlockMapping:
         """Return the ring of events as read-only views of the block; `slots` (capacity,) of MESSAGE."""
         head, marks = (self._array(f"events_{part}") for part in ("head", "marks"))
         return Ring(head, marks, self._array("events_slots", MESSAGE))
+
+    def load(self, word: Word) -> int:
+        """Return a control word of the block."""
+        return int(self["words"][word])
+
+    def __getitem__(self, name: str) -> np.ndarray:
+        """Return a read-only view of the block's array `name`. Raises KeyError for an unknown name."""
+        return self._array(name)
 
     def _array(self, name: str, dtype: np.dtype | None = None) -> np.ndarray:
         """Return a read-only view of the block's array `name`; `dtype` replaces the type that the block states.

@@ -13,6 +13,7 @@ from rtloop.client.ticks.tick_stretch import Stretch
 from rtloop.engine.messages import MESSAGE
 from rtloop.engine.ring import Ring, drain
 from rtloop.errors import UnavailableError
+from rtloop.supervision.recording_state import RecordingState, recording_state
 
 MAX_TICKS = 1 << 14
 """Largest stretch, so that the caller can do other work while it reads a full ring."""
@@ -67,6 +68,11 @@ class Reader:
         copied_count, first, _ = drain(self._events, self._event_cursor, messages)
         self._event_cursor = first + copied_count
         return messages[:copied_count]
+
+    @property
+    def recording_state(self) -> RecordingState | None:
+        """State of the run's recording; None before `read` has mapped a block."""
+        return None if self._mapping is None else recording_state(self._mapping)
 
     def _switch_block(self) -> bool:
         """Map the block that lies at the path now, begin a run and return True; without a block, return False and

@@ -6,6 +6,7 @@ as quick to import as any other: most processes call no kernel.
 
 from __future__ import annotations
 
+import ctypes
 import os
 from collections.abc import Callable
 from functools import cached_property, update_wrapper, wraps
@@ -178,6 +179,13 @@ def c_library_function(name: str, signature: str, uncompiled: Callable[..., obje
         return compiler.types.ExternalFunction(name, compiler.parse_signature(signature))
 
     return KernelSymbol(name, resolve_type, uncompiled)
+
+
+def unlocked_call(function: CFunction | UncompiledFunction) -> Callable[..., int]:
+    """Return a function that calls a C function with addresses, and lets other threads of Python run meanwhile."""
+    if isinstance(function, UncompiledFunction):
+        return function
+    return ctypes.CFUNCTYPE(ctypes.c_int32, ctypes.c_ssize_t, ctypes.c_ssize_t)(function.address)
 
 
 def cfunc(signature: str) -> Callable[[Callable[..., object]], Any]:

@@ -25,8 +25,16 @@ def _gettime_in_python(clock: int, timespec_address: int) -> int:
     return 0
 
 
+def _nanosleep_in_python(clock: int, flags: int, timespec_address: int, _: int) -> int:
+    """Sleep like the C library's `clock_nanosleep` with CLOCK_MONOTONIC; return 0."""
+    seconds, ns = uncompiled.carray(timespec_address, 2, np.int64).tolist()
+    began_ns = time.clock_gettime_ns(clock) if flags == TIMER_ABSTIME else 0
+    time.sleep(max(seconds * SECOND_NS + ns - began_ns, 0) / SECOND_NS)
+    return 0
+
+
 _clock_gettime = c_library_function("clock_gettime", "int32(int32, intp)", _gettime_in_python)
-_clock_nanosleep = c_library_function("clock_nanosleep", "int32(int32, int32, intp, intp)")
+_clock_nanosleep = c_library_function("clock_nanosleep", "int32(int32, int32, intp, intp)", _nanosleep_in_python)
 
 
 @jit

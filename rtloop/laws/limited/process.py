@@ -1,8 +1,8 @@
 """Parent side of the limited process, in which a user law runs first; the process is killed if the law does not return.
 
 The process starts with the first job, or ahead of it, and then waits for the next job; a killed one is replaced at the
-next job. It ends with its parent. The time limit of a job begins when its imports are done and the compiler is loaded,
-and excludes time spent waiting for a processor: a busy host does not lead to a refusal."""
+next job. It ends with its parent. The limit of a job begins when its imports are done and the compiler is loaded. It is
+processor time: a busy host does not lead to a refusal."""
 
 from __future__ import annotations
 
@@ -22,14 +22,17 @@ from typing import IO, Any, TypeVar
 
 from rtloop.drivers.errors import DriverError
 from rtloop.errors import ConfigError, RtloopError, UnavailableError
+from rtloop.foundation.processors import processor_time_s
 from rtloop.laws.limited.frames import LENGTH, write_frame
 from rtloop.laws.limited.worker import PREPARE, RUN, Preparation
 
 LIMIT_S = 10.0
-"""Time in which a law must be read, or built and verified, in seconds, without time spent waiting for a processor."""
+"""Processor time in which a law must be read, or built and verified, in seconds."""
 START_S = 120.0
-MAX_WAIT_FACTOR = 6.0
-"""Multiple of a limit after which a process is abandoned, however busy the host is."""
+MAX_IDLE_FACTOR, MAX_FACTOR = 3.0, 60.0
+"""Multiples of a limit after which a process is abandoned: of the time in which it neither computes nor waits for a
+processor, and of all time, however busy the host is."""
+LONGEST_SELECT_S, SHORTEST_SELECT_S = 1.0, 0.02
 MAX_OUTPUT_BYTES = 1 << 16
 """Largest number of bytes that a law's code may print in a job."""
 Result = TypeVar("Result")
@@ -45,7 +48,7 @@ class AbandonedJob(UnavailableError):
 
 
 class LimitedProcess:
-    """Limited process that runs one job at a time, each within `limit_s` seconds; thread-safe."""
+    """Limited process that runs one job at a time, each within `limit_s` seconds of processor time; thread-safe."""
 
     def __init__(self, limit_s: float = LIMIT_S) -> None:
         """Set the time limit of a job; the process starts with the first job, or with `prepare_ahead`."""
@@ -190,12 +193,11 @@ class LimitedProcess:
         """
         answers, printed = (pipe.fileno() for pipe in self._pipes[1:])
         while len(self._data) < LENGTH.size or len(self._data) < self._end_of_message:
-            if (remaining_s := clock.remaining_s) <= 0:
-                raise self._abandonment(
-                    f"the code took longer than {clock.limit_s:g} s and was stopped; make it faster, or correct a loop "
-                    "that does not end"
-                )
-            readable = select.select([answers, printed], [], [], remaining_s)[0]
+            remaining_s, is_by_law, excess = clock.verdict
+            if remaining_s <= 0:
+                raise self._abandonment(excess, is_by_law)
+            wait_s = min(max(remaining_s, SHORTEST_SELECT_S), LONGEST_SELECT_S)
+            readable = select.select([answers, printed], [], [], wait_s)[0]
             if printed in readable:
                 self._add_output(os.read(printed, MAX_OUTPUT_BYTES))
             if answers in readable:
@@ -231,9 +233,11 @@ class LimitedProcess:
         if len(self._printed) > MAX_OUTPUT_BYTES:
             raise self._abandonment(f"the code printed more than {MAX_OUTPUT_BYTES >> 10} KiB; let it print less")
 
-    def _abandonment(self, reason: str) -> AbandonedJob:
-        """Return the error that names the running law and `reason`."""
-        return AbandonedJob(f"{self._culprit or 'building the law: '}{reason}", self._law is not None)
+    def _abandonment(self, reason: str, is_by_law: bool = True) -> AbandonedJob:
+        """Return the error that names the running law, if there is one, and `reason`, which is the law's unless
+        `is_by_law` is False.
+        """
+        return AbandonedJob(f"{self._culprit or 'building the law: '}{reason}", is_by_law and self._law is not None)
 
     @property
     def _culprit(self) -> str:
@@ -248,25 +252,55 @@ class LimitedProcess:
 
 
 class _Clock:
-    """Running time of a process: elapsed time minus time spent waiting for a processor (proc(5), schedstat)."""
+    """Times of a process since the clock was made: processor time, time waited for a processor (proc(5), schedstat),
+    and the rest, in which it sleeps or waits for something else.
+    """
 
     def __init__(self, limit_s: float, pid: int | None) -> None:
-        """Begin to count the time of process `pid`, against a limit of `limit_s`."""
-        self.limit_s, self._file = limit_s, Path(f"/proc/{pid}/schedstat")
-        self._begin_s, self._waited_before_s = time.monotonic(), self._waited_s
+        """Begin to count the times of process `pid`, against a limit of `limit_s` of processor time."""
+        self.limit_s, self._pid, self._file = limit_s, pid or 0, Path(f"/proc/{pid}/schedstat")
+        self._begin = self._times_s
 
     @property
-    def remaining_s(self) -> float:
-        """Time until the limit, in s, if the process does not wait for a processor again; 0 or less after it.
-
-        The time waited extends the limit, up to MAX_WAIT_FACTOR times.
+    def verdict(self) -> tuple[float, bool, str]:
+        """Return the time until the next limit, in s, 0 or less after it; whether that limit blames the code; and what
+        the process did beyond the limit.
         """
-        passed_s, waited_s = time.monotonic() - self._begin_s, self._waited_s - self._waited_before_s
-        return min(self.limit_s + waited_s, MAX_WAIT_FACTOR * self.limit_s) - passed_s
+        passed_s, computed_s, waited_s = (
+            now_s - begin_s for now_s, begin_s in zip(self._times_s, self._begin, strict=True)
+        )
+        idle_limit_s, longest_s = MAX_IDLE_FACTOR * self.limit_s, MAX_FACTOR * self.limit_s
+        return min(
+            (
+                self.limit_s - computed_s,
+                True,
+                f"the code used more than {self.limit_s:g} s of processor time and was stopped; make it faster, or "
+                "correct a loop that does not end",
+            ),
+            (
+                idle_limit_s - (passed_s - computed_s - waited_s),
+                True,
+                f"the code was stopped, because for {idle_limit_s:g} s it did not compute; correct code that sleeps, "
+                "or waits for a file, a lock or another process",
+            ),
+            (
+                longest_s - passed_s,
+                False,
+                f"the code had only {computed_s:.2g} s of processor time within {longest_s:g} s, because the host is "
+                "too busy, and was stopped; try again on a quieter host",
+            ),
+        )
+
+    @property
+    def _times_s(self) -> tuple[float, float, float]:
+        """Time of a monotonic clock, processor time of all threads, and time waited for a processor, in s; the last two
+        are 0 if they are unknown or the process has ended.
+        """
+        return time.monotonic(), processor_time_s(self._pid), self._waited_s
 
     @property
     def _waited_s(self) -> float:
-        """Time waited for a processor since the process began, in s; 0 if unknown or the process has ended."""
+        """Time that the main thread has waited for a processor, in s; 0 if unknown or the process has ended."""
         try:
             return int(self._file.read_text().split()[1]) / 1e9
         except (OSError, ValueError, IndexError):

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 from rtloop.kernel.reference import Generator
-from rtloop.recording.file.topics.events import Event
+from rtloop.recording.file.topics.events import RECORDER, Event
 from rtloop.values import count_text
 
 UM = " µm"
@@ -109,6 +109,9 @@ def event_text(event: Event, unit: str = "") -> str:
             return f"{details['step']}: {details['reason']}" if details["reason"] else details["step"]
         case "periods_missed":
             return f"{count_text(details['late_ticks'], 'late tick')}, worst {details['worst_ms']:.3g} ms"
+        case "gap":
+            verb = "recorded" if event["who"] == RECORDER else "shown"
+            return f"{count_text(details['ticks'], 'tick')} not {verb}: {details['cause']}"
     return ""
 
 

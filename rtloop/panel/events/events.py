@@ -1,7 +1,7 @@
 """The last events of the loop with their texts, for all clients: commands, trips, changed laws.
 
-Late ticks without another event between them are one row that grows; on an overloaded host they would displace the
-other rows.
+Late ticks without another event between them are one row that grows, and so is a gap of lost ticks; on an overloaded
+host they would displace the other rows.
 """
 
 from __future__ import annotations
@@ -20,9 +20,13 @@ from rtloop.errors import RtloopError
 from rtloop.panel.events.event_text import OFF, RunState, event_text
 from rtloop.panel.events.lateness import LATE_END_KIND, LATE_KIND, LateEpisodes
 from rtloop.panel.service.service import Description, Service
-from rtloop.recording.file.topics.events import Event, event_from_message
+from rtloop.recording.file.topics.events import GAP, Event, event_from_message
 
 MAX_ROWS = 200
+PANEL = "panel"
+"""Value of `who` for ticks that the panel did not read in time."""
+GAP_QUIET_S = 1.0
+"""Time of ticks without another lost tick after which a gap has ended."""
 QUERY_TIMEOUT_S = 0.2
 """Longest wait for an operator's name. The ring holds ten seconds of ticks; a silent service is asked again later."""
 
@@ -34,6 +38,14 @@ class EventRow:
     number: int
     """Number of its newest version."""
     event: Event
+
+
+@dataclass
+class Gap:
+    """A gap of lost ticks: its row, and the tick of the newest loss."""
+
+    row: EventRow
+    last_tick: int = 0
 
 
 class OperatorAnswer(NamedTuple):
@@ -54,6 +66,8 @@ class Events:
         self._rows: deque[EventRow] = deque(maxlen=MAX_ROWS)
         self._late_row: tuple[EventRow, LateEpisodes] | None = None
         """Newest row of late ticks."""
+        self._gaps: dict[str, Gap] = {}
+        """Newest gap of each loser of ticks."""
         self._run, self._run_state = -1, RunState({})
         """Run of the newest event, and its references and mode."""
         self._lock = threading.Lock()
@@ -96,6 +110,20 @@ class Events:
             self._append_event(event, loop.rate_hz)
             if is_from_operator and not is_answering:
                 self._pending_rows.append((self._rows[-1], identity))
+
+    def add_lost_ticks(self, who: str, ticks: int, cause: str, tick: int, loop: Description, run: int) -> None:
+        """Add `ticks` lost at or before `tick` by `who`, RECORDER or PANEL, with their `cause` in words.
+
+        They extend the loser's newest gap; a gap ends after GAP_QUIET_S without a lost tick.
+        """
+        gap = self._gaps.get(who)
+        is_open = gap is not None and gap.row.event["run"] == run and tick <= gap.last_tick + GAP_QUIET_S * loop.rate_hz
+        if gap is None or not is_open:
+            event = {"tick": tick, "time_ns": round(tick / loop.rate_hz * 1e9), "kind": GAP, "who": who, "axis": None}
+            gap = self._gaps[who] = Gap(EventRow(0, event | {"what": {"ticks": 0}, "run": run}))
+        gap.last_tick = tick
+        details = {"ticks": gap.row.event["what"]["ticks"] + ticks, "cause": cause}
+        self._renew(gap.row, add_text(summary := {**gap.row.event, "what": details}, event_text(summary)))
 
     def _complete_pending(self) -> bool:
         """Request operators and changes of the pending rows from the service, oldest first, and add them to the rows.

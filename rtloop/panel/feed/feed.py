@@ -15,16 +15,19 @@ from rtloop.client.ticks.reader import MAX_TICKS, Reader
 from rtloop.client.ticks.tick_stretch import Stretch
 from rtloop.engine.messages import MESSAGE, Kind
 from rtloop.errors import RtloopError
-from rtloop.panel.events.events import Events
+from rtloop.panel.events.events import PANEL, Events
 from rtloop.panel.feed.tick_history import TickHistory, history_ticks
 from rtloop.panel.feed.timing import Timing
 from rtloop.panel.service.service import Description, Service
+from rtloop.recording.file.topics.events import RECORDER
 
 POLL_S = 1 / 60
 IDLE_S = 0.2
 """Pause between reads without clients; the ring holds ten seconds."""
 RETRY_S = 0.5
 """Pause before the next request to a service that did not answer."""
+LATE_READER = "the panel did not read them within ten seconds; the host is too busy"
+LATE_RECORDER = "the recorder did not read them within ten seconds; the host or its disk is too busy"
 Messages = npt.NDArray[np.void]
 log = logging.getLogger(__name__)
 
@@ -65,6 +68,8 @@ class Feed:
         """Run whose ticks in the ring were all read; its new ticks are current."""
         self._early_messages: Messages = np.zeros(0, MESSAGE)
         """Events whose ticks were not read yet."""
+        self._unrecorded = (-1, 0)
+        """Run, and its ticks without a record that the events have."""
         self._newest_tick_s: float | None = None
         self._end_event = threading.Event()
         self._thread = threading.Thread(target=self._read_until_ended, name="feed", daemon=True)
@@ -150,6 +155,7 @@ class Feed:
                 messages = np.concatenate([self._early_messages, messages])
             with self.lock:
                 self._distribute(stretch, messages, past)
+            self._report_lost_ticks(stretch, reader)
             if self.loop is not None:  # Outside the lock, because it asks the service for the operators' names.
                 self.events.append(messages, self.loop, self.run)
             self._early_messages = messages[:0]
@@ -157,6 +163,19 @@ class Feed:
                 break
         self._early_messages = np.concatenate([self._early_messages, reader.read_messages()])
         self._caught_up_run = self.run
+
+    def _report_lost_ticks(self, stretch: Stretch, reader: Reader) -> None:
+        """Add the ticks that this feed or the recorder has lost since the last call to the events."""
+        if self.loop is None or (recording := reader.recording_state) is None:
+            return
+        if stretch.lost:
+            first = stretch.first - stretch.lost
+            self.events.add_lost_ticks(PANEL, stretch.lost, LATE_READER, first, self.loop, stretch.run)
+        run, unrecorded_ticks = self._unrecorded if self._unrecorded[0] == stretch.run else (stretch.run, 0)
+        if (new_ticks := recording["ticks_lost"] - unrecorded_ticks) > 0:
+            tick, cause = stretch.first + len(stretch), recording["reason"] or LATE_RECORDER
+            self.events.add_lost_ticks(RECORDER, new_ticks, cause, tick, self.loop, run)
+        self._unrecorded = run, unrecorded_ticks + max(new_ticks, 0)
 
     def _begin_run(self, loop: Description) -> TickHistory:
         """End the old run for all viewers and begin a new one; `lock` must be held. Returns the history for its ticks.

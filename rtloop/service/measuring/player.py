@@ -147,6 +147,7 @@ class Player:
         read_count, deadline_s = 0, time.monotonic() + (first + count - self.next_tick) / self.rate_hz + READ_MARGIN_S
         while read_count < count:
             require_client(self._activity)
+            is_late = time.monotonic() > deadline_s  # Read first: a stalled service looks once more after the deadline.
             new_count, _, lost = drain(ring, first + read_count, rows[read_count:])
             if lost:
                 raise Refusal(f"{self._activity}: ticks were overwritten before the service read them; try again")
@@ -155,7 +156,7 @@ class Player:
                 self._require_usable(rows[read_count : read_count + new_count])
                 check_position(self.column(rows[read_count : read_count + new_count], signals.POSITION))
             read_count += new_count
-            if time.monotonic() > deadline_s:
+            if is_late and read_count < count:
                 raise Refusal(f"{self._activity}: the loop stands still or runs too slowly; see `rtloop doctor`")
             time.sleep(POLL_S)
         return rows

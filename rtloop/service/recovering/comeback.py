@@ -140,7 +140,9 @@ def _await_record(supervisor: Supervisor, tick: int) -> Real:
     Raises Refusal after RECORD_TIMEOUT_S without this record.
     """
     deadline_s = time.monotonic() + RECORD_TIMEOUT_S
-    while time.monotonic() < deadline_s:
+    is_late = False
+    while not is_late:
+        is_late = time.monotonic() >= deadline_s  # Read first: a stalled service looks once more after the deadline.
         rows = supervisor.newest(max(supervisor.ticks - tick, 1))
         match = rows[rows[:, signals.TICK] == tick]
         if len(match):

@@ -8,9 +8,11 @@ from typing import Any
 
 import numpy as np
 
+from rtloop.client.ticks.tick_stretch import Stretch
 from rtloop.engine.messages import MESSAGE, Kind, Origin
 from rtloop.errors import UnavailableError
 from rtloop.panel.events.events import MAX_ROWS, Events
+from rtloop.panel.feed.feed import Feed
 from rtloop.signals import Mode
 
 KINDS = {"m": Kind.PERIODS_MISSED, "o": Kind.LATENESS_OVER, "t": Kind.TRIPPED}
@@ -71,6 +73,41 @@ def test_late_ticks_are_one_row_until_something_else_happens() -> None:
     assert rows_after(events)[::2] == [(0, "15 late ticks, worst 8 ms"), (6, "1 late tick, worst 1 ms")]
     events.append(make_messages("m1", 7), LOOP, 1)
     assert rows_after(events)[-1] == (7, "1 late tick, worst 1 ms"), "another run"
+
+
+def test_lost_ticks_are_one_row_for_each_gap_with_number_and_cause() -> None:
+    """A gap ends after a second without a lost tick, which is 1000 ticks here, and at the end of a run."""
+    events = Events(SimpleNamespace())  # type: ignore[arg-type]
+    add = lambda who, ticks, tick, run=0: events.add_lost_ticks(who, ticks, "the disk is full", tick, LOOP, run)
+    for tick in range(0, 5000, 50):
+        add("recorder", 50, tick)
+    add("panel", 3, 4900)
+    assert rows_after(events) == [
+        (0, "5,000 ticks not recorded: the disk is full"),
+        (4900, "3 ticks not shown: the disk is full"),
+    ]
+    add("recorder", 1, 5951)
+    add("panel", 1, 4900, run=1)
+    assert [(tick, text.split(":")[0]) for tick, text in rows_after(events)[2:]] == [
+        (5951, "1 tick not recorded"),
+        (4900, "1 tick not shown"),
+    ]
+
+
+def test_the_feed_reports_each_lost_tick_once() -> None:
+    """Ticks that wait without a record count as soon as the recorder fails, and not again when it gives them up."""
+    feed = Feed(SimpleNamespace())  # type: ignore[arg-type]
+    feed.loop = LOOP
+    reports = [(0, 0, None), (7, 100, "the disk is full"), (0, 160, "the disk is full"), (0, 150, None), (0, 160, None)]
+    for number, (lost, unrecorded, reason) in enumerate(reports):
+        stretch = Stretch(("tick",), 1000 + 100 * number, np.zeros((100, 1)), lost, run=0)
+        reader: Any = SimpleNamespace(recording_state={"ticks_lost": unrecorded, "reason": reason})
+        feed._report_lost_ticks(stretch, reader)
+    texts = [text for _, text in rows_after(feed.events)]
+    assert (texts[0][:19], texts[1]) == ("7 ticks not shown: ", "160 ticks not recorded: the disk is full")
+    reader = SimpleNamespace(recording_state={"ticks_lost": 5, "reason": None})
+    feed._report_lost_ticks(Stretch(("tick",), 0, np.zeros((100, 1)), 0, run=1), reader)
+    assert rows_after(feed.events)[2][1].startswith("5 ticks not recorded: the recorder did not read them")
 
 
 def test_late_ticks_push_off_no_trip() -> None:

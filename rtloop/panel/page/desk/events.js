@@ -4,14 +4,14 @@ import { $, make } from "../dom.js";
 import { counted } from "../numbers.js";
 
 const MOST = 200;
-const LATE = "periods_missed";
-/** Late ticks without anything else between them: one row, told again as it grows. */
-const CALLED = { [LATE]: "", load_law: "tuned", set_reference: "reference", set_mode: "mode", reset_trip: "reset" };
+const [LATE, GAP] = ["periods_missed", "gap"];
+/** Late ticks without anything else between them, and lost ticks: one row, told again as it grows. */
+const CALLED = { [LATE]: "", [GAP]: "", load_law: "tuned", set_reference: "reference", set_mode: "mode", reset_trip: "reset" };
 
 /** A blank between a number and its unit, where a line must not break. */
 const BEFORE_UNIT = /(?<=\d) (?=(?:µm|µs|ms|s|V|Hz|kHz|%)(?![\p{L}\d]))/gu;
 
-const keyOf = (event) => (event.kind === LATE ? `${event.run} ${event.tick}` : JSON.stringify({ ...event, who: null }));
+const keyOf = (event) => ([LATE, GAP].includes(event.kind) ? `${event.kind} ${event.who} ${event.run} ${event.tick}` : JSON.stringify({ ...event, who: null }));
 
 function rowOf({ tick, kind, who, axis, what }) {
   const tripped = kind === "tripped"; // its words begin with the axis

@@ -18,7 +18,7 @@ import numpy.typing as npt
 
 from rtloop.engine.messages import ALL_AXES, MESSAGE, Kind, Origin
 from rtloop.recording.file.topics.recovery_steps import Note, step_meaning
-from rtloop.signals import Failure, Flag, Mode, trip_causes
+from rtloop.signals import Failure, Flag, Mode, Silence, trip_causes
 
 Event = dict[str, Any]
 GAP, FINISHED, ROTATED, RECOVERED, CUT = "gap", "finished", "rotated", "recovered", "cut"
@@ -30,8 +30,15 @@ COMMANDS = frozenset(kind.name.lower() for kind in Kind if kind < Kind.REFUSED)
 """Kinds of events that record a command."""
 OPERATOR = Origin.OPERATOR.name.lower()
 """Value of `who` for an operator without a name."""
-LOST_HEARTBEAT = "the heartbeat of `rtloop run` or of the service stopped: that process died or stood still"
-"""Reason of a trip by the heartbeat, which concerns all axes."""
+LOST_HEARTBEAT = "the heartbeat of `rtloop run` or of the service stopped"
+"""Reason of a trip by the heartbeat, which concerns all axes; a cause of SILENCES follows."""
+SILENCES = {
+    Silence.DEAD: "that process died",
+    Silence.STOPPED: "that process was stopped by a signal, a debugger or a container",
+    Silence.UNWATCHED: "that process lives, but its watch of the loop stood still",
+    Silence.STARVED: "the host stalled that process: it was ready to run, and got no processor",
+}
+"""Causes of a lost heartbeat; recordings of older versions have none."""
 RESERVED_NAMES = (*(origin.name.lower() for origin in Origin), RECORDER)
 MAX_NAME = 40
 """Maximum length of an operator's name in characters."""
@@ -81,12 +88,19 @@ def trip_reason(message: np.void, axes: Sequence[str], laws: Sequence[str]) -> s
     all_causes, value, limit, bit, number = (float(element) for element in message["values"][:5])
     axis, causes = int(message["axis"]), trip_causes(bit)
     if not causes or not 0 <= axis < len(axes):
-        return LOST_HEARTBEAT if int(all_causes) & Flag.TRIP_HEARTBEAT else None
+        return _heartbeat_text(value, int(number)) if int(all_causes) & Flag.TRIP_HEARTBEAT else None
     if causes == ["law"]:
         label = laws[int(number)] if 0 <= number < len(laws) else f"number {number:g}"
         return f"{axes[axis]}: law {label} {_failure_text(int(limit), value)}"
     flag = Flag(int(bit))
     return f"{axes[axis]}: {flag.message.format(cause=causes[0], value=value, limit=limit, unit=flag.unit)}"
+
+
+def _heartbeat_text(silent_s: float, silence: int) -> str:
+    """Describe a lost heartbeat by the length of its silence, 0 if it was not recorded, and a `Silence`."""
+    cause = SILENCES.get(Silence(silence)) if silence in set(Silence) else None
+    length = f" for {silent_s:.2g} s" if silent_s else ""
+    return f"{LOST_HEARTBEAT}{length}: {cause or 'that process died or stood still'}"
 
 
 def law_label(kind: str, file: str = "") -> str:
