@@ -165,12 +165,12 @@ class Desk:
                     return int(event["tick"])
             if is_late:
                 break
-            if is_late := time.monotonic() >= deadline:
-                if position is not None and withdraw(self._block, position):
-                    raise Refusal(
-                        f"{kind.name.lower()}: the loop did not answer within {timeout_s:g} s; the command is "
-                        "withdrawn; try again, and see `rtloop doctor` if the loop stands still"
-                    )
+            is_late = time.monotonic() >= deadline
+            if is_late and position is not None and withdraw(self._block, position):
+                raise Refusal(
+                    f"{kind.name.lower()}: the loop did not answer within {timeout_s:g} s; the command is withdrawn; "
+                    "try again, and see `rtloop doctor` if the loop stands still"
+                )
             time.sleep(POLL_S)  # After a withdrawal that failed, too: the loop may have answered just now.
         if position is None:
             raise UnconfirmedCommand(

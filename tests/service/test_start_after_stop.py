@@ -120,7 +120,7 @@ def test_a_stop_without_a_loop_says_that_it_holds_and_it_does(returning: Virtual
     returning.end_loop()
     service.recovery.accept_end("driver_failed", fault)
     service.faults.append(fault)
-    with pytest.raises(Refusal, match="no loop is running: .* tripped; the stop stays in force: the next loop begins"):
+    with pytest.raises(Refusal, match=r"no loop is running: .* tripped; the stop stays in force: the next loop"):
         service.stop()
     returning.begin_loop()
     assert set(returning.drive_v(0.5)) == {0.0}
@@ -213,7 +213,7 @@ def test_a_reset_that_is_withdrawn_says_that_the_recovery_has_ended(make: Make):
     hanging.service.start()
     hanging.trip()
     hanging.hangs = True
-    with pytest.raises(Refusal, match="the command is withdrawn; .*; the recovery that was under way has ended$"):
+    with pytest.raises(Refusal, match=r"the command is withdrawn; .*; the recovery that was under way has ended$"):
         hanging.service.reset()
     hanging.hangs = False
     hanging.turns.sleep(0.1)
