@@ -12,6 +12,7 @@ from pydantic import BeforeValidator, SerializeAsAny, ValidationInfo
 from rtloop.configuration.text_files import InputFileError, read_text
 from rtloop.kernel.layout import MAX_COUPLED
 from rtloop.laws.contract import ANY_NUMBER, Controller, CoupledController, Feedforward, Law
+from rtloop.laws.helpers import read_helpers
 from rtloop.laws.options import ControllerOptions, FeedforwardOptions
 from rtloop.laws.registry import BUILT_IN, LawReference, find_law, kinds, law_class, law_from_text
 
@@ -44,7 +45,10 @@ class Library:
                 raise ValueError(f"{key}: {value!r}; allowed: a name, as a string")
         path = str(self.folder / file) if file else ""
         if self.loaded is None:
-            return law_from_text(_text(Path(path)), path, kind) if file else find_law(kind or default)
+            if not file:
+                return find_law(kind or default)
+            text = _text(Path(path))
+            return law_from_text(text, path, kind, read_helpers(text, path))
         loaded = dict.fromkeys(replace(law, axes=0) for law in self.loaded)
         matches = [law for law in loaded if (law.file == path if file else law.kind == (kind or default))]
         matches = [law for law in matches if kind is None or law.kind == kind]

@@ -20,7 +20,7 @@ from rtloop.kernel.layout import FUNCTIONS, control_dtype
 from rtloop.kernel.memory import LawRecords
 from rtloop.laws.contract import Law
 from rtloop.laws.purity import MEMORY, foreign_calls
-from rtloop.laws.registry import LawReference, law_class
+from rtloop.laws.registry import LawReference, law_class, plain_functions
 
 if TYPE_CHECKING:
     from numba.core.typing.templates import Signature
@@ -46,10 +46,20 @@ def _bind_law(reference: LawReference) -> npt.NDArray[np.void]:
     Raises ValueError as `bind_functions` does.
     """
     law, record = law_class(reference), np.zeros(1, FUNCTIONS)
+    if not (law.shipped or UNCOMPILED):
+        _let_ticks_call(plain_functions(reference))
     law_records = law.records(reference.axes)
     for name in function_names(law):
         record[name] = _function_address(law, law_records, name)
     return record
+
+
+def _let_ticks_call(functions: Sequence[Callable[..., object]]) -> None:
+    """Let compiled functions call these Python functions, which are compiled with the checks of `jit_strict`."""
+    from numba.extending import register_jitable
+
+    for function in functions:
+        register_jitable(error_model="python", boundscheck=True)(function)
 
 
 def function_signatures(law: type[Law], law_records: LawRecords) -> dict[str, Signature]:

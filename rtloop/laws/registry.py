@@ -1,10 +1,11 @@
 """Registry of laws: finds the law that a configuration names, by kind (shipped or installed) or in a file.
 
 Modules are imported on demand: the loop's process loads only the laws that it runs. A law from a file is passed on as
-its text, so that every process runs the same code."""
+its text, with the texts of its helpers, so that every process runs the same code."""
 
 from __future__ import annotations
 
+import builtins
 import contextlib
 import hashlib
 import inspect
@@ -16,15 +17,19 @@ from dataclasses import dataclass
 from functools import cache
 from importlib import import_module
 from pathlib import Path
-from types import ModuleType
+from types import FunctionType, ModuleType
+from typing import Any
 
 from rtloop.kernel.memory import Layout
 from rtloop.laws.contract import Law
+from rtloop.laws.helpers import Helper
 from rtloop.laws.limited.announcement import announce, is_limited
 from rtloop.laws.options import LawOptions
 
 GROUP = "rtloop.laws"
 SHIPPED = "rtloop.laws.shipped"
+MODULE_PREFIX = "rtloop_law_"
+"""Prefix of the names of the modules of laws that are not shipped."""
 BUILT_IN = {
     "coupled": f"{SHIPPED}.coupled:Coupled",
     "integral_resonant": f"{SHIPPED}.integral_resonant:IntegralResonant",
@@ -46,11 +51,14 @@ class LawReference:
     """Path of the text's file, for messages."""
     axes: int = 0
     """Number of axes in this loop, for a law whose class leaves it open."""
+    helpers: tuple[Helper, ...] = ()
+    """Files beside the law's that it imports."""
 
     @property
     def sha256(self) -> str | None:
-        """SHA-256 of the text; None for a shipped law."""
-        return hashlib.sha256(self.text.encode()).hexdigest() if self.text else None
+        """SHA-256 of the text, with helpers of the text and then their names and texts; None for a shipped law."""
+        parts = [self.text, *(part for helper in self.helpers for part in (helper.name, helper.text))]
+        return hashlib.sha256("\0".join(parts).encode()).hexdigest() if self.text else None
 
     def restore_options(self, values: Mapping[str, object]) -> LawOptions:
         """Return the law's options with `values`, bound to this law.
@@ -94,28 +102,31 @@ def find_law(kind: str) -> LawReference:
     return law_from_text(text, str(file), kind)
 
 
-def laws_in(text: str, file: str) -> tuple[LawReference, ...]:
-    """Return all laws that a text defines, sorted by kind; the text is run once in a process. `file` is for messages.
+def laws_in(text: str, file: str, helpers: tuple[Helper, ...] = ()) -> tuple[LawReference, ...]:
+    """Return all laws that a text defines, sorted by kind; the text is run once in a process. `file` is for messages,
+    `helpers` are the texts that it imports.
 
     Raises ValueError if the text cannot be run or has a mistake.
     """
     announce(Path(file).stem, file)
-    return _laws_in(text, file)
+    return _laws_in(text, file, helpers)
 
 
-def _laws_in(text: str, file: str) -> tuple[LawReference, ...]:
+def _laws_in(text: str, file: str, helpers: tuple[Helper, ...]) -> tuple[LawReference, ...]:
     """Return all laws that a text defines, like `laws_in`, but do not name the law to the parent process."""
-    return tuple(LawReference(kind, text, file) for kind in sorted(_law_classes(_module(text, file))))
+    classes = _law_classes(_module(text, file, helpers))
+    return tuple(LawReference(kind, text, file, helpers=helpers) for kind in sorted(classes))
 
 
-def law_from_text(text: str, file: str, kind: str | None = None) -> LawReference:
-    """Return the law that a text defines; `kind` selects one of several. The text is run once in a process.
+def law_from_text(text: str, file: str, kind: str | None = None, helpers: tuple[Helper, ...] = ()) -> LawReference:
+    """Return the law that a text with these `helpers` defines; `kind` selects one of several. The text is run once in a
+    process.
 
     Raises ValueError if the text defines no law, no law `kind`, or several laws while `kind` is None, and if it cannot
     be run or has a mistake.
     """
     announce(kind or Path(file).stem, file)
-    laws = {law.kind: law for law in _laws_in(text, file)}
+    laws = {law.kind: law for law in _laws_in(text, file, helpers)}
     if kind is None and len(laws) == 1:
         return next(iter(laws.values()))
     if kind not in laws:
@@ -123,7 +134,7 @@ def law_from_text(text: str, file: str, kind: str | None = None) -> LawReference
             raise ValueError(f"{file}: defines the laws {', '.join(laws)}; set kind to one of them")
         from rtloop.laws.mistakes import missing_law
 
-        mistake = missing_law(text, vars(_module(text, file)))
+        mistake = missing_law(text, vars(_module(text, file, helpers)))
         place, message = ("", "defines no law") if mistake is None else (f", line {mistake.line}", mistake.message)
         raise ValueError(f"{file}{place}: {message}")
     return laws[kind]
@@ -137,12 +148,22 @@ def law_class(law: LawReference) -> type[Law]:
     """
     if law.text:
         announce(law.kind, law.file)
-        classes = _law_classes(_module(law.text, law.file))
+        classes = _law_classes(_module(law.text, law.file, law.helpers))
         if law.kind not in classes:
             raise ValueError(f"{law.file}: does not define the law {law.kind!r}")
         return classes[law.kind]
     module, _, name = BUILT_IN[law.kind].partition(":")
     return getattr(import_module(module), name)
+
+
+def plain_functions(law: LawReference) -> list[FunctionType]:
+    """Return the functions, outside classes, of the text of a law that is not shipped, and of the helpers that it has
+    imported. Raises ValueError as `law_class`.
+    """
+    module = _module(law.text, law.file, law.helpers)
+    names = [module.__name__, *(f"{module.__name__}.{helper.name}" for helper in law.helpers)]
+    values = [value for name in names if name in sys.modules for value in vars(sys.modules[name]).values()]
+    return [value for value in values if isinstance(value, FunctionType) and value.__module__ in names]
 
 
 def law_layout(laws: Sequence[LawReference]) -> Layout:
@@ -157,28 +178,65 @@ def _layout(laws: tuple[LawReference, ...]) -> Layout:
 
 
 @cache
-def _module(text: str, file: str) -> ModuleType:
-    """Return a text as a module, run once in a process; its output goes to stderr.
+def _module(text: str, file: str, helpers: tuple[Helper, ...]) -> ModuleType:
+    """Return a text as a module, run once in a process with the `helpers` that it imports; its output goes to stderr.
 
-    Raises ValueError with the error of the text, or its first mistake.
+    Raises ValueError with the error of the text or of a helper, or with the text's first mistake.
     """
-    name = f"rtloop_law_{hashlib.sha256((file + text).encode()).hexdigest()[:16]}"
-    module = ModuleType(name, text)
-    module.__file__ = file
-    sys.modules[name] = module
+    name = MODULE_PREFIX + hashlib.sha256(repr((file, text, helpers)).encode()).hexdigest()[:16]
+    importer = _HelperImporter(name, helpers)
     try:
         # stdout belongs to the command, or to the supervisor; a limited process has none of its own
         with contextlib.nullcontext() if is_limited() else contextlib.redirect_stdout(sys.stderr):
-            exec(compile(text, file, "exec", dont_inherit=True), module.__dict__)
+            module = importer.run(name, text, file)
     except Exception as error:
-        del sys.modules[name]
-        raise ValueError(f"{file}{_line(error, file)}: {_message(error)}") from error
+        message = _message(error)
+        importer.forget()
+        raise ValueError(f"{_location(error, [file, *(helper.file for helper in helpers)])}: {message}") from error
     from rtloop.laws.mistakes import find_mistakes  # Only user laws have mistakes.
 
     for mistake in find_mistakes(text, vars(module)):
-        del sys.modules[name]
+        importer.forget()
         raise ValueError(f"{file}, line {mistake.line}: {mistake.message}")
     return module
+
+
+class _HelperImporter:
+    """Import statement of one law and of its helpers: a helper's name means this law's helper, in no other module."""
+
+    def __init__(self, law: str, helpers: Sequence[Helper]) -> None:
+        """`law` is the name of the law's module, with which the names of its helpers' modules begin."""
+        self._law, self._helpers = law, {helper.name: helper for helper in helpers}
+        self._loaded: dict[str, ModuleType | None] = {}
+        """Modules by name in `sys.modules`; None while the text runs for the first time."""
+
+    def run(self, name: str, text: str, file: str) -> ModuleType:
+        """Run a text as the module `name` of `sys.modules`, and return it. Raises what the text raises."""
+        self._loaded[name] = None
+        module = sys.modules[name] = ModuleType(name, text)
+        module.__file__ = file
+        module.__dict__["__builtins__"] = {**vars(builtins), "__import__": self._import}
+        exec(compile(text, file, "exec", dont_inherit=True), module.__dict__)
+        self._loaded[name] = module
+        return module
+
+    def forget(self) -> None:
+        """Remove the modules of the law from `sys.modules`."""
+        for name in self._loaded:
+            sys.modules.pop(name, None)
+
+    def _import(self, name: str, *context: Any) -> Any:
+        """Return a helper of the law, run at its first import; any other module as Python does."""
+        helper = None if context[3:] and context[3] else self._helpers.get(name)
+        if helper is None:
+            return builtins.__import__(name, *context)
+        module_name = f"{self._law}.{name}"
+        if module_name not in self._loaded:
+            return self.run(module_name, helper.text, helper.file)
+        if (module := self._loaded[module_name]) is None:
+            raise ImportError(f"{name} is imported while it is being imported itself; let one of the two files not "
+                              "import the other")  # fmt: skip
+        return module
 
 
 def _law_classes(module: ModuleType) -> dict[str, type[Law]]:
@@ -187,11 +245,17 @@ def _law_classes(module: ModuleType) -> dict[str, type[Law]]:
     return {law.kind: law for law in classes if issubclass(law, Law) and not inspect.isabstract(law)}
 
 
-def _line(error: Exception, file: str) -> str:
-    """Return the line of a law's file in which an exception was raised, as ", line N"; "" if unknown."""
-    lines = [frame.lineno for frame in traceback.extract_tb(error.__traceback__) if frame.filename == file]
-    line = error.lineno if isinstance(error, SyntaxError) else lines[-1] if lines else None
-    return "" if line is None else f", line {line}"
+def _location(error: Exception, files: Sequence[str]) -> str:
+    """Return the file, of a law or a helper in `files`, in which an exception was raised, with its line if it is known.
+
+    `files` begins with the law's file.
+    """
+    if isinstance(error, SyntaxError):
+        file, line = error.filename or files[0], error.lineno
+    else:
+        frames = [frame for frame in traceback.extract_tb(error.__traceback__) if frame.filename in files]
+        file, line = (frames[-1].filename, frames[-1].lineno) if frames else (files[0], None)
+    return file if line is None else f"{file}, line {line}"
 
 
 def _message(error: Exception) -> str:
@@ -207,4 +271,5 @@ def _message(error: Exception) -> str:
     from difflib import get_close_matches
 
     near = get_close_matches(absent[1], vars(sys.modules[absent[2]]), 1)
-    return f"{type(error).__name__}: {absent[0]}" + (f"; did you mean {near[0]}?" if near else "")
+    sentence = re.sub(rf"{MODULE_PREFIX}\w+\.", "", absent[0])
+    return f"{type(error).__name__}: {sentence}" + (f"; did you mean {near[0]}?" if near else "")

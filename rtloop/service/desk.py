@@ -2,6 +2,7 @@
 
 Callers do not wait for each other. A command without acknowledgement in time is withdrawn, so that it cannot take
 effect after its refusal. If the loop has taken the command already, UnconfirmedCommand states that it may take effect.
+Mode off is never withdrawn: it stays in the queue, and takes effect once the loop continues.
 """
 
 from __future__ import annotations
@@ -88,7 +89,7 @@ class RefusedByLoop(Refusal):
 
 
 class UnconfirmedCommand(RtloopError):
-    """The loop took a command and stands still: it is unknown when, or whether, the command takes effect."""
+    """The loop stands still, and took a command or will take it: it is unknown when, or whether, it takes effect."""
 
 
 class Desk:
@@ -120,11 +121,13 @@ class Desk:
         records; `change` describes a change of a law in words, for `change_text`. Raises Refusal if the requester has
         no permission (a stop and a reset need none, unless `may_always_stop` is False), or without an acknowledgement
         in time (the command is withdrawn); RefusedByLoop if the loop refuses the command; UnconfirmedCommand if the
-        loop took the command and stands still; QueueFull if too many commands wait for the loop.
+        loop took the command and stands still, and for mode off without an acknowledgement; QueueFull if too many
+        commands wait for the loop.
         """
         requester = current_requester()
         command = message(cast(Kind, kind), axis=axis, origin=requester.origin, values=values)
-        is_urgent = kind is Kind.RESET_TRIP or (kind is Kind.SET_MODE and values[0] == Mode.OFF)
+        is_off = kind is Kind.SET_MODE and values[0] == Mode.OFF
+        is_urgent = is_off or kind is Kind.RESET_TRIP
         with self._lock:  # The queue allows one producer. A permission that ends before a stop is sent ends here, too.
             if not (is_urgent and requester.may_always_stop):
                 requester.require_permission()
@@ -138,21 +141,20 @@ class Desk:
                 if len(self._changes) > MAX_CHANGES:
                     self._changes.popitem(last=False)
             position = send(self._block, command, urgent=is_urgent)
-        return self._answer(kind, identity, cursor, position)
+        return self._answer(kind, identity, cursor, None if is_off else position)
 
-    def _answer(self, kind: Kind | Note, identity: int, cursor: int, position: int) -> int:
+    def _answer(self, kind: Kind | Note, identity: int, cursor: int, position: int | None) -> int:
         """Wait for the event with `identity`, the acknowledgement of a command, and return its tick.
 
-        `cursor` is the number of the first event to read, `position` the command's place in the queue, `kind` names it
-        in messages. Raises RefusedByLoop if the loop refused the command. Without an acknowledgement in time, withdraws
-        it and raises Refusal, or UnconfirmedCommand if the loop has taken it and it can no longer be withdrawn.
+        `cursor` is the number of the first event to read, `position` the command's place in the queue (None: it must
+        not be withdrawn), `kind` names it in messages. Raises RefusedByLoop if the loop refused the command. Without an
+        acknowledgement in time, withdraws it and raises Refusal, or UnconfirmedCommand if it is not withdrawn.
         """
         timeout_s = ANSWER_TIMEOUT_S + ANSWER_PERIODS * self._period_s
         ring, deadline = self._block.ring("events"), time.monotonic() + timeout_s
         events: npt.NDArray[np.void] = np.zeros(64, MESSAGE)
         is_late = False
-        while not is_late:
-            is_late = time.monotonic() >= deadline  # Read first: a stalled service looks once more after the deadline.
+        while True:
             event_count, first, _ = drain(ring, cursor, events)
             cursor = int(first) + event_count
             for event in events[:event_count]:
@@ -161,11 +163,20 @@ class Desk:
                         raise RefusedByLoop(kind, int(event["tick"]))
                     self._await_tick(int(event["tick"]), deadline)
                     return int(event["tick"])
-            time.sleep(POLL_S)
-        if withdraw(self._block, position):
-            raise Refusal(
-                f"{kind.name.lower()}: the loop did not answer within {timeout_s:g} s; the command is withdrawn; "
-                "try again, and see `rtloop doctor` if the loop stands still"
+            if is_late:
+                break
+            is_late = time.monotonic() >= deadline
+            if is_late and position is not None and withdraw(self._block, position):
+                raise Refusal(
+                    f"{kind.name.lower()}: the loop did not answer within {timeout_s:g} s; the command is withdrawn; "
+                    "try again, and see `rtloop doctor` if the loop stands still"
+                )
+            time.sleep(POLL_S)  # After a withdrawal that failed, too: the loop may have answered just now.
+        if position is None:
+            raise UnconfirmedCommand(
+                f"{kind.name.lower()}: the loop did not answer within {timeout_s:g} s; mode off stays in force: the "
+                "outputs ramp to safe as soon as the loop continues, and rtloop parks them if it ends the loop's "
+                "process instead"
             )
         raise UnconfirmedCommand(
             f"{kind.name.lower()}: the loop has taken the command and stands still; "

@@ -16,6 +16,7 @@ import time
 from collections.abc import Callable
 from dataclasses import replace
 from enum import StrEnum
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -33,13 +34,15 @@ from rtloop.foundation.trusted import open_own
 from rtloop.recording.file.recover import find_leftovers, recover
 from rtloop.service.changing.building import prepare_builder, prepare_limited
 from rtloop.service.changing.live import LiveLaw
-from rtloop.service.desk import Desk, Refusal, RefusedByLoop
+from rtloop.service.desk import Desk, Refusal, RefusedByLoop, Requester, UnconfirmedCommand, use_requester
 from rtloop.service.lock import Lock
 from rtloop.service.measuring.current_measurement import CurrentMeasurement
 from rtloop.service.measuring.measurement import MeasurementHistory
 from rtloop.service.measuring.quality import Quality
 from rtloop.service.notify import Notifier
 from rtloop.service.preparation import prepare_actuator
+from rtloop.service.recovering.comeback import RunningLoop, restore_references
+from rtloop.service.recovering.former_state import record_former_state
 from rtloop.service.recovering.recovery import Recovery
 from rtloop.service.second_opinion import SecondOpinion
 from rtloop.signals import Flag, Mode
@@ -56,6 +59,7 @@ RESTART_PAUSE_S = 0.2
 SPARE_SAMPLES = 1 << 20
 BUILDER_PAUSE_S = 5.0
 """Time from READY to the start of the limited process, so that it takes no processor from the loop's first seconds."""
+STOP_IN_FORCE = "the stop stays in force: the next loop begins with its outputs off, and keeps them off until a start"
 RECOVERY_TIMEOUT_S = 10.0
 """Time for recovering unfinished recordings after the last loop; the next start continues."""
 log = logging.getLogger("rtloop")
@@ -109,7 +113,7 @@ class Service:
         self.recovery = Recovery(self)
         self._is_preparing = False
         self._requested_mode: Mode | None = None
-        """Mode that a client requested while the actuator was prepared."""
+        """Mode that a client requested last, of this loop or before it; the preparation sends nothing after that."""
         self._desk: Desk | None = None
         self._end_requested, self._reload_requested = threading.Event(), threading.Event()
         self._reload_lock = threading.Lock()
@@ -216,34 +220,72 @@ class Service:
         `mode` is the name of a Mode, such as "closed_loop"; else KeyError. A reference in µm is meaningless in volts:
         on entry to and exit from mode raw, the present output is held. In a loop that is tripped or stops, mode off
         changes no output: all are safe, or ramp to safe. Raises Refusal for any mode but off while tripped, while not
-        armed and while the actuator is prepared; after mode off in the preparation, the configured mode is not set.
-        Raises Refusal also without a loop and for mode off if the driver refuses every write, and as `Desk.submit`. A
-        mode that is not refused for the first three reasons ends a recovery.
+        armed, while the actuator is prepared and during the return of a recovery; after mode off in the preparation,
+        the configured mode is not set. Raises Refusal also without a loop, where mode off holds for the next loop, and
+        for mode off if the driver refuses every write, and as `Desk.submit`. Mode off ends a recovery.
         """
         target_mode = Mode[mode.upper()]
+        if target_mode is Mode.OFF:
+            self.recovery.end()
+            self._requested_mode = target_mode
+            return self._enter(target_mode)
         self._require_permission(target_mode)
-        if target_mode is not Mode.OFF and self._is_preparing and self.configuration.service.prepares:
+        if self._is_preparing and self.configuration.service.prepares:
             raise Refusal(f"mode {mode}: the actuator is being depolarised or tared; send the request again afterwards")
-        self.recovery.end()
-        self._requested_mode = target_mode
-        return self._enter(target_mode)
+        if self.recovery.is_returning:
+            raise Refusal(
+                f"mode {mode}: the service is returning to its mode before the trip; send the request again "
+                f"afterwards, or end the return by a stop first ({self.ctl('stop')})"
+            )
+        return self._drive(target_mode)
+
+    def _drive(self, mode: Mode) -> int:
+        """Enter a mode other than off, with the references that a return or a preparation has replaced.
+
+        Returns the tick at which it took effect; raises as `_enter`. A mode that is refused has no later effect.
+        """
+        supervisor, live, desk, unrestored = self.supervisor, self.live, self.desk, self.recovery.unrestored
+        earlier_mode, self._requested_mode = self._requested_mode, mode
+        restore: Callable[[], None] = lambda: None
+        if unrestored is not None and supervisor is not None and unrestored.live is live:
+            loop = RunningLoop(supervisor, unrestored.live, desk)
+            restore = partial(restore_references, unrestored, mode, loop)
+        try:
+            if mode is not Mode.RAW:
+                restore()
+            tick = self._enter(mode)
+            if mode is Mode.RAW:
+                restore()
+        except RtloopError as error:
+            if not isinstance(error, UnconfirmedCommand):  # The loop still enters this mode if it goes on.
+                self._requested_mode = earlier_mode
+            raise
+        self.recovery.unrestored = None
+        return tick
 
     def _require_permission(self, mode: Mode) -> None:
-        """Raise Refusal for any mode but off while the service is tripped or not armed."""
-        if mode is not Mode.OFF and self.state is State.TRIPPED:
+        """Raise Refusal for a mode other than off while the service is tripped or not armed."""
+        if self.state is State.TRIPPED:
             raise Refusal(f"mode {mode.name.lower()}: the service is tripped; use reset first ({self.ctl('reset')})")
-        if mode is not Mode.OFF and not self.armed:
+        if not self.armed:
             raise Refusal(f"mode {mode.name.lower()}: the outputs are not armed; use arm first ({self.ctl('arm')})")
 
     def _enter(self, mode: Mode) -> int:
         """Change the mode bumplessly, without the checks of `set_mode`. Returns the tick at which it took effect.
 
         Mode off in a loop that is tripped or stops has no effect, and returns the tick at which the loop refused it.
-        Raises Refusal without a loop, and for mode off in such a loop if the driver refuses every write; else as
-        `Desk.submit`.
+        Raises Refusal without a loop, and for mode off in such a loop if the driver refuses every write, or once the
+        loop has died without an answer; else as `Desk.submit`.
         """
+        supervisor = self.supervisor
+        if mode is Mode.OFF and (self._desk is None or self._latest_row() is None):
+            raise self._refused_stop_without_loop()
         try:
             return self.desk.submit(Kind.SET_MODE, values=[float(mode), 0.0, 1.0])
+        except UnconfirmedCommand:
+            if mode is not Mode.OFF or supervisor is None or supervisor.error is None:
+                raise
+            raise Refusal(f"mode off: {supervisor.error}; {STOP_IN_FORCE}") from None
         except RefusedByLoop as refusal:
             if mode is not Mode.OFF:
                 raise
@@ -253,16 +295,26 @@ class Service:
                 raise Refusal(f"mode off: {reason}") from None
             return refusal.tick
 
+    def _refused_stop_without_loop(self) -> Refusal:
+        """Return the error for mode off without a loop, or before its first tick: it says what holds for the next loop.
+
+        A schedule begins with the first loop, and takes no notice of an earlier stop.
+        """
+        holds = "try again when a loop runs, because the schedule begins with the loop"
+        if not self.configuration.schedule or self.state is State.TRIPPED:
+            holds = STOP_IN_FORCE
+        return Refusal(f"mode off: no loop is running: the state of the service is {self.state}; {holds}")
+
     def stop(self) -> int:
-        """Ramp the outputs to safe and keep them there; disarm if service.arm is set.
+        """Ramp the outputs to safe and keep them there; disarm if service.arm is set, also after an error.
 
         Returns the tick at which the ramp begins, or a later one if the outputs ramp already, as after a trip. Raises
-        Refusal without a loop and if the driver refuses every write, and as `Desk.submit`; `armed` is then not
-        changed.
+        Refusal without a loop and if the driver refuses every write, and as `Desk.submit`.
         """
-        tick = self.set_mode("off")
-        self.armed = not self.configuration.service.arm
-        return tick
+        try:
+            return self.set_mode("off")
+        finally:
+            self.armed = not self.configuration.service.arm
 
     def reset(self) -> int:
         """Clear latched trips and faults; the outputs stay off, and the service is disarmed if service.arm is set.
@@ -272,8 +324,14 @@ class Service:
         """
         if self.state is not State.TRIPPED:
             raise Refusal(f"reset: there is no trip; the state of the service is {self.state}")
-        self.recovery.end()
-        tick = self.desk.submit(Kind.RESET_TRIP)
+        desk = self.desk
+        ends_recovery = self.recovery.end()
+        try:
+            tick = desk.submit(Kind.RESET_TRIP)
+        except RtloopError as error:
+            if ends_recovery:
+                error.args = (f"{error}; the recovery that was under way has ended",)
+            raise
         self.faults.clear()
         self.recovery.clear()
         self.armed = not self.configuration.service.arm
@@ -364,7 +422,7 @@ class Service:
             plan = replace(prepared.plan, coefficients=coefficients, spare_samples=SPARE_SAMPLES)
             prepared = replace(prepared, plan=plan)
             supervisor = Supervisor(processes, prepared, new_recording_path(prepared, None), options.stall_ms / 1000)
-            self._requested_mode, self._is_preparing = None, needs_preparation
+            self._is_preparing = needs_preparation
             try:
                 supervisor.start()
                 self._desk = Desk(supervisor.block, prepared.plan.pacing.rate_hz, supervisor.names)
@@ -374,7 +432,7 @@ class Service:
                     self._start_thread(self._prepare_and_start)
                 return self._watch(supervisor)
             finally:
-                self.supervisor = self._desk = self.live = None
+                self.supervisor = self._desk = self.live = self._requested_mode = None
                 self._is_preparing = False
                 supervisor.close()
 
@@ -514,29 +572,27 @@ class Service:
     def _prepare_and_start(self) -> None:
         """Depolarise and tare the actuator, then set the configured references and mode; runs in its own thread.
 
-        A mode that a client requests meanwhile, such as off, is set in place of the configured one. An RtloopError is
-        added to `faults` and logged, unless a client requested a mode or the service ends. No effect without a loop.
+        Nothing of that is sent after a client has requested a mode, such as off; the references are then restored with
+        the next start. An RtloopError is added to `faults` and logged, unless a client requested a mode or the service
+        ends. No effect without a loop.
         """
         supervisor, live, desk = self.supervisor, self.live, self._desk
         if supervisor is None or live is None or desk is None:
             return
+        mode = Mode[self.configuration.loop.mode.upper()]
+        self.recovery.unrestored = record_former_state(mode, live)
         try:
-            try:
+            with use_requester(Requester(require_permission=self._require_no_request)):
+                self._require_no_request()
                 prepare_actuator(self.configuration.service, supervisor, live, desk)
-            except Refusal:
-                if self._requested_mode is None:
-                    raise
-            mode = Mode[self.configuration.loop.mode.upper()]
-            if self._requested_mode is None:
-                self._require_permission(mode)
-            if mode is Mode.RAW and self._requested_mode is None:
-                self._enter(mode)  # The references that follow are in V then.
-            for number in range(len(live.prepared.plan.axes)):
-                live.references.restore_configured(number)
-            if self._requested_mode is None:
+                if mode is not Mode.OFF:
+                    self._require_permission(mode)
+                if mode is Mode.RAW:
+                    self._enter(mode)  # The references that follow are in V then.
+                for number in range(len(live.prepared.plan.axes)):
+                    live.references.restore_configured(number)
                 self._enter(mode)
-            if self._requested_mode is not None:  # It came before, or while the configured mode was entered.
-                self._enter(self._requested_mode)
+            self.recovery.unrestored = None
         except RtloopError as error:
             if self._requested_mode is None and not self._end_requested.is_set():
                 self.faults.append(str(error))
@@ -548,6 +604,11 @@ class Service:
                     "the configured mode does not apply: mode %s was requested during the start",
                     self._requested_mode.name.lower(),
                 )
+
+    def _require_no_request(self) -> None:
+        """Raise Refusal once a client has requested a mode of this loop."""
+        if self._requested_mode is not None:
+            raise Refusal("the start has ended, because a mode was requested")
 
     def _start_builder_later(self) -> None:
         """Wait BUILDER_PAUSE_S, then start the process that builds changes, unless the service ends meanwhile."""

@@ -71,12 +71,15 @@ def recording_header(prepared: Prepared, realtime: Mapping[str, object]) -> dict
 def _law_description(plan: Plan) -> dict[str, object]:
     """Return the layout of the loop's laws as JSON values: `Layout.description`.
 
-    In its list `laws`, a user's law also has its `sha256`, its `text`, so that a replay needs no file, and its `file`.
+    In its list `laws`, a user's law also has its `sha256`, its `text`, so that a replay needs no file, and its `file`;
+    with helpers also `helpers`, a list of {name, text}.
     """
     layout = plan.layout.description()
     for entry, law in zip(layout["laws"], plan.laws, strict=True):
         if law.text:
             entry |= {"sha256": law.sha256, "text": law.text, "file": str(Path(law.file).absolute())}
+        if law.helpers:
+            entry["helpers"] = [{"name": helper.name, "text": helper.text} for helper in law.helpers]
     return layout
 
 

@@ -15,8 +15,9 @@ from rtloop.configuration.text_files import read_text
 from rtloop.drivers.base import Driver
 from rtloop.drivers.registry import driver_class
 from rtloop.errors import ConfigError
+from rtloop.laws.helpers import read_helpers
 from rtloop.laws.limited.trial import try_limited
-from rtloop.laws.registry import laws_in
+from rtloop.laws.registry import LawReference, laws_in
 from rtloop.recording.errors import RecordingError
 from rtloop.recording.file.run_readers import ReportTicks
 from rtloop.recording.load import Recording, load
@@ -78,13 +79,15 @@ def make_trust(files: Sequence[Path], trusts_recorded: bool) -> TrustedLaws:
     law, ConfigError for a law that does not end, ends the process, prints too much, leaves a thread or process, or
     closes or replaces a standard stream.
     """
-    texts = {str(path): read_text(path) for path in files}
-    for file, text in texts.items():
-        try_limited(file, laws_in, text, file)
-    try:
-        laws = [law for file, text in texts.items() for law in laws_in(text, file)]
-    except ValueError as error:
-        raise RecordingError(str(error)) from None
+    laws: list[LawReference] = []
+    for path in files:
+        file, text = str(path), read_text(path)
+        try:
+            helpers = read_helpers(text, file)
+            try_limited(file, laws_in, text, file, helpers)
+            laws += laws_in(text, file, helpers)
+        except ValueError as error:
+            raise RecordingError(str(error)) from None
     return TrustedLaws(tuple(laws), trusts_recorded)
 
 

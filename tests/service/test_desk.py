@@ -50,6 +50,30 @@ def test_the_desk_answers_when_the_record_of_the_tick_is_there(block, monkeypatc
     assert block["ticks_head"][0] == (7 if stall_s else 8)
 
 
+@pytest.mark.parametrize("kind", [Kind.SET_REFERENCE, Kind.REFUSED])
+def test_an_answer_that_comes_while_the_command_is_withdrawn_is_the_answer(block, monkeypatch, kind: Kind):
+    """The loop claims the command after the desk's last look at the events, and before the withdrawal."""
+    now_s = [0.0]
+
+    def take_and_answer(*_: Any) -> bool:
+        events, event = block.ring("events"), message(kind, tick=7)
+        event["identity"] = 1
+        events.slots[claim(events, np.uint64(0))] = event[0]
+        publish(events, np.uint64(0))
+        return False
+
+    def sleep(seconds: float) -> None:
+        now_s[0] += seconds
+
+    monkeypatch.setattr(desk_module, "time", SimpleNamespace(monotonic=lambda: now_s[0], sleep=sleep))
+    monkeypatch.setattr(desk_module, "withdraw", take_and_answer)
+    if kind is Kind.REFUSED:
+        with pytest.raises(RefusedByLoop, match="refused at tick 7"):
+            Desk(block).submit(Kind.SET_REFERENCE)
+    else:
+        assert Desk(block).submit(Kind.SET_REFERENCE) == 7
+
+
 def test_a_change_that_was_taken_is_settled_two_ticks_later(block):
     """The loop takes the command after the record of tick 4: tick 5 may read the staged change; tick 6 follows."""
 

@@ -257,6 +257,16 @@ def test_a_trip_in_the_middle_counts_and_keeps_the_state_before_the_first():
     assert bench.run(10.0).former.mode is Mode.FEEDFORWARD
 
 
+def test_a_trip_that_comes_to_light_at_the_end_of_a_return_begins_another_recovery():
+    bench = Bench()
+    bench.trip(Flag.TRIP_STALE)
+    confirmed = bench.run(10.0)
+    bench.loop.follow = lambda: bench.loop.record_trip(Flag.TRIP_LATE)  # type: ignore[method-assign]
+    assert not bench.recovery.finish(confirmed.serial)
+    bench.recovery.observe()
+    assert (bench.report["state"], bench.report["left"]) == ("waiting", 0)
+
+
 def test_another_failure_of_the_driver_before_the_return_counts():
     bench = Bench()
     bench.trip(Flag.TRIP_DRIVER)
@@ -393,7 +403,9 @@ def test_only_the_end_of_a_loop_by_an_allowed_cause_is_covered():
     for outcome in ("killed", "law_failed", "failed", "done", "stopped"):
         assert not bench.recovery.accept_end(outcome, outcome)
     bench.host.faults += ["the card is gone", "another"]
-    bench.recovery.remove_own_faults()
+    bench.recovery.remove_own_faults(serial=0)
+    assert bench.host.faults == ["the card is gone", "another"]
+    bench.recovery.remove_own_faults(serial=1)  # The loops that ended otherwise have latched it.
     assert bench.host.faults == ["another"]
 
 
@@ -410,6 +422,9 @@ def test_the_pause_between_starts_doubles_up_to_a_limit():
         pauses_s.append(bench.recovery.pause_s)
     assert pauses_s[:3] == [WAIT_S, 2 * WAIT_S, 4 * WAIT_S]
     assert pauses_s[-1] == LONGEST_PAUSE_S
+    bench.recovery.clear()
+    bench.recovery.accept_failed_start("no answer")
+    assert bench.recovery.pause_s == WAIT_S
 
 
 AXIS = {name: signals.axis_column(0, column) for name, column in
@@ -469,6 +484,17 @@ def test_the_ramp_of_a_return_is_smooth_and_slow_enough():
     assert (samples[0], samples[-1]) == (-limits.drive_v, 0.0)
     assert samples[1] - samples[0] < 1e-3 * np.max(np.diff(samples)) * 10
     assert ticks >= BUMP_FACTOR * limits.bump_s * PREPARED.plan.pacing.rate_hz
+
+
+@pytest.mark.parametrize("order", [1, -1])
+def test_the_slowest_axis_determines_the_ramp_of_a_return(order: int):
+    (axis,), plan = PREPARED.configuration.axes, PREPARED.plan
+    slow = axis.model_copy(update={"limits": axis.limits.model_copy(update={"trip_slew_v_per_s": 2.0})})
+    configuration = SimpleNamespace(axes=(axis, slow)[::order])
+    pair = SimpleNamespace(coefficients=np.concatenate([plan.coefficients] * 2), pacing=plan.pacing)
+    live: Any = SimpleNamespace(prepared=SimpleNamespace(configuration=configuration, plan=pair))
+    travel_s = axis.limits.drive_v / 2.0
+    assert ramp_ticks(live) == round(10.0 * travel_s * plan.pacing.rate_hz)
 
 
 @pytest.mark.parametrize(

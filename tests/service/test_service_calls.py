@@ -94,8 +94,8 @@ def busy_service() -> Service:
     service._desk = cast(Any, SimpleNamespace(submit=refuse_command))
     service.supervisor = cast(Any, SimpleNamespace(latest=lambda: np.zeros(max(FLAGS, MODE) + 1), error=None))
     service.armed = True
-    prepared = SimpleNamespace(plan=SimpleNamespace(axes="x"))
-    references = SimpleNamespace(restore_configured=refuse_command)
+    prepared = SimpleNamespace(plan=SimpleNamespace(axes="x", table=[]), configuration=service.configuration)
+    references = SimpleNamespace(restore_configured=refuse_command, client_counts=())
     service.live = cast(Any, SimpleNamespace(prepared=prepared, references=references))
     return service
 

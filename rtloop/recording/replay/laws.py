@@ -17,6 +17,7 @@ from pathlib import Path
 from rtloop.foundation.trusted import open_file
 from rtloop.kernel.layout import MAX_COUPLED
 from rtloop.laws.contract import ANY_NUMBER
+from rtloop.laws.helpers import Helper, read_helpers
 from rtloop.laws.limited.trial import try_limited
 from rtloop.laws.registry import BUILT_IN, LawReference, find_law, kinds, law_class, law_layout
 from rtloop.recording.errors import RecordingError
@@ -95,9 +96,9 @@ def _find_law(entry: Mapping[str, object], recording: Recording, trust: TrustedL
     for law in (*trust.files, *_installed_laws(name)):
         if law.kind == name and law.sha256 == digest:
             return law
-    law = LawReference(name, str(text), str(recording.paths[0]))
+    law = LawReference(name, str(text), str(recording.paths[0]), helpers=_recorded_helpers(entry, location))
     try:
-        law = _in_place(name, str(digest), entry.get("file"))
+        law = _in_place(law, str(digest), entry.get("file"))
     except ValueError as error:
         if not trust.recorded:
             raise RecordingError(
@@ -119,21 +120,37 @@ def _find_law(entry: Mapping[str, object], recording: Recording, trust: TrustedL
     return law
 
 
-def _in_place(name: str, digest: str, file: object) -> LawReference:
-    """Read the law `name` from `file`, from which it ran; `digest` is the recorded SHA-256 of its text.
+def _recorded_helpers(entry: Mapping[str, object], location: str) -> tuple[Helper, ...]:
+    """Return the helpers of the law of one header entry. Raises RecordingError for others than names with texts."""
+    recorded = entry.get("helpers", [])
+    try:
+        helpers = tuple(Helper(item["name"], item["text"], f"{location}: {item['name']}.py") for item in recorded)  # type: ignore[attr-defined]
+    except (TypeError, KeyError):
+        helpers = (Helper("", None, ""),)  # type: ignore[arg-type]
+    if not all(isinstance(part, str) for helper in helpers for part in helper):
+        raise RecordingError(f"{location}: helpers: invalid; allowed: a list of names and texts")
+    return helpers
 
-    Raises ValueError if the file is not recorded, unreadable or untrusted, has another SHA-256, or does not import
-    rtloop.
+
+def _in_place(recorded: LawReference, digest: str, file: object) -> LawReference:
+    """Read the law `recorded` and its helpers from `file`, from which it ran, and from beside it; `digest` is the
+    recorded SHA-256.
+
+    Raises ValueError if the file is not recorded, if it or a helper is unreadable or untrusted, has another SHA-256, or
+    if the file does not import rtloop.
     """
     if not isinstance(file, str) or not file.isprintable():
         raise ValueError("the law's file is not recorded")
     try:
         with os.fdopen(open_file(Path(file), os.O_RDONLY), "rb") as opened:
-            law = LawReference(name, opened.read(MAX_TEXT_BYTES).decode(), file)
+            text = opened.read(MAX_TEXT_BYTES).decode()
     except OSError as error:
         raise ValueError(f"{file}: {error.strerror}") from None
+    law = replace(recorded, text=text, file=file, helpers=read_helpers(text, file))
     if law.sha256 != digest:
-        raise ValueError(f"{file} has changed since the run")
+        texts, recorded_texts = ({(helper.name, helper.text) for helper in side.helpers} for side in (law, recorded))
+        names = sorted({f"{name}.py" for name, _ in texts ^ recorded_texts}) if text == recorded.text else []
+        raise ValueError(f"{', '.join(names) or file} has changed since the run")
     if not IMPORT.search(law.text):
         raise ValueError(f"{file} is not a law")
     return law

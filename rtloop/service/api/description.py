@@ -18,7 +18,8 @@ ERRORS = {
     413: f"the body is longer than {MAX_BODY_BYTES} bytes",
     422: "the request is malformed, or a value is not allowed",
     503: "too many requests wait, the request takes too long, or the service is ending; send the request again later",
-    504: "the loop has taken the command and stands still; the command takes effect if the loop continues",
+    504: "the loop stands still, and has taken the command or will take it (mode off, a stop): the command takes "
+    "effect if the loop continues",
 }
 ERROR_SCHEMA = {"type": "object", "properties": {"error": {"type": "string"}}, "required": ["error"]}
 _RESERVED = "|".join(

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from enum import Enum
 from typing import NamedTuple
 
@@ -20,7 +21,7 @@ from rtloop.engine.messages import Kind
 from rtloop.foundation.arrays import Real
 from rtloop.kernel.reference import Generator
 from rtloop.service.changing.live import LiveLaw
-from rtloop.service.changing.references import Setting
+from rtloop.service.changing.references import ReferenceReplaced, Setting
 from rtloop.service.desk import Desk, Refusal
 from rtloop.service.preparation import await_ticks, depolarise
 from rtloop.service.recovering.former_state import FormerState
@@ -90,7 +91,7 @@ def come_back(
         depolarise(sine, supervisor, live, desk)
         on_step(ReturnStep.DEPOLARISED)
     targets = [_restart(former, number, loop) for number in range(len(former.settings))]
-    present = [_hold_present(former, number, loop) for number in range(len(targets))]
+    present = [_hold_present(former, number, loop, former.mode) for number in range(len(targets))]
     desk.submit(Kind.SET_MODE, values=[float(former.mode), 0.0, 1.0])
     on_step(ReturnStep.ENTERED)
     ticks = ramp_ticks(live)
@@ -102,6 +103,22 @@ def come_back(
     await_ticks(supervisor, ticks + hold_ticks, live.prepared.plan.pacing.rate_hz)
     for number in range(len(targets)):
         _restart(former, number, loop)
+
+
+def restore_references(former: FormerState, mode: Mode, loop: RunningLoop) -> None:
+    """Start the references of `former` again, which a return that did not succeed has replaced.
+
+    Call it before another mode than raw is entered, for raw after it. A former reference in the unit of another mode
+    becomes a constant, as when the mode changes. A reference that a client has set since stays. Raises as
+    `LiveReferences.restart`.
+    """
+    is_raw = mode is Mode.RAW
+    for number, setting in enumerate(former.settings):
+        with suppress(ReferenceReplaced):
+            if setting is not None and setting.in_volts == is_raw:
+                loop.live.references.restart(number, setting, former.client_counts[number])
+            elif not is_raw:
+                _hold_present(former, number, loop, mode)
 
 
 def _restart(former: FormerState, number: int, loop: RunningLoop) -> tuple[float, float]:
@@ -122,14 +139,14 @@ def _restart(former: FormerState, number: int, loop: RunningLoop) -> tuple[float
     )
 
 
-def _hold_present(former: FormerState, number: int, loop: RunningLoop) -> float:
-    """Set a constant reference of axis `number` with which entering the former mode does not move the drive, and
-    return its value, µm or in raw mode V.
+def _hold_present(former: FormerState, number: int, loop: RunningLoop, mode: Mode) -> float:
+    """Set a constant reference of axis `number` with which entering `mode` does not move the drive, and return its
+    value, µm or in raw mode V.
 
     The value is the newest one of the mode's signal in HELD_COLUMNS. Raises as `LiveReferences.restart`.
     """
-    value = float(loop.supervisor.newest(1)[-1, signals.axis_column(number, HELD_COLUMNS[former.mode])])
-    hold = Setting((float(Generator.HOLD), value), former.mode is Mode.RAW)
+    value = float(loop.supervisor.newest(1)[-1, signals.axis_column(number, HELD_COLUMNS[mode])])
+    hold = Setting((float(Generator.HOLD), value), mode is Mode.RAW)
     loop.live.references.restart(number, hold, former.client_counts[number])
     return value
 

@@ -100,6 +100,8 @@ class Recovery:
         self._state, self._reason, self._causes = RecoveryState.READY, StepReason.NONE, 0
         self._former: FormerState | None = None
         """State to return to; None unless a recovery is under way."""
+        self.unrestored: FormerState | None = None
+        """State whose references a return or a preparation has replaced and not restored: the next start does it."""
         self._serial = 0
         """Changes when a recovery begins or ends; the commands of an earlier one are refused."""
         self._begun_s: deque[float] = deque()
@@ -154,13 +156,18 @@ class Recovery:
             return
         self._causes = trip.causes
         reason = self._obstacle(trip, options)
-        if reason is None and self._count_remaining(options) == 0:
-            reason = StepReason.COUNT
         if reason is None and self._former is None:
             self._former = None if trip.mode is None else record_former_state(trip.mode, live)
             reason = StepReason.REFERENCE if self._former is None else None
         if reason is not None:
             self._end(RecoveryStep.LATCHED, reason, RecoveryState.LATCHED)
+            return
+        self._wait(options)
+
+    def _wait(self, options: RecoverOptions) -> None:
+        """Count one more recovery and enter WAITING; latch if none is left. The guard must be held."""
+        if self._count_remaining(options) == 0:
+            self._end(RecoveryStep.LATCHED, StepReason.COUNT, RecoveryState.LATCHED)
             return
         self._begun_s.append(self._now_s())
         self._serial += 1
@@ -208,7 +215,7 @@ class Recovery:
             if obstacle is not None:
                 self._end(RecoveryStep.LATCHED, obstacle, RecoveryState.LATCHED)
                 return None
-            self._state, self._reason = RecoveryState.RETURNING, StepReason.NONE
+            self._state, self._reason, self.unrestored = RecoveryState.RETURNING, StepReason.NONE, former
             self._add_step(RecoveryStep.CONFIRMED)
             return Return(former, options, self._serial)
 
@@ -237,7 +244,7 @@ class Recovery:
             if live.references.trip.number != self._seen_trip:
                 return False
             if failure is None:
-                self._failures = 0
+                self._failures, self.unrestored = 0, None
                 self._end(RecoveryStep.RECOVERED, StepReason.NONE, RecoveryState.READY)
             elif failure is StepReason.CLIENT:
                 self._end(RecoveryStep.ENDED, failure, RecoveryState.READY)
@@ -245,17 +252,19 @@ class Recovery:
                 self._end(RecoveryStep.LATCHED, failure, RecoveryState.LATCHED)
             return True
 
-    def end(self) -> None:
+    def end(self) -> bool:
         """End a recovery that is under way, because a client takes over; the recovery sends no command afterwards.
 
-        The state becomes READY if the return has begun, else LATCHED: no return before `reset`. No effect without a
-        recovery under way.
+        The state becomes READY if the return has begun, else LATCHED: no return before `reset`. Returns whether a
+        recovery was under way.
         """
         with self._guard:
-            if self._former is not None:
-                is_returning = self._state is RecoveryState.RETURNING
-                state = RecoveryState.READY if is_returning else RecoveryState.LATCHED
-                self._end(RecoveryStep.ENDED, StepReason.CLIENT, state)
+            if self._former is None:
+                return False
+            is_returning = self._state is RecoveryState.RETURNING
+            state = RecoveryState.READY if is_returning else RecoveryState.LATCHED
+            self._end(RecoveryStep.ENDED, StepReason.CLIENT, state)
+            return True
 
     def clear(self) -> None:
         """Enter the state READY after a reset, and end a recovery under way; the recoveries of the last hour still
@@ -277,7 +286,7 @@ class Recovery:
             if options is None:
                 return False
             if OUTSIDE_OUTCOMES.get(outcome) in options.causes:
-                return self._accept(fault)
+                return self._accept(fault, options)
             if self._state is not RecoveryState.LATCHED:
                 self._end(RecoveryStep.LATCHED, StepReason.CAUSE, RecoveryState.LATCHED)
             return False
@@ -293,19 +302,28 @@ class Recovery:
             options = self._options
             if options is None or "driver" not in options.causes or self._live is None:
                 return False
-            return self._accept(fault)
+            return self._accept(fault, options)
 
-    def _accept(self, fault: str) -> bool:
+    def _accept(self, fault: str, options: RecoverOptions) -> bool:
         """Count a loop that ended or could not start, and store `fault`, the text that the service latches for this
         failure, so that the return removes `fault` from the service's faults. Returns True.
+
+        A loop that ends in a return, before the return has reset its trip, tells no other trip: the next loop must be
+        confirmed anew.
         """
         self._own_faults.add(fault)
         self._failures += 1
+        if self._state is RecoveryState.RETURNING:
+            self._wait(options)
         return True
 
-    def remove_own_faults(self) -> None:
-        """Remove from the service's faults each one that `accept_end` or `accept_failed_start` has accepted."""
+    def remove_own_faults(self, serial: int) -> None:
+        """Remove from the service's faults each one that `accept_end` or `accept_failed_start` has accepted; no effect
+        once the recovery `serial` has ended, also by the end of its loop, which has added a fault.
+        """
         with self._guard:
+            if self._serial != serial:
+                return
             self._host.faults[:] = [fault for fault in self._host.faults if fault not in self._own_faults]
             self._own_faults.clear()
 
@@ -316,6 +334,11 @@ class Recovery:
         """
         wait_s = LONGEST_PAUSE_S if self._options is None else self._options.wait_s
         return min(wait_s * 2.0 ** min(max(self._failures - 1, 0), 10), LONGEST_PAUSE_S)
+
+    @property
+    def is_returning(self) -> bool:
+        """Whether the return has begun, and neither succeeded nor ended."""
+        return self._state is RecoveryState.RETURNING
 
     @property
     def oldest_step(self) -> Step | None:

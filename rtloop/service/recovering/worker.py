@@ -105,7 +105,7 @@ class RecoveryWorker:
         faults that the recovery covers.
         """
         if step is ReturnStep.RESET:
-            self._recovery.remove_own_faults()
+            self._recovery.remove_own_faults(serial)
             return
         self._recovery.report(
             serial, RecoveryStep.DEPOLARISED if step is ReturnStep.DEPOLARISED else RecoveryStep.RETURNING
