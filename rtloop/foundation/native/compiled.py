@@ -181,7 +181,7 @@ def c_library_function(name: str, signature: str, uncompiled: Callable[..., obje
     return KernelSymbol(name, resolve_type, uncompiled)
 
 
-def unlocked_call(function: CFunction | UncompiledFunction) -> Callable[..., int]:
+def unlocked_call(function: CFunction | UncompiledFunction) -> Callable[..., object]:
     """Return a function that calls a C function with addresses, and lets other threads of Python run meanwhile."""
     if isinstance(function, UncompiledFunction):
         return function

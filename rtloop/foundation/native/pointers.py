@@ -99,11 +99,11 @@ def load_word(compiler: ModuleType, address: Type) -> tuple[Signature, Callable[
 
 
 @intrinsic_like(uncompiled.add_words)
-def add_words(compiler: ModuleType, first: Type, second: Type) -> tuple[Signature, Callable[..., Value]]:
+def add_words(compiler: ModuleType, first: Type, second: Type) -> tuple[Signature, Callable[..., object]]:
     """Add two uint64 modulo 2⁶⁴. The operator + would warn of an overflow where kernels run uncompiled."""
     types = compiler.types
 
-    def codegen(context: BaseContext, builder: IRBuilder, signature: Signature, arguments: Sequence[Value]) -> Value:
+    def codegen(context: BaseContext, builder: IRBuilder, signature: Signature, arguments: Sequence[Value]) -> object:
         """Emit the LLVM code of the sum and return its value; numba defines the parameters."""
         return builder.add(arguments[0], arguments[1])
 
