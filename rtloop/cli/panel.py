@@ -12,7 +12,7 @@ from pathlib import Path
 import click
 
 from rtloop.cli.exit_codes import report_errors
-from rtloop.cli.options import OUTPUT
+from rtloop.cli.options import TARGET
 from rtloop.errors import RtloopError
 
 PORT = 8321
@@ -56,7 +56,7 @@ def panel_process(config: Path, enabled: bool, port: int, name: str | None = Non
 @click.argument("service", metavar="[NAME|SOCKET]", required=False)
 @port_option("--port")
 @click.option("--open", "opens", is_flag=True, help="Open the panel in the browser.")
-@click.option("--token-file", type=OUTPUT, help="File with the access token; a missing file is created.")
+@click.option("--token-file", type=TARGET, help="File with the access token; a missing file is created.")
 @click.option(
     "--foxglove", is_flag=True, help="Serve Foxglove viewers (WebSocket) too; these viewers cannot control the loop."
 )
