@@ -70,10 +70,8 @@ class _service:
     def __init__(self, folder: Path, environment: dict[str, str]) -> None:
         self._socket = folder / "run" / "paper.sock"
         environment = environment | {"RUNTIME_DIRECTORY": str(folder / "run")}
-        self._log = open(folder / "service.log", "wb")
-        self._process = subprocess.Popen(
-            [PROGRAM, "serve", folder / "stock" / "paper.toml"], cwd=folder, env=environment, stderr=self._log
-        )
+        command = [PROGRAM, "serve", folder / "stock" / "paper.toml"]
+        self._process = subprocess.Popen(command, cwd=folder, env=environment, stderr=subprocess.DEVNULL)
 
     def __enter__(self) -> Path:
         while not self._socket.exists():
@@ -84,7 +82,6 @@ class _service:
     def __exit__(self, *_: object) -> None:
         self._process.send_signal(signal.SIGINT)
         self._process.wait()
-        self._log.close()
 
 
 class Table:

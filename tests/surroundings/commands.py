@@ -141,8 +141,9 @@ COMMANDS = _listed()
 
 LONG = (
     "campaign run", "campaign rerun", "campaign search", "campaign boundary", "campaign compare", "design verify",
-    "design shape", "design auto", "identify", "experiment run", "drivers --selftest", "demo", "serve {stock}/paper.toml "
-    "--name cell --panel", "ctl --socket {socket} re", "ctl --socket {socket} learn", "ctl --socket {socket} controller",
+    "design shape", "design auto", "identify", "experiment run", "drivers --selftest", "demo",
+    "serve {stock}/paper.toml --name cell --panel", "ctl --socket {socket} re", "ctl --socket {socket} learn",
+    "ctl --socket {socket} controller",
 )  # fmt: skip
 """Beginnings of the commands that compute for seconds, which the option --short leaves out."""
 
@@ -210,7 +211,7 @@ def write_node_configurations(place: Path, stock: Path, port: int) -> None:
 
 
 def clean_environment(home: Path) -> dict[str, str]:
-    """Return the environment of the clean column: no variable that any program here looks for, the cache of this user."""
+    """Return the environment of the clean column: few variables, and the cache of this user."""
     from rtloop.foundation.native.cache import CACHE_FOLDER
 
     kept = {name: os.environ[name] for name in ("PATH", "TERM") if name in os.environ}

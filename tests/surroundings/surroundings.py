@@ -120,8 +120,8 @@ SURROUNDINGS: dict[str, Surrounding] = {
         shell=f"mkdir gone; cd gone; rmdir ../gone; {RUN}", cause=ANY_OUTPUT, same_text=False
     ),
     "folder read-only": Surrounding(
-        shell=f"exec unshare --mount bash -c 'mount --bind . . && mount -o remount,ro,bind . && cd \"$PWD\"; {RUN}' bash \"$@\"",
-        cause=ANY_OUTPUT, root=True, same_text=False,
+        shell="exec unshare --mount bash -c 'mount --bind . . && mount -o remount,ro,bind . && cd \"$PWD\"; "
+        f"{RUN}' bash \"$@\"", cause=ANY_OUTPUT, root=True, same_text=False,
     ),
     "64 files": Surrounding(shell=f"ulimit -n 64; {RUN}", cause=ANY_OUTPUT),
     "long path": Surrounding(
