@@ -39,6 +39,7 @@ def main() -> int:
     parser.add_argument("--only", help="rows, by parts of their names, separated by commas")
     parser.add_argument("--commands", help="commands, by their beginnings, separated by commas")
     parser.add_argument("--short", action="store_true", help="leave out commands that compute for seconds")
+    parser.add_argument("--stock", type=Path, help="folder of the files that commands read, made if it is missing")
     parser.add_argument("--jobs", type=int, default=len(os.sched_getaffinity(0)))
     parser.add_argument("--text", action="store_true", help="print the messages of failed cells")
     options = parser.parse_args()
@@ -58,19 +59,21 @@ def main() -> int:
         folder.chmod(0o755)
         (folder / "home").mkdir()
         environment = clean_environment(folder / "home")
-        make_stock(folder / "stock", environment)
-        with _service(folder, environment) as socket:
-            bench = Bench(folder, folder / "stock", environment, socket)
+        stock = options.stock or folder / "stock"
+        if not stock.exists():
+            make_stock(stock, environment)
+        with _service(folder, stock, environment) as socket:
+            bench = Bench(folder, stock, environment, socket)
             return Table(bench, commands, options.jobs, options.text).run(rows)
 
 
 class _service:
     """The service of shared commands: it runs in clean surroundings while all cells run."""
 
-    def __init__(self, folder: Path, environment: dict[str, str]) -> None:
+    def __init__(self, folder: Path, stock: Path, environment: dict[str, str]) -> None:
         self._socket = folder / "run" / "paper.sock"
         environment = environment | {"RUNTIME_DIRECTORY": str(folder / "run")}
-        command = [PROGRAM, "serve", folder / "stock" / "paper.toml"]
+        command = [PROGRAM, "serve", stock / "paper.toml"]
         self._process = subprocess.Popen(command, cwd=folder, env=environment, stderr=subprocess.DEVNULL)
 
     def __enter__(self) -> Path:

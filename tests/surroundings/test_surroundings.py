@@ -82,15 +82,25 @@ def test_the_planted_files_would_run(tmp_path: Path) -> None:
     assert (tmp_path / "ran-this").exists()
 
 
-def test_every_child_is_started_by_the_one_command() -> None:
-    """`sys.executable` and Python's own ways to start processes stand in two files."""
-    allowed = {"rtloop/foundation/children.py"}
-    found = set()
+STARTERS = {"subprocess.Popen", "subprocess.run", "asyncio.create_subprocess_exec"}
+
+
+def test_every_child_has_the_one_command_and_environment() -> None:
+    """`sys.executable` stands in one file, and each start of a process states its environment."""
+    users, starts = set(), 0
     for path in sorted((ROOT / "rtloop").rglob("*.py")):
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-            if isinstance(node, ast.Attribute) and node.attr in ("executable", "spawnv", "execv", "system"):
-                found.add(str(path.relative_to(ROOT)))
-    assert found == allowed
+            if isinstance(node, ast.Attribute):
+                name = ast.unparse(node)
+                assert not name.startswith(("os.system", "os.exec", "os.spawn", "os.posix_spawn")), path
+                if name == "sys.executable":
+                    users.add(path.name)
+            if isinstance(node, ast.Call) and ast.unparse(node.func) in STARTERS:
+                starts += 1
+                (environment,) = [ast.unparse(word.value) for word in node.keywords if word.arg == "env"]
+                assert environment == "environment" or environment.startswith("child_environment("), path
+    assert users == {"children.py"}
+    assert starts >= 7
 
 
 def test_a_child_gets_no_variable_that_changes_it(monkeypatch: pytest.MonkeyPatch) -> None:

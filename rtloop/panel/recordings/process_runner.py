@@ -95,5 +95,5 @@ async def _run_json(command: list[str], stdin: bytes, timeout_s: float) -> dict[
 
 def _command_text(command: list[str]) -> str:
     """Return the command line for a terminal, quoted: `rtloop …`, or `python -m MODULE …` for another module."""
-    module = command.index("-m") + 1
-    return shlex.join(command[module:] if command[module] == "rtloop" else ["python", *command[1:]])
+    words = command[command.index("-m") + 1 :]
+    return shlex.join(words if words[0] == "rtloop" else ["python", "-m", *words])
