@@ -67,6 +67,8 @@ def _prepare_environment() -> None:
     """Remove what would change results or break commands from this process's environment, for its children too."""
     if ignored := [name for name in harmful_variables() if name.startswith("NUMBA_")]:
         _complain(f"warning: environment: {', '.join(ignored)}: no effect; rtloop compiles with its own settings\n")
+    if sys.flags.optimize > 1:
+        _complain("warning: environment: PYTHONOPTIMIZE=2: help and descriptions are missing; unset it\n")
     for name in harmful_variables():
         del os.environ[name]
     sys.warnoptions.clear()  # multiprocessing passes them on

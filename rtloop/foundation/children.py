@@ -25,5 +25,8 @@ def child_environment(changes: Mapping[str, str] | None = None) -> dict[str, str
 
 
 def harmful_variables() -> list[str]:
-    """Return the names of the environment's variables that would change compiled code or end a child by a warning."""
-    return sorted(name for name in os.environ if name.startswith("NUMBA_") or name == "PYTHONWARNINGS")
+    """Return the names of the environment's variables that would change compiled code, or make a child end or lose its
+    texts and assertions.
+    """
+    harmful = ("PYTHONOPTIMIZE", "PYTHONWARNINGS")
+    return sorted(name for name in os.environ if name.startswith("NUMBA_") or name in harmful)

@@ -169,7 +169,8 @@ def _module(text: str, file: str) -> ModuleType:
     try:
         # stdout belongs to the command, or to the supervisor; a limited process has none of its own
         with contextlib.nullcontext() if is_limited() else contextlib.redirect_stdout(sys.stderr):
-            exec(compile(text, file, "exec", dont_inherit=True), module.__dict__)
+            # optimize: an `assert` of the law stays one of its steps, whatever `python -O` or PYTHONOPTIMIZE says
+            exec(compile(text, file, "exec", dont_inherit=True, optimize=0), module.__dict__)
     except Exception as error:
         del sys.modules[name]
         raise ValueError(f"{file}{_line(error, file)}: {_message(error)}") from error

@@ -138,10 +138,11 @@ def faults(ending: Ending, clean: tuple[Ending, Ending], surrounding: Surroundin
         found.append(f"planted code ran: {' '.join(ending.markers)}")
     if isinstance(ending.code, str) or ending.code < 0 or ending.code >= 128 or ending.code == 120:
         found.append(f"ended with {ending.code}")
-    if ending.code != clean[0].code:
-        cause = surrounding.cause
-        if cause is None or not (cause == "^$" or re.search(cause, ending.stderr)):
-            found.append(f"exit code {ending.code}, clean {clean[0].code}")
+    cause = surrounding.cause
+    is_explained = cause is not None and (cause == "^$" or bool(re.search(cause, ending.stderr)))
+    if ending.code != clean[0].code and not is_explained:
+        found.append(f"exit code {ending.code}, clean {clean[0].code}")
+    if ending.code != clean[0].code or (is_explained and cause != "^$"):
         return found
     for name, data in clean[0].files.items():
         if name not in ending.files:

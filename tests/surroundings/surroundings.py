@@ -19,8 +19,8 @@ class Surrounding:
 
     `environment` changes variables, None removes one; {place} is the cell's folder. `shell` is a text of bash that runs
     the command "$@" in the cell's folder. `prepare(place, markers)` writes what lies there. `cause` is a pattern that a
-    message matches where the exit code differs from the clean one; None: it must be equal. With `same_text`, stdout
-    equals the clean one, where two clean runs are equal. `root` needs root.
+    message matches where exit code or files differ from the clean ones; None: they must be equal. With `same_text`,
+    stdout equals the clean one, where two clean runs are equal. `root` needs root.
     """
 
     environment: Mapping[str, str | None] = field(default_factory=dict)
@@ -73,7 +73,8 @@ SURROUNDINGS: dict[str, Surrounding] = {
     ),
     "LC_ALL=C": Surrounding({"LC_ALL": "C", "LANG": "C"}),
     **_variable("LC_ALL", "xx_YY.garbage"),
-    **_variable("PYTHONOPTIMIZE", "1", "2"),
+    **_variable("PYTHONOPTIMIZE", "1"),
+    **_variable("PYTHONOPTIMIZE", "2", cause="PYTHONOPTIMIZE=2: help and descriptions are missing"),
     **_variable("PYTHONWARNINGS", "error", "garbage"),
     **_variable("PYTHONDONTWRITEBYTECODE", "1"),
     **_variable("PYTHONHASHSEED", "1"),

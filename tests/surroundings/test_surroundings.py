@@ -104,10 +104,10 @@ def test_every_child_has_the_one_command_and_environment() -> None:
 
 
 def test_a_child_gets_no_variable_that_changes_it(monkeypatch: pytest.MonkeyPatch) -> None:
-    for name in ("NUMBA_OPT", "NUMBA_DISABLE_JIT", "PYTHONWARNINGS"):
+    for name in ("NUMBA_OPT", "NUMBA_DISABLE_JIT", "PYTHONWARNINGS", "PYTHONOPTIMIZE"):
         monkeypatch.setenv(name, "1")
     environment = child_environment({"ADDED": "1"})
-    assert not [name for name in environment if name.startswith("NUMBA_") or name == "PYTHONWARNINGS"]
+    assert not [name for name in environment if name.startswith(("NUMBA_", "PYTHONWARN", "PYTHONOPT"))]
     assert environment["ADDED"] == environment["PYTHONSAFEPATH"] == "1"
     assert environment["PATH"] == os.environ["PATH"]
     assert python_command("a.b", 1)[1:] == ["-P", "-m", "a.b", "1"]
@@ -151,6 +151,12 @@ def test_a_recording_is_shown_whatever_the_surroundings(
     assert message in result.stderr
     assert "Traceback" not in result.stderr + result.stdout
     assert "Exception ignored" not in result.stderr
+
+
+def test_an_assertion_of_a_law_stays_whatever_python_leaves_out() -> None:
+    program = "from rtloop.laws.registry import laws_in; laws_in('assert False, 1234', 'law.py')"
+    done = subprocess.run([sys.executable, "-OO", "-P", "-c", program], capture_output=True, text=True)
+    assert "law.py, line 1: AssertionError: 1234" in done.stderr
 
 
 def test_a_umask_leaves_the_owner_his_rights(bench: Bench, tmp_path: Path) -> None:
