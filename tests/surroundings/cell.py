@@ -17,7 +17,7 @@ from pathlib import Path
 from tests.surroundings.commands import PROGRAM, Command, write_node_configurations
 from tests.surroundings.surroundings import Surrounding
 
-LIMIT_S = 240.0
+LIMIT_S = 900.0
 POLL_S = 0.1
 CLEAN = Surrounding()
 
