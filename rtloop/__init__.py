@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from importlib import import_module
-from typing import TYPE_CHECKING
 
 from rtloop.version import __version__ as __version__
 
+TYPE_CHECKING = False  # not from typing: with `python -m rtloop` that could still be a file of the current folder
 if TYPE_CHECKING:
     from rtloop.campaigns.run import campaign as campaign
     from rtloop.client.capture.conditions import Edge as Edge

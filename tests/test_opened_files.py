@@ -34,6 +34,7 @@ VERBS = {"driver.open", "self._driver.open", "self.open", "loop.open", "self.loo
 KERNEL_FILE = "a fixed path, which the kernel serves"
 PACKAGE_FILE = "a file of the installed package"
 ALLOWED = {
+    ("cli/program.py", "os.open"): KERNEL_FILE,
     ("configuration/text_files.py", "os.open"): "below a folder that is held open, through no link; kind looked at",
     ("doctor/host.py", "(self.root / path.lstrip('/')).read_text"): KERNEL_FILE,
     ("doctor/host.py", "(self.root / 'proc/config.gz').read_bytes"): KERNEL_FILE,
@@ -50,6 +51,7 @@ ALLOWED = {
     ("panel/web/application.py", "FileResponse"): PACKAGE_FILE,
     ("panel/web/server.py", "webbrowser.open"): "an address, no file",
     ("interchange/export.py", "archive.open"): "a member of an archive that is open",
+    ("recording/views/picture.py", "os.open"): "the current folder, to return to; nothing is read of it",
     ("recording/file/mcap/chunkfile.py", "os.open"): "a folder, to be synchronised; nothing is read of it",
     ("service/second_opinion.py", "path.read_bytes"): PACKAGE_FILE,
     ("starters/examples.py", "files('rtloop').joinpath('examples', name).read_text"): PACKAGE_FILE,

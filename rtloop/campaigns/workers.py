@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import multiprocessing
+import multiprocessing.forkserver
 import os
 import re
 import signal
@@ -13,14 +14,14 @@ from collections.abc import Callable
 from concurrent.futures import Executor, Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from ipaddress import ip_address
-from typing import Any, Literal, Protocol, TypeVar
+from typing import Any, Protocol, TypeVar
 
 from rtloop.errors import MissingExtra, UnavailableError
+from rtloop.foundation.children import child_environment
 from rtloop.foundation.heap import keep_freed_memory
 from rtloop.version import __version__
 
 Result = TypeVar("Result")
-StartMethod = Literal["forkserver", "spawn"]
 START = "start it with `dask scheduler --host 127.0.0.1`"
 CONNECT_S = 10.0
 """Time after which a scheduler that does not answer counts as unreachable."""
@@ -68,18 +69,17 @@ class ProcessWorkers:
     def __init__(
         self,
         count: int | None = None,
-        start_method: StartMethod = "forkserver",
         preload: str = "rtloop.campaigns.unit",
     ) -> None:
         """Use `count` processes, by default one for each processor that this process may use.
 
-        With forkserver, the module `preload` is imported once for all processes.
+        The module `preload` is imported once for all processes.
         """
         self.count = count or len(os.sched_getaffinity(0))
         self.name = f"{self.count} worker process{'es' if self.count > 1 else ''}"
-        self._context = multiprocessing.get_context(start_method)
-        if start_method == "forkserver":
-            self._context.set_forkserver_preload([preload])
+        self._context = multiprocessing.get_context("forkserver")
+        self._context.set_forkserver_preload([preload])
+        _start_forkserver()
         self._executor = self._start()
 
     def submit(self, function: Callable[..., Result], *arguments: object) -> Future[Result]:
@@ -105,6 +105,18 @@ class ProcessWorkers:
     def _start(self) -> Executor:
         """Return a new pool of processes, which leave Ctrl-C to the coordinator and end with it."""
         return ProcessPoolExecutor(self.count, mp_context=self._context, initializer=_follow_coordinator)
+
+
+def _start_forkserver() -> None:
+    """Start the server that makes worker processes, with the environment of a child; no effect if it runs already."""
+    before = dict(os.environ)
+    os.environ.clear()
+    os.environ.update(child_environment())
+    try:
+        multiprocessing.forkserver.ensure_running()
+    finally:
+        os.environ.clear()
+        os.environ.update(before)
 
 
 def _follow_coordinator() -> None:

@@ -46,6 +46,7 @@ from rtloop.cli import (
     service,
     verify,
 )
+from rtloop.cli.program import Program
 from rtloop.foundation.heap import keep_freed_memory
 from rtloop.version import __version__
 
@@ -58,7 +59,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")
 
 
-@click.group(context_settings={"help_option_names": ["-h", "--help"]})
+@click.group(cls=Program, context_settings={"help_option_names": ["-h", "--help"]})
 @click.version_option(__version__, prog_name="rtloop")
 def main() -> None:
     """Close a hard, fast control loop from Python, and record every tick so that the run can be verified.

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from rtloop.cli.exit_codes import report_errors
-from rtloop.cli.options import JSON, OUTPUT
+from rtloop.cli.options import JSON, OUTPUT, TARGET
 from rtloop.cli.output import print_result
 from rtloop.cli.output.progress import Counter
 from rtloop.cli.workers import choose_workers, worker_options
@@ -35,7 +35,7 @@ def _add_options(command: Callable[..., object]) -> Callable[..., object]:
         JSON,
         click.option(
             "--out",
-            type=OUTPUT,
+            type=TARGET,
             help="Folder for the verdicts, from which the same command continues after a stop.  [default: none]",
         ),
         worker_options,

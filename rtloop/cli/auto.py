@@ -9,7 +9,7 @@ import click
 
 from rtloop.cli.exit_codes import report_errors
 from rtloop.cli.identify import AXIS
-from rtloop.cli.options import JSON, OUTPUT
+from rtloop.cli.options import JSON, OUTPUT, TARGET
 from rtloop.cli.robust import print_taps
 from rtloop.cli.verify import verify_configuration
 from rtloop.errors import NoDesign
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 @click.argument("step", metavar="STEP", type=OUTPUT)
 @click.option("--specs", type=OUTPUT, required=True, help="Specification of the loop; its [plant] is not used.")
 @click.option(
-    "--out", type=OUTPUT, required=True, help="Configuration file to write; an existing file is not overwritten."
+    "--out", type=TARGET, required=True, help="Configuration file to write; an existing file is not overwritten."
 )
 @AXIS
 @click.option(

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import click
 
 from rtloop.cli.exit_codes import report_errors, require_readable
-from rtloop.cli.options import JSON, OUTPUT
+from rtloop.cli.options import JSON, OUTPUT, TARGET
 from rtloop.cli.output import echo_json
 from rtloop.cli.output.progress import StatusLine
 from rtloop.cli.workers import choose_workers, worker_options
@@ -25,14 +25,14 @@ if TYPE_CHECKING:
     from rtloop.campaigns.summary import CampaignSummary
 
 CAMPAIGN = click.argument("campaign", type=OUTPUT)
-FOLDER = click.option("--out", type=OUTPUT, help="Folder of the results.  [default: campaigns/CAMPAIGN-CONFIG]")
+FOLDER = click.option("--out", type=TARGET, help="Folder of the results.  [default: campaigns/CAMPAIGN-CONFIG]")
 CONFIGURATION = click.option(
     "--config", type=OUTPUT, help="Configuration that replaces the one in CAMPAIGN, to compare both on the same rigs."
 )
 RIGS = click.option(
     "--rigs", type=click.IntRange(1, 10_000_000), help="Number of sampled rigs.  [default: the number in CAMPAIGN]"
 )
-PAGE = click.option("--page", type=OUTPUT, help="Write the report to this file, too, as one HTML page.")
+PAGE = click.option("--page", type=TARGET, help="Write the report to this file, too, as one HTML page.")
 STOPPED = 130
 """Exit code of a campaign that Ctrl-C has stopped."""
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import click
 
 from rtloop.cli.exit_codes import report_errors
-from rtloop.cli.options import JSON, OUTPUT
+from rtloop.cli.options import JSON, OUTPUT, TARGET
 from rtloop.cli.output import echo_json
 
 
@@ -23,7 +23,7 @@ def design() -> None:
     help="File that `rtloop identify dynamics` wrote: its [axis.model] replaces [plant] of SPEC; its "
     "[axis.feedforward], if there is one, goes into --out.  [default: [plant] of SPEC]",
 )  # fmt: skip
-@click.option("--out", type=OUTPUT, help="Configuration file to write.  [default: only [axis.controller], to stdout]")
+@click.option("--out", type=TARGET, help="Configuration file to write.  [default: only [axis.controller], to stdout]")
 @click.option("--axis", default="x", show_default=True, help="Name of the axis in the configuration that is written.")
 @click.option(
     "--cross-check",

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import click
 
 from rtloop.cli.exit_codes import report_errors
-from rtloop.cli.options import JSON, OUTPUT, Seconds
+from rtloop.cli.options import JSON, OUTPUT, TARGET, Seconds
 from rtloop.cli.output import echo_json
 from rtloop.cli.output.progress import StatusLine
 from rtloop.values import to_jsonable
@@ -41,7 +41,7 @@ DEFAULT_RATE_HZ = 10_000.0
     is_flag=True,
     help="Change the settings that can be changed without a restart of the host; needs root.",
 )
-@click.option("--png", type=OUTPUT, metavar="FILE", help="Picture to write: histogram of the ticks' lateness.")
+@click.option("--png", type=TARGET, metavar="FILE", help="Picture to write: histogram of the ticks' lateness.")
 @JSON
 @report_errors
 def doctor(config: Path | None, seconds: float, change: bool, png: Path | None, as_json: bool) -> int:

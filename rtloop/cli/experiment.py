@@ -14,7 +14,7 @@ from typing import IO, TYPE_CHECKING, Any, TypedDict, Unpack
 import click
 
 from rtloop.cli.exit_codes import report_errors
-from rtloop.cli.options import CONFIG, JSON, OUTPUT
+from rtloop.cli.options import CONFIG, JSON, OUTPUT, TARGET
 from rtloop.cli.output import echo_json, print_warnings
 from rtloop.cli.output.progress import StatusLine
 from rtloop.cli.run import recover_leftovers
@@ -54,7 +54,7 @@ RUN_OPTIONS = (
     ),
     click.option(
         "--out",
-        type=OUTPUT,
+        type=TARGET,
         help="Folder for recordings and report.  [default: NAME-experiments-TIME in recording.folder]",
     ),
     JSON,
@@ -138,7 +138,7 @@ experiment.add_command(
 
 @experiment.command()
 @click.argument("runs", metavar="RUN...", type=OUTPUT, nargs=-1, required=True)
-@click.option("--out", type=OUTPUT, help="Folder for the report.  [default: folder of the first recording]")
+@click.option("--out", type=TARGET, help="Folder for the report.  [default: folder of the first recording]")
 @JSON
 @report_errors
 def report(runs: tuple[Path, ...], out: Path | None, as_json: bool) -> int:

@@ -10,7 +10,7 @@ from typing import Any
 import click
 
 from rtloop.cli.exit_codes import report_errors
-from rtloop.cli.options import FILES, JSON, OUTPUT, Seconds
+from rtloop.cli.options import FILES, JSON, TARGET, Seconds
 from rtloop.cli.output import print_result
 from rtloop.cli.output.progress import Counter
 from rtloop.values import count_text
@@ -36,7 +36,7 @@ UNTIL = click.option(
 @click.command()
 @FILES
 @click.option("--to", type=FORMAT, required=True, help="Format of the file; parquet and hdf5 need rtloop[data].")
-@click.option("--out", type=OUTPUT, help="File to write.  [default: FILE with another ending]")
+@click.option("--out", type=TARGET, help="File to write.  [default: FILE with another ending]")
 @FROM
 @UNTIL
 @click.option(
@@ -78,7 +78,7 @@ def export(
 
 @click.command()
 @FILES
-@click.option("--out", type=OUTPUT, help="Picture to write: .png, .pdf or .svg.  [default: FILE with .png]")
+@click.option("--out", type=TARGET, help="Picture to write: .png, .pdf or .svg.  [default: FILE with .png]")
 @FROM
 @UNTIL
 @click.option("--html", is_flag=True, help="Write one HTML page with zoom and pan, instead of a PNG.")

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from rtloop.cli.exit_codes import report_errors
-from rtloop.cli.options import JSON, OUTPUT, NumberList
+from rtloop.cli.options import JSON, OUTPUT, TARGET, NumberList
 from rtloop.cli.output import echo_json, print_warnings
 from rtloop.workbench.tables import console
 
@@ -16,8 +16,8 @@ if TYPE_CHECKING:
     from rtloop.workbench.identified_model import IdentifiedModel
 RUNS = click.argument("runs", metavar="RUN...", type=OUTPUT, nargs=-1, required=True)
 AXIS = click.option("--axis", help="Name of the axis.  [default: the only axis]")
-OUT = click.option("--out", type=OUTPUT, help="TOML file to write; an existing file is not overwritten.")
-PLOT = click.option("--plot", type=OUTPUT, help="Picture (PNG) to write.")
+OUT = click.option("--out", type=TARGET, help="TOML file to write; an existing file is not overwritten.")
+PLOT = click.option("--plot", type=TARGET, help="Picture (PNG) to write.")
 
 
 @click.group()

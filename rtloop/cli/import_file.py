@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, TypedDict
 import click
 
 from rtloop.cli.exit_codes import report_errors
-from rtloop.cli.options import FILES, JSON, OUTPUT
+from rtloop.cli.options import FILES, JSON, OUTPUT, TARGET
 from rtloop.cli.output import print_result
 from rtloop.cli.output.progress import Counter
 from rtloop.errors import OutputError
@@ -77,7 +77,7 @@ class ColumnListing(dict[str, object]):
 @click.option(
     "--mapping", type=OUTPUT, help="TOML file with these options.  [default: NAME.map.toml or map.toml beside FILE]"
 )
-@click.option("--out", type=OUTPUT, help="Recording to write; allowed with one FILE.  [default: FILE with .mcap]")
+@click.option("--out", type=TARGET, help="Recording to write; allowed with one FILE.  [default: FILE with .mcap]")
 @JSON
 @report_errors
 def import_command(

@@ -9,7 +9,7 @@ import click
 
 from rtloop.cli.exit_codes import report_errors
 from rtloop.cli.laws import LAW_NAME
-from rtloop.cli.options import OUTPUT
+from rtloop.cli.options import OUTPUT, TARGET
 
 if TYPE_CHECKING:
     from rtloop.starters.folder import Starter
@@ -19,7 +19,7 @@ NAMES = {"law": "my_law", "driver": "my_card"}
 
 
 @click.command()
-@click.argument("folder", type=OUTPUT, default=Path())
+@click.argument("folder", type=TARGET, default=Path())
 @click.option(
     "--kind",
     type=click.Choice(["paper", "stage", "law", "driver"]),

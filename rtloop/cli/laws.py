@@ -9,7 +9,7 @@ from typing import Any
 import click
 
 from rtloop.cli.exit_codes import report_errors
-from rtloop.cli.options import JSON, OUTPUT, MatchingText
+from rtloop.cli.options import JSON, TARGET, MatchingText
 from rtloop.cli.output import echo_json
 from rtloop.errors import ConfigError
 from rtloop.workbench.tables import console, escape, table
@@ -36,7 +36,7 @@ def law() -> None:
 
 @law.command()
 @click.argument("name", type=LAW_NAME)
-@click.option("--out", type=OUTPUT, default=Path(), help="Folder for the three files.  [default: the current folder]")
+@click.option("--out", type=TARGET, default=Path(), help="Folder for the three files.  [default: the current folder]")
 @report_errors
 def new(name: str, out: Path) -> None:
     """Write NAME.py, its test and an example configuration.

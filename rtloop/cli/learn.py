@@ -9,7 +9,7 @@ import click
 
 from rtloop.cli.ctl import AXIS, make_client, read_numbers
 from rtloop.cli.exit_codes import report_errors
-from rtloop.cli.options import JSON, OUTPUT, InputFile
+from rtloop.cli.options import JSON, TARGET, InputFile
 from rtloop.cli.output import echo_json
 from rtloop.workbench.tables import console, table
 
@@ -27,7 +27,7 @@ from rtloop.workbench.tables import console, table
 )
 @click.option(
     "--out",
-    type=OUTPUT,
+    type=TARGET,
     help="File to write: the learned table, which `rtloop ctl waveform` plays; an existing file is not overwritten.",
 )
 @JSON

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 import re
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
@@ -14,6 +15,24 @@ if TYPE_CHECKING:
 
 OUTPUT = click.Path(path_type=Path, readable=False)
 """A path; a file that cannot be read is reported by its reader, with exit code 66, as a missing one is."""
+
+
+class OutputPath(click.Path):
+    """A path to write to; `-`, the standard output of other programs, is refused."""
+
+    def __init__(self) -> None:
+        """Take any path; the writer reports one that cannot be written."""
+        super().__init__(path_type=Path, readable=False)
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """Return `value` as a Path. Fails with a usage error for "-"."""
+        if os.fspath(value) == "-":
+            self.fail("value is -; allowed: the path of a file or folder, such as ./- for one of this name. "
+                      "rtloop writes no file to the standard output", param, ctx)  # fmt: skip
+        return super().convert(value, param, ctx)
+
+
+TARGET = OutputPath()
 CONFIG = click.argument("config", type=OUTPUT)
 
 

@@ -12,7 +12,7 @@ from pathlib import Path
 import click
 
 from rtloop.cli.exit_codes import report_errors
-from rtloop.cli.options import OUTPUT, MatchingText
+from rtloop.cli.options import TARGET, MatchingText
 from rtloop.errors import RtloopError
 
 PORT = 8321
@@ -60,7 +60,7 @@ def panel_process(config: Path, enabled: bool, port: int, name: str | None = Non
               help="Address of the panel in 127.0.0.0/8.  [default: another one at each start]")  # fmt: skip
 @click.option("--open", "opens", is_flag=True, help="Open the panel in the browser.")
 @click.option(
-    "--token-file", type=OUTPUT, help="File that receives the address with the token, which is then not printed."
+    "--token-file", type=TARGET, help="File that receives the address with the token, which is then not printed."
 )
 @click.option(
     "--foxglove", is_flag=True, help="Serve Foxglove viewers (WebSocket) too; these viewers cannot control the loop."

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from rtloop.cli.exit_codes import report_errors
-from rtloop.cli.options import FILES, JSON, OUTPUT, Seconds
+from rtloop.cli.options import FILES, JSON, TARGET, Seconds
 from rtloop.cli.output import print_result
 from rtloop.cli.output.progress import Counter
 from rtloop.values import count_text
@@ -25,7 +25,7 @@ TICK = click.IntRange(min=0)
 @FILES
 @click.option(
     "--out",
-    type=OUTPUT,
+    type=TARGET,
     help="Recovered file to write; allowed with one FILE.  [default: NAME.mcap for NAME.mcap.part]",
 )
 @JSON
@@ -66,7 +66,7 @@ def recover(files: tuple[Path, ...], out: Path | None, as_json: bool) -> None:
 )
 @click.option("--from-tick", "first", type=TICK, metavar="TICK", help="First tick of the part, instead of --from.")
 @click.option("--until-tick", "end", type=TICK, metavar="TICK", help="First tick after the part, instead of --until.")
-@click.option("--out", type=OUTPUT, help="Recording to write.  [default: NAME.cut-TICK.mcap beside FILE]")
+@click.option("--out", type=TARGET, help="Recording to write.  [default: NAME.cut-TICK.mcap beside FILE]")
 @JSON
 @report_errors
 def cut(

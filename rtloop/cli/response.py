@@ -13,7 +13,7 @@ from rtloop.cli.ctl import AXIS as SERVICE_AXIS
 from rtloop.cli.ctl import make_client
 from rtloop.cli.exit_codes import report_errors
 from rtloop.cli.identify import AXIS, PLOT
-from rtloop.cli.options import JSON, OUTPUT
+from rtloop.cli.options import JSON, OUTPUT, TARGET
 from rtloop.cli.output import echo_json
 from rtloop.values import to_jsonable
 from rtloop.workbench.tables import console, format_number, table
@@ -52,7 +52,7 @@ NEAR = click.option(
     type=click.FloatRange(0, min_open=True),
     help="Expected frequency of the lightly damped mode, in Hz.  [default: the model's]",
 )
-OUT = click.option("--out", type=OUTPUT, help="JSON file to write; an existing file is not overwritten.")
+OUT = click.option("--out", type=TARGET, help="JSON file to write; an existing file is not overwritten.")
 
 
 @click.command("response")

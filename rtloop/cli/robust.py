@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import click
 
 from rtloop.cli.exit_codes import report_errors
-from rtloop.cli.options import CONFIG, JSON, OUTPUT
+from rtloop.cli.options import CONFIG, JSON, OUTPUT, TARGET
 from rtloop.cli.output import echo_json
 from rtloop.errors import ConfigError, NoDesign
 from rtloop.workbench.written_files import path_from, write_configuration, write_output
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 )
 @click.option(
     "--out",
-    type=OUTPUT,
+    type=TARGET,
     help="Configuration file to write: a copy of --config with the new controller; without --config, a new "
     "configuration with a simulated rig.  [default: to stdout; without --config, only [axis.controller]]",
 )
@@ -77,13 +77,13 @@ def robust(spec: Path, config: Path | None, out: Path | None, axis: str, as_json
 @click.option("--spec", type=OUTPUT, help="Specification file.  [default: key `specification` of the axis]")
 @click.option(
     "--out",
-    type=OUTPUT,
+    type=TARGET,
     help="Configuration file to write: CONFIG with the new taps.  [default: only [axis.prefilter], to stdout]",
 )
 @click.option("--axis", default="x", show_default=True, help="Name of the axis for which the taps are made.")
 @click.option(
     "--plot",
-    type=OUTPUT,
+    type=TARGET,
     help="Picture (.png) to write: overshoot over settling time, and the step (needs rtloop[plot]).",
 )
 @JSON

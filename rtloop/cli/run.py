@@ -12,7 +12,7 @@ import click
 
 from rtloop import signals
 from rtloop.cli.exit_codes import report_errors, require_readable
-from rtloop.cli.options import CONFIG, JSON, OUTPUT, Seconds
+from rtloop.cli.options import CONFIG, JSON, TARGET, Seconds
 from rtloop.cli.output import echo_json, print_warnings
 from rtloop.cli.output.progress import Counter, StatusLine
 from rtloop.cli.panel import panel_options, panel_process
@@ -40,7 +40,7 @@ SHOWN_AXES = 4
 @click.option(
     "--unpaced", is_flag=True, help="Run in virtual time, as fast as the machine allows (simulated hardware only)."
 )
-@click.option("--out", type=OUTPUT, help="Folder for the recording.  [default: recording.folder]")
+@click.option("--out", type=TARGET, help="Folder for the recording.  [default: recording.folder]")
 @JSON
 @panel_options
 @report_errors

@@ -7,11 +7,11 @@ from pathlib import Path
 import click
 
 from rtloop.cli.exit_codes import report_errors
-from rtloop.cli.options import OUTPUT
+from rtloop.cli.options import TARGET
 
 
 @click.command()
-@click.option("--out", type=OUTPUT, help="File to write.  [default: stdout]")
+@click.option("--out", type=TARGET, help="File to write.  [default: stdout]")
 @report_errors
 def schema(out: Path | None) -> None:
     """Print the JSON Schema of a configuration.

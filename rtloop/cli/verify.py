@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import click
 
 from rtloop.cli.exit_codes import report_errors
-from rtloop.cli.options import CONFIG, JSON, OUTPUT
+from rtloop.cli.options import CONFIG, JSON, OUTPUT, TARGET
 from rtloop.cli.output import echo_json, print_warnings
 from rtloop.errors import ConfigError
 from rtloop.workbench.tables import console, escape, table
@@ -33,7 +33,7 @@ RED = {"MISSED", "NO"}
 @click.option(
     "--spec", type=OUTPUT, help="Specification file for all axes.  [default: key `specification` of each axis]"
 )
-@click.option("--out", type=OUTPUT, help="Folder for verify.html, verify.json and pictures (needs rtloop[plot]).")
+@click.option("--out", type=TARGET, help="Folder for verify.html, verify.json and pictures (needs rtloop[plot]).")
 @JSON
 @report_errors
 def verify(config: Path, spec: Path | None, out: Path | None, as_json: bool) -> int:

@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, TypeVar
 
-from rtloop.errors import MissingExtra
+from rtloop.recording.views.picture import load_matplotlib
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -59,18 +59,13 @@ def draw_pictures(
 
     `draw(figure, curves, palette)` draws it. Raises MissingExtra without matplotlib.
     """
-    try:
-        import matplotlib
-        from matplotlib.backends.backend_agg import FigureCanvasAgg
-        from matplotlib.figure import Figure
-    except ImportError:
-        raise MissingExtra("the report's pictures need matplotlib: pip install 'rtloop[plot]'") from None
+    matplotlib = load_matplotlib()
     images: dict[str, bytes] = {}
     first: Figure | None = None
     for name, ink in THEMES.items():
         with matplotlib.rc_context(_matplotlib_settings(ink)):
-            figure = Figure(figsize=size, layout="constrained" if first is None else None)
-            FigureCanvasAgg(figure)
+            figure = matplotlib.figure.Figure(figsize=size, layout="constrained" if first is None else None)
+            matplotlib.backends.backend_agg.FigureCanvasAgg(figure)
             draw(figure, curves, ink)
             if first is not None:
                 _copy_layout(first, figure)

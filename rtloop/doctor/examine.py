@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import subprocess
-import sys
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -17,6 +16,7 @@ from rtloop.doctor.node_line import NetworkLine, SerialLine
 from rtloop.engine import latency
 from rtloop.engine.plan import Pacing
 from rtloop.errors import RtloopError
+from rtloop.foundation.children import child_environment, python_command
 
 START_S = 60.0
 """Longest start of the measuring process, which compiles the loop the first time."""
@@ -78,7 +78,8 @@ def examine(
     timeout_s = START_S + 3 * seconds
     try:
         process = subprocess.run(
-            [sys.executable, "-m", "rtloop.engine.latency"],
+            python_command("rtloop.engine.latency"),
+            env=child_environment(),
             input=latency.encode_request(pacing, max(1, round(seconds * pacing.rate_hz))),
             capture_output=True,
             timeout=timeout_s,

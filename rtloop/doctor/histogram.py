@@ -8,8 +8,9 @@ from pathlib import Path
 import numpy as np
 
 from rtloop.doctor.examine import Latency
-from rtloop.errors import MissingExtra, output_errors
+from rtloop.errors import output_errors
 from rtloop.foundation.trusted import overwrite_file
+from rtloop.recording.views.picture import DOTS_PER_INCH, create_picture
 
 FINEST_US = 0.01
 
@@ -19,15 +20,9 @@ def draw_histogram(latency: Latency, target: Path) -> None:
 
     Raises OutputError if the system refuses, MissingExtra without matplotlib.
     """
-    try:
-        from matplotlib.backends.backend_agg import FigureCanvasAgg
-        from matplotlib.figure import Figure
-    except ImportError:
-        raise MissingExtra("a picture needs matplotlib: pip install 'rtloop[plot]'") from None
+    figure = create_picture(8, 4.5)
     values_us = np.maximum(latency.lateness_us, FINEST_US)
     edges = np.geomspace(FINEST_US, max(values_us.max(), latency.period_us) * 1.1, 120)
-    figure = Figure(figsize=(8, 4.5), layout="constrained")
-    FigureCanvasAgg(figure)
     panel = figure.add_subplot()
     panel.hist(values_us, edges, color="tab:blue")
     panel.set_xscale("log")
@@ -45,4 +40,4 @@ def draw_histogram(latency: Latency, target: Path) -> None:
     panel.grid(visible=True, alpha=0.3)
     panel.legend()
     with output_errors(target), os.fdopen(overwrite_file(target), "wb") as file:
-        figure.savefig(file, format="png", dpi=110)
+        figure.savefig(file, format="png", dpi=DOTS_PER_INCH)

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import platform
-import sys
+import shlex
 from importlib.metadata import PackageNotFoundError, version
 
 from rtloop.doctor.findings import Finding
 from rtloop.doctor.host import Host
 from rtloop.engine.plan import Pacing
+from rtloop.foundation.children import python_command
 from rtloop.foundation.native.cache import CACHE_FOLDER, CACHE_IS_PERSISTENT
 from rtloop.foundation.native.cache_files import damaged_files, quarantined_files
 
@@ -31,7 +32,7 @@ def compiled_code(host: Host, pacing: Pacing) -> Finding:
             False,
             0.0,
             "the next start compiles damaged files again; if files are damaged repeatedly, the disk fails",
-            f"{sys.executable} -m rtloop.cli.warm",
+            shlex.join(python_command("rtloop.cli.warm")),
         )
     return Finding(
         "compiled code",

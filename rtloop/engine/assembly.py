@@ -16,8 +16,10 @@ from rtloop.engine.loop import Outcome, run_ticks
 from rtloop.engine.memory import SharedBlock
 from rtloop.engine.messages import MESSAGE
 from rtloop.engine.plan import Pacing, Plan
+from rtloop.errors import HostRefusal
 from rtloop.foundation.arrays import Real
-from rtloop.foundation.native.compiled import python_entry
+from rtloop.foundation.native.c_function import Entry
+from rtloop.foundation.native.compiled import UNCOMPILED, python_entry
 from rtloop.foundation.native.pointers import address_pointer, carray
 from rtloop.kernel.layout import CONDITIONS, LAW
 from rtloop.kernel.memory import LawMemory
@@ -58,8 +60,14 @@ class Assembly:
     ) -> None:
         """Fill in the loop's context from the plan, and write the plan's table and the drives at rest to `block`.
 
-        No tick is run. Raises ValueError for a channel that the driver lacks.
+        No tick is run. Raises ValueError for a channel that the driver lacks, HostRefusal if the loop is compiled and
+        the laws are not.
         """
+        if UNCOMPILED and isinstance(run_ticks, Entry):  # It would take the functions' numbers for addresses.
+            raise HostRefusal(
+                "environment: NUMBA_DISABLE_JIT is set, but a loop runs compiled only; unset it. Tests of a law run "
+                "uncompiled with it (rtloop.laws.conformance)"
+            )
         self._loops = np.zeros(1, LOOP).view(np.recarray)
         self.loop = self._loops[0]
         self._arrays: dict[str, npt.NDArray[Any]] = {}

@@ -9,7 +9,6 @@ followed by the columns' doubles, one column after the other.
 from __future__ import annotations
 
 import json
-import os
 import signal
 import subprocess
 import sys
@@ -21,6 +20,7 @@ from typing import IO, cast
 import numpy as np
 
 from rtloop.errors import MissingExtra, RtloopError
+from rtloop.foundation.children import child_environment, python_command
 from rtloop.interchange.formats.groups import MAX_BYTES, row_count
 from rtloop.interchange.formats.table import Table, UnopenedData, UnreadableData
 from rtloop.interchange.reading import read_in_process
@@ -37,8 +37,8 @@ def read_table(path: Path, group: str | None = None) -> Table:
     UnreadableData if it is of no known format, damaged, too large or has no such group, or if the process is killed;
     MissingExtra if the format's package is missing.
     """
-    command = [sys.executable, "-m", __name__, str(path), *([] if group is None else [group])]
-    environment = os.environ | {"OPENBLAS_NUM_THREADS": "1"}
+    command = python_command(__name__, path, *([] if group is None else [group]))
+    environment = child_environment({"OPENBLAS_NUM_THREADS": "1"})
     devnull = subprocess.DEVNULL
     with subprocess.Popen(command, stdin=devnull, stdout=subprocess.PIPE, stderr=devnull, env=environment) as process:
         table = _receive_table(path, cast("IO[bytes]", process.stdout))

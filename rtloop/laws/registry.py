@@ -216,7 +216,8 @@ class _HelperImporter:
         module = sys.modules[name] = ModuleType(name, text)
         module.__file__ = file
         module.__dict__["__builtins__"] = {**vars(builtins), "__import__": self._import}
-        exec(compile(text, file, "exec", dont_inherit=True), module.__dict__)
+        # optimize: an `assert` of the law stays one of its steps, whatever `python -O` or PYTHONOPTIMIZE says
+        exec(compile(text, file, "exec", dont_inherit=True, optimize=0), module.__dict__)
         self._loaded[name] = module
         return module
 

@@ -15,12 +15,12 @@ import os
 import signal
 import socket
 import subprocess
-import sys
 import tempfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from rtloop.errors import UnavailableError, output_errors
+from rtloop.foundation.children import child_environment, python_command
 from rtloop.starters.examples import read_example
 from rtloop.starters.first_start import FIRST_START, is_first_start
 from rtloop.starters.new_files import write_new_files
@@ -92,12 +92,12 @@ def _board_process(config: Path) -> Iterator[None]:
 
     Raises UnavailableError if it does not start.
     """
-    command = [sys.executable, "-m", "rtloop", "hil", "serve", str(config), "--until-stdin-ends"]
+    command = python_command("rtloop", "hil", "serve", config, "--until-stdin-ends")
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as notifications:
         # Linux chooses a name outside the file system, whose paths may be too long for a socket.
         notifications.bind("")
         notifications.settimeout(POLL_S)
-        environment = os.environ | {"NOTIFY_SOCKET": f"@{notifications.getsockname()[1:].decode()}"}
+        environment = child_environment({"NOTIFY_SOCKET": f"@{notifications.getsockname()[1:].decode()}"})
         process = subprocess.Popen(command, stdin=subprocess.PIPE, process_group=0, env=environment)
         try:
             _wait_until_ready(notifications, process)

@@ -6,11 +6,11 @@ import contextlib
 import json
 import queue
 import subprocess
-import sys
 import threading
 from pathlib import Path
 from typing import Any
 
+from rtloop.foundation.children import child_environment, python_command
 from rtloop.foundation.processors import processor_time_s
 
 END_TIMEOUT_S = 5.0
@@ -33,7 +33,8 @@ class Child:
         files = {"fd": fd, **other_files}
         options = [word for name, file in files.items() for word in (f"--{name}", str(file))]
         self.process = subprocess.Popen(
-            [sys.executable, "-m", module, *options],
+            python_command(module, *options),
+            env=child_environment(),
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             pass_fds=[*files.values()],

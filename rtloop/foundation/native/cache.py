@@ -88,8 +88,9 @@ def _cache_folder() -> tuple[Path, bool]:
     if not HAS_OWNERS:  # A folder that others cannot change is not known to be one.
         return Path(tempfile.mkdtemp(prefix="rtloop-")), False
     digest = source_digest()
-    home = os.environ.get("XDG_CACHE_HOME") or (os.environ.get("HOME", "") and f"{os.environ['HOME']}/.cache")
-    if home and _make_private_folder(Path(home) / "rtloop" / digest):
+    home = os.environ.get("XDG_CACHE_HOME") or f"{os.environ.get('HOME', '')}/.cache"
+    # A relative path would make any folder in which the process stands a place of code; without HOME there is no cache.
+    if os.path.isabs(home) and home != "/.cache" and _make_private_folder(Path(home) / "rtloop" / digest):
         return Path(home) / "rtloop" / digest, True
     shared = Path(tempfile.gettempdir()) / f"rtloop-{os.getuid()}"
     if _make_private_folder(shared) and _make_private_folder(shared / digest):

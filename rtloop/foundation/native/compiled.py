@@ -25,8 +25,10 @@ if TYPE_CHECKING:
 
 PACKAGE_PREFIX = "rtloop."
 """Prefix of the modules in the cache folder's digest; numba caches the kernels of other modules itself."""
-UNCOMPILED = bool(int(os.environ.get("NUMBA_DISABLE_JIT") or 0))
-"""Whether kernels run uncompiled, as Python functions, because the environment has NUMBA_DISABLE_JIT=1."""
+UNCOMPILED = os.environ.get("NUMBA_DISABLE_JIT", "").strip("0 ").isdecimal()
+"""Whether kernels run uncompiled, as Python functions, because of NUMBA_DISABLE_JIT=1 in the environment.
+
+Any number but 0 has this effect; numba ignores other texts."""
 
 
 class Kernel:

@@ -7,17 +7,20 @@ from __future__ import annotations
 
 from typing import Any
 
-import numba
-import numba.np.linalg
-from llvmlite import ir
-from numba import config
-from numba.core import caching, cgutils, types
-from numba.core.registry import cpu_target
-from numba.core.sigutils import normalize_signature
-from numba.core.typing.templates import Signature, make_intrinsic_template
-
 from rtloop.foundation.native.cache import CACHE_FOLDER
-from rtloop.foundation.native.numba_cache_file import CheckedCacheFile
+from rtloop.foundation.native.default_settings import numba_by_default
+
+with numba_by_default():
+    import numba
+    import numba.np.linalg
+    from llvmlite import ir
+    from numba import config
+    from numba.core import caching, cgutils, types
+    from numba.core.registry import cpu_target
+    from numba.core.sigutils import normalize_signature
+    from numba.core.typing.templates import Signature, make_intrinsic_template
+
+    from rtloop.foundation.native.numba_cache_file import CheckedCacheFile
 
 __all__ = ["cgutils", "ir", "kernel_type", "make_intrinsic_template", "numba", "parse_signature", "types"]
 
@@ -43,6 +46,7 @@ def _report_no_blas() -> None:
 
 _load_arrays_without_blas()
 caching.IndexDataCacheFile = CheckedCacheFile  # pyright: ignore[reportAttributeAccessIssue]
+config.reload_config = lambda: None  # pyright: ignore[reportAttributeAccessIssue]  # It would read them again.
 config.CACHE_DIR = str(CACHE_FOLDER)  # pyright: ignore[reportAttributeAccessIssue]
 # Four equal operations written side by side become one vector operation, which reorders no sum. Loops are left as they
 # are: they run over an axis, five states or fifteen plays, and their vector forms cost more than they save.

@@ -22,6 +22,7 @@ from typing import IO, Any, TypeVar
 
 from rtloop.drivers.errors import DriverError
 from rtloop.errors import ConfigError, RtloopError, UnavailableError
+from rtloop.foundation.children import child_environment, python_command
 from rtloop.foundation.processors import processor_time_s
 from rtloop.laws.limited.frames import LENGTH, write_frame
 from rtloop.laws.limited.worker import PREPARE, RUN, Preparation
@@ -144,7 +145,8 @@ class LimitedProcess:
         self._unanswered = 0
         self._data.clear()
         self._process = subprocess.Popen(
-            [sys.executable, "-m", "rtloop.laws.limited.worker"],
+            python_command("rtloop.laws.limited.worker"),
+            env=child_environment(),
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
@@ -155,7 +157,11 @@ class LimitedProcess:
 
     def _prepare(self, function: Callable[..., object], compiles: bool) -> None:
         """Send the preparation of a job and count it in `_unanswered`; its acknowledgement is read later."""
-        preparation = Preparation(os.getcwd(), sys.path, pickle.dumps(function), compiles, self.limit_s)
+        try:
+            folder = os.getcwd()
+        except FileNotFoundError:  # deleted meanwhile
+            folder = "/"
+        preparation = Preparation(folder, sys.path, pickle.dumps(function), compiles, self.limit_s)
         self._send(pickle.dumps((PREPARE, tuple(preparation))))
         self._unanswered += 1
 

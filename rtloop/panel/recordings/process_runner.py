@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import asyncio
 import json
-import os
 import shlex
-import sys
 from contextlib import suppress
 
 from rtloop.errors import RtloopError
+from rtloop.foundation.children import child_environment, python_command
 from rtloop.service.api.lanes import TooManyRequests
 from rtloop.values import count_text
 
@@ -57,8 +56,7 @@ class ProcessRunner:
         self._pending += 1
         try:
             async with self._slots:
-                command = [sys.executable, "-m", module, *map(str, arguments)]
-                return await _run_json(command, stdin.encode(), self._timeout_s)
+                return await _run_json(python_command(module, *arguments), stdin.encode(), self._timeout_s)
         finally:
             self._pending -= 1
 
@@ -71,7 +69,7 @@ async def _run_json(command: list[str], stdin: bytes, timeout_s: float) -> dict[
     """
     pipe, devnull = asyncio.subprocess.PIPE, asyncio.subprocess.DEVNULL
     process = await asyncio.create_subprocess_exec(
-        *command, stdin=pipe, stdout=pipe, stderr=devnull, env=os.environ | SINGLE_THREADED
+        *command, stdin=pipe, stdout=pipe, stderr=devnull, env=child_environment(SINGLE_THREADED)
     )
     try:
         output, _ = await asyncio.wait_for(process.communicate(stdin), timeout_s)
@@ -97,4 +95,5 @@ async def _run_json(command: list[str], stdin: bytes, timeout_s: float) -> dict[
 
 def _command_text(command: list[str]) -> str:
     """Return the command line for a terminal, quoted: `rtloop …`, or `python -m MODULE …` for another module."""
-    return shlex.join(command[2:] if command[2] == "rtloop" else ["python", *command[1:]])
+    words = command[command.index("-m") + 1 :]
+    return shlex.join(words if words[0] == "rtloop" else ["python", "-m", *words])

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import contextlib
 import subprocess
-import sys
 from collections.abc import Iterator
 from pathlib import Path
+
+from rtloop.foundation.children import child_environment, python_command
 
 EXIT_TIMEOUT_S = 2.0
 
@@ -18,8 +19,8 @@ def run_panel_process(socket: Path, port: int) -> Iterator[None]:
     The panel has a separate process group, so that Ctrl-C reaches the loop alone. It ends when its stdin closes: after
     the block, and if this process is killed. A panel that has not ended EXIT_TIMEOUT_S after the block is killed.
     """
-    command = [sys.executable, "-m", "rtloop", "panel", str(socket), "--port", str(port), "--until-stdin-ends"]
-    process = subprocess.Popen(command, stdin=subprocess.PIPE, process_group=0)
+    command = python_command("rtloop", "panel", socket, "--port", port, "--until-stdin-ends")
+    process = subprocess.Popen(command, stdin=subprocess.PIPE, process_group=0, env=child_environment())
     try:
         yield
     finally:

@@ -3,9 +3,14 @@
 from __future__ import annotations
 
 import io
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from types import ModuleType
 from typing import TYPE_CHECKING
 
 from rtloop.errors import MissingExtra
+from rtloop.foundation.trusted import HAS_OWNERS, close_descriptor
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -13,17 +18,43 @@ if TYPE_CHECKING:
 DOTS_PER_INCH = 110
 
 
+def load_matplotlib() -> ModuleType:
+    """Return matplotlib with `figure` and `backends.backend_agg`; a matplotlibrc of the current folder is not read.
+
+    Raises MissingExtra without matplotlib.
+    """
+    try:
+        with _standing_elsewhere():
+            import matplotlib
+        import matplotlib.backends.backend_agg
+        import matplotlib.figure
+    except ImportError:
+        raise MissingExtra("a picture needs matplotlib: pip install 'rtloop[plot]'") from None
+    return matplotlib
+
+
+@contextmanager
+def _standing_elsewhere() -> Iterator[None]:
+    """Make the root the current folder during the block, on Linux; the folder may have been deleted."""
+    if not HAS_OWNERS:
+        yield
+        return
+    here = os.open(".", os.O_PATH)
+    try:
+        os.chdir("/")
+        yield
+    finally:
+        os.fchdir(here)
+        close_descriptor(here)
+
+
 def create_picture(width_inch: float, height_inch: float) -> Figure:
     """Return a new, empty figure that pyplot does not hold, and that a notebook shows as PNG without pyplot.
 
     Raises MissingExtra without matplotlib.
     """
-    try:
-        from matplotlib.figure import Figure
-    except ImportError:
-        raise MissingExtra("a plot needs matplotlib: pip install 'rtloop[plot]'") from None
 
-    class Picture(Figure):
+    class Picture(load_matplotlib().figure.Figure):
         """Figure with the method that notebooks look for."""
 
         def _repr_png_(self) -> bytes:

@@ -11,13 +11,13 @@ import json
 import logging
 import os
 import subprocess
-import sys
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 from rtloop.configuration.axis import AdaptOptions
+from rtloop.foundation.children import child_environment, python_command
 from rtloop.service.background import repeat_every
 from rtloop.service.service import Service, State
 
@@ -42,7 +42,8 @@ def _run_at_low_priority(command: Sequence[str]) -> subprocess.CompletedProcess[
 
     Raises OSError, and TimeoutExpired after RETUNE_TIMEOUT_S, which kills it.
     """
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+    pipe, environment = subprocess.PIPE, child_environment()
+    with subprocess.Popen(command, stdout=pipe, stderr=pipe, text=True, env=environment) as process:
         with contextlib.suppress(OSError):
             os.setpriority(os.PRIO_PROCESS, process.pid, NICENESS)
         try:
@@ -87,8 +88,7 @@ class RetuneSchedule:
 
     def _retune(self, axis: str, options: AdaptOptions) -> None:
         """Run `rtloop ctl retune` for an axis, wait for its end, and log the result or the failure."""
-        ctl = [sys.executable, "-m", "rtloop", "ctl", "--socket", str(self._socket)]
-        command = [*ctl, "retune", axis, "--yes", "--json"]
+        command = python_command("rtloop", "ctl", "--socket", self._socket, "retune", axis, "--yes", "--json")
         for name in ("amplitude_um", "gain_um", "bound_percent", "within_percent"):
             command += [f"--{name.replace('_', '-')}", repr(getattr(options, name))]
         try:

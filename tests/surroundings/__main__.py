@@ -1,0 +1,144 @@
+"""Table of surroundings and commands: every command of the command line in odd folders, environments and streams.
+
+    make soak NAME=surroundings FLAGS="--only planted --commands export,plot"
+
+A cell fails by a traceback, a signal, planted code that ran, another exit code than in clean surroundings without a
+message that names the cause, and by files that are missing, empty or unlike the clean ones. Rows that need root are
+left out for other users.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+from tests.surroundings.cell import CLEAN, Bench, Ending, faults
+from tests.surroundings.commands import (
+    COMMANDS,
+    LONG,
+    PROGRAM,
+    Command,
+    clean_environment,
+    make_stock,
+    missing_commands,
+)
+from tests.surroundings.surroundings import SURROUNDINGS, Surrounding
+
+
+def main() -> int:
+    """Print a line for each surrounding, and its failed cells; return 1 if one failed."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--only", help="rows, by parts of their names, separated by commas")
+    parser.add_argument("--commands", help="commands, by their beginnings, separated by commas")
+    parser.add_argument("--short", action="store_true", help="leave out commands that compute for seconds")
+    parser.add_argument("--stock", type=Path, help="folder of the files that commands read, made if it is missing")
+    parser.add_argument("--jobs", type=int, default=len(os.sched_getaffinity(0)))
+    parser.add_argument("--text", action="store_true", help="print the messages of failed cells")
+    options = parser.parse_args()
+    if missing := missing_commands():
+        sys.exit(f"commands without a cell: {', '.join(sorted(missing))}")
+    rows = {
+        name: row for name, row in SURROUNDINGS.items()
+        if (not options.only or any(part in name for part in options.only.split(",")))
+        and (os.geteuid() == 0 or not row.root)
+    }  # fmt: skip
+    begins = tuple(options.commands.split(",")) if options.commands else ("",)
+    commands = [command for command in COMMANDS if command.words.replace("--socket {socket} ", "").startswith(begins)]
+    if options.short:
+        commands = [command for command in commands if not command.words.startswith(LONG)]
+    with tempfile.TemporaryDirectory(prefix="s", dir="/tmp") as name:
+        folder = Path(name)
+        folder.chmod(0o755)
+        (folder / "home").mkdir()
+        environment = clean_environment(folder / "home")
+        stock = options.stock or folder / "stock"
+        if not stock.exists():
+            make_stock(stock, environment)
+        with _service(folder, stock, environment) as socket:
+            bench = Bench(folder, stock, environment, socket)
+            return Table(bench, commands, options.jobs, options.text).run(rows)
+
+
+class _service:
+    """The service of shared commands: it runs in clean surroundings while all cells run."""
+
+    def __init__(self, folder: Path, stock: Path, environment: dict[str, str]) -> None:
+        self._socket = folder / "run" / "paper.sock"
+        environment = environment | {"RUNTIME_DIRECTORY": str(folder / "run")}
+        command = [PROGRAM, "serve", stock / "paper.toml"]
+        self._process = subprocess.Popen(command, cwd=folder, env=environment, stderr=subprocess.DEVNULL)
+
+    def __enter__(self) -> Path:
+        while not self._socket.exists():
+            assert self._process.poll() is None, "the service did not start"
+            time.sleep(0.1)
+        return self._socket
+
+    def __exit__(self, *_: object) -> None:
+        self._process.send_signal(signal.SIGINT)
+        self._process.wait()
+
+
+class Table:
+    """Cells of the table, run by several threads; clients of the one service run one after the other."""
+
+    def __init__(self, bench: Bench, commands: list[Command], jobs: int, shows_text: bool) -> None:
+        self._bench, self._jobs, self._shows_text = bench, jobs, shows_text
+        self._alone = [command for command in commands if not command.shared]
+        self._shared = [command for command in commands if command.shared]
+        self._number = 0
+
+    def run(self, rows: dict[str, Surrounding]) -> int:
+        """Run the clean cells twice, then each row; print what failed. Returns 1 if a cell failed."""
+        begin_s = time.monotonic()
+        clean = list(zip(self._row(CLEAN), self._row(CLEAN), strict=True))
+        commands = [*self._alone, *self._shared]
+        for command, pair in zip(commands, clean, strict=True):
+            if found := faults(pair[0], pair, CLEAN) or pair[0].code != pair[1].code:
+                print(f"clean: {command.words}: {found}\n{pair[0].stderr[-1500:]}", flush=True)
+        tried = failed = 0
+        for name, surrounding in rows.items():
+            endings = self._row(surrounding)
+            bad = [
+                (command, ending, found)
+                for command, ending, pair in zip(commands, endings, clean, strict=True)
+                if (found := faults(ending, pair, surrounding))
+            ]
+            tried, failed = tried + len(endings), failed + len(bad)
+            print(f"{name:32} {len(endings):4} cells {len(bad):4} failed", flush=True)
+            for command, ending, found in bad:
+                print(f"    {command.words}: {'; '.join(found)}", flush=True)
+                if self._shows_text:
+                    print("        " + ending.stderr[-1200:].replace("\n", "\n        "), flush=True)
+        minutes = (time.monotonic() - begin_s) / 60
+        print(
+            f"{len(rows)} surroundings, {len(commands)} commands: {tried} cells, {failed} failed; {minutes:.0f} minutes"
+        )
+        return bool(failed)
+
+    def _row(self, surrounding: Surrounding) -> list[Ending]:
+        with ThreadPoolExecutor(self._jobs) as pool, ThreadPoolExecutor(1) as clients:
+            futures = [pool.submit(self._cell, command, surrounding) for command in self._alone]
+            futures += [clients.submit(self._cell, command, surrounding) for command in self._shared]
+            return [future.result() for future in futures]
+
+    def _cell(self, command: Command, surrounding: Surrounding) -> Ending:
+        self._number += 1
+        number = self._number
+        try:
+            return self._bench.run(number, command, surrounding)
+        finally:
+            for part in "cml":
+                shutil.rmtree(os.fsencode(self._bench.folder / f"{part}{number}"), ignore_errors=True)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
