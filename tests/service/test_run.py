@@ -214,7 +214,9 @@ def test_a_stopped_supervisor_is_told_from_a_dead_one(tmp_path: Path) -> None:
     assert err.count("stopped by a signal") == 1, err
 
 
-@pytest.mark.parametrize(("supervisor_pid", "outcome"), [(os.getpid(), "done"), (1 << 22, "heartbeat_lost")])
+@pytest.mark.parametrize(
+    ("supervisor_pid", "outcome"), [(os.getpid(), "done"), (1 << 22, "heartbeat_lost")], ids=["lives", "is dead"]
+)
 def test_before_its_first_tick_a_loop_in_virtual_time_waits_for_a_supervisor_that_lives(
     supervisor_pid: int, outcome: str
 ) -> None:
