@@ -201,7 +201,7 @@ def _collect_arrays(columns: FileColumns, path: str, value: object, depth: int, 
             _collect_arrays(columns, f"{path}/{name or number}", element, depth + 1)
     elif type(value).__name__ in ("MatlabOpaque", "MatlabFunction"):
         columns.left_out.append(f"{path} (an object that only MATLAB can read; save a structure or an array instead)")
-    elif isinstance(value, np.ndarray):
+    elif isinstance(value, np.ndarray | float | int):
         columns.add_column(path, value, unit)
 
 
