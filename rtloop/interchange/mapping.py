@@ -203,7 +203,7 @@ def signal_name(text: str) -> str:
 def default_signal_name(column: str) -> str:
     """Return a column's name in a recording: without its unit, of ASCII letters, digits and underscores.
 
-    A long name loses its beginning: the last MAX_NAME_CHARACTERS stay. The prefix `column_` is added to a name that
+    A long name loses its beginning: the last MAX_NAME_CHARACTERS stay. The prefix column_ is added to a name that
     does not begin with a letter, `file_` to the name of a signal that every recording has, such as tick.
     """
     plain = (

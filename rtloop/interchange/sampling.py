@@ -183,10 +183,18 @@ def _clocks(table: Table, units: Mapping[str, str | None]) -> list[str]:
         for name, values in table.columns.items()
         if is_time_unit(units.get(name)) and _grows(values) and len(table.columns) > 1 and not is_counter_name(name)
     ]
+    measured += [name for name in table.columns if units.get(name) is None and _is_epoch(table, name)]
     declared = [] if table.time is None else [table.time]
     return [
         *dict.fromkeys([*declared, *(n for n in names if units.get(n) is None or is_time_unit(units[n])), *measured])
     ]
+
+
+def _is_epoch(table: Table, name: str) -> bool:
+    """Whether a column grows, by whole numbers or fractions of s, and begins as a time since 1970 does."""
+    values = table.columns[name]
+    begin = abs(table.origins.get(name, 0) + float(values[0])) if values.size else 0.0
+    return _grows(values) and any(EPOCH_S[0] <= begin * factor <= EPOCH_S[1] for factor in EPOCH_UNITS.values())
 
 
 def _grows(times: Real) -> bool:

@@ -14,7 +14,14 @@ from typing import NamedTuple
 from rtloop.interchange.formats.cells import NO_NUMBER, is_missing, is_value, parse_cell
 from rtloop.interchange.formats.dates import date_kind
 from rtloop.interchange.formats.table import Hints, Reading, UnreadableData, ask
-from rtloop.interchange.formats.text_source import SAMPLE_BYTES, Record, TextSource, split_fields, split_records
+from rtloop.interchange.formats.text_source import (
+    SAMPLE_BYTES,
+    Record,
+    TextSource,
+    logical_lines,
+    split_fields,
+    split_records,
+)
 
 SAMPLE_LINES = 1000
 FOOTER_LINES = 20
@@ -60,7 +67,7 @@ def find_grid(source: TextSource, hints: Hints) -> Grid:
     """
     lines = [*source.head, *source.later]
     skipped = [k for k in range(len(source.head)) if k + 1 in hints.skip_rows]
-    lines = [line for k, line in enumerate(lines) if k not in skipped and line.strip()]
+    lines = [line for line in logical_lines([s for k, s in enumerate(lines) if k not in skipped]) if line.strip()]
     lines = lines[:: -(-len(lines) // SAMPLE_LINES) or 1]
     delimiter, decimal, joined = _find_notation(source, lines, hints)
     rows = [_split(line, delimiter, joined) for line in lines]
@@ -245,7 +252,7 @@ def _is_row(grid: Grid, line: str, hints: Hints) -> bool:
 def _footer(source: TextSource, grid: Grid, hints: Hints) -> list[str]:
     """Return the last lines, up to FOOTER_LINES, that hold no number in any column of numbers."""
     footer: list[str] = []
-    for line in reversed(source.tail):
+    for line in reversed(logical_lines(source.tail)):
         row = grid.split(line)
         has_number = len(row) == grid.width and any(parse_cell(row[k], grid.decimal) for k in grid.numbers)
         is_short = 0 < len(row) < grid.width and all(is_value(cell, grid.decimal) for cell in row if cell) and any(row)

@@ -66,6 +66,8 @@ class _Reader:
         self.units: dict[int, str] = {}
         """Units behind the numbers themselves, by column."""
         self.markers: dict[int, Counter[str]] = {}
+        self.plain: set[int] = set()
+        """Columns with a block of numbers without units."""
         self.filled: set[int] = set()
         """Columns with any value or text."""
         self.long: dict[int, int] = {}
@@ -205,7 +207,10 @@ class _Reader:
                 whole = parts[0].astype(np.int64).to_numpy() - self.long[values.name]
                 return whole + ("0." + parts[1] + "0").astype(np.float64).to_numpy()
             self.long.pop(values.name)
-        if values.dtype.kind in "iu" or values.dtype.kind in "fb":
+        if values.dtype.kind in "iufb":
+            self.plain.add(values.name)
+            if values.name in self.units and not self.header.units[values.name]:
+                raise self._unit_for_some(values.name, int(values.index[0]))
             return values.to_numpy() if values.dtype.kind in "iu" else values.to_numpy(np.float64)
         text = values.astype(str).str.strip()
         plain = text.str.replace(",", ".", regex=False) if self.grid.decimal == "," and not self.grid.joined else text
@@ -237,6 +242,16 @@ class _Reader:
                 has_units |= bool(parsed.unit)
         if has_units:
             self.units[column] = target
+        is_plain = ~odd & np.isfinite(numbers)
+        if column in self.units and not self.header.units[column] and (is_plain.any() or column in self.plain):
+            row = int(values.index[int(np.argmax(is_plain if is_plain.any() else odd))])
+            raise self._unit_for_some(column, row)
+
+    def _unit_for_some(self, column: int, row: int) -> UnreadableData:
+        return UnreadableData(
+            f"{self.path}: column {self.header.names[column]!r}: some values have a unit behind them, others have none "
+            f"(about line {self.line_number(row)}); write the unit into the column's name"
+        )
 
     def _factor(self, column: int, unit: str, target: str, row: int) -> float:
         if unit in ("", target):

@@ -29,7 +29,10 @@ def read_tdms(path: Path, group: str | None = None) -> Table:
         raise MissingExtra("TDMS needs npTDMS: pip install 'rtloop[tdms]'") from None
     columns = FileColumns(path)
     try:
-        with os.fdopen(open_user_file(path), "rb") as stream, TdmsFile.open(stream) as file:
+        with (
+            os.fdopen(open_user_file(path), "rb") as stream,
+            TdmsFile(stream, read_metadata_only=True, keep_open=True) as file,
+        ):
             folders: dict[tuple[object, ...], str] = {}
             for member in file.groups():
                 for channel in member.channels():
@@ -66,5 +69,7 @@ def _add_channel(columns: FileColumns, group: str, channel: Any, folders: dict[t
         others = sum(known[0] == group for known in folders)
         folders[key] = f"{group} ({1 / increment:g} Hz{', ' + str(others + 1) if others else ''})"
         columns.add_column(f"{folders[key]}/time", offset + increment * np.arange(len(values)), "s")
-        columns.notes.append(f"{name}: the times are wf_increment {increment:g} s, as the file states")
+        columns.notes.append(
+            f"{folders[key]}/{channel.name}: the times are wf_increment {increment:g} s, as the file states"
+        )
     columns.add_column(f"{folders[key]}/{channel.name}", values, unit)

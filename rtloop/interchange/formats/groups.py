@@ -123,7 +123,11 @@ class FileColumns:
                 tick_hz=stated_ticks(statements),
                 unnamed=tuple(short_names[name] for name in names if name in self.made_up),
                 origins={short_names[name]: self.origins[name] for name in names if name in self.origins},
-                notes=tuple(self.notes),
+                notes=tuple(
+                    note
+                    for note in self.notes
+                    if (owner := note.partition(": ")[0]) in names or owner not in self.columns
+                ),
             )
         return tables
 

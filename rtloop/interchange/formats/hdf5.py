@@ -29,6 +29,8 @@ MAX_DEPTH = 32
 MAX_OBJECTS = 100_000
 CONTROL = r"[\x00-\x1f\x7f-\x9f\ud800-\udfff]"
 """Characters of a name that control a terminal, or that it cannot show."""
+MATLAB_OBJECTS = "#subsystem#"
+"""Group of the contents of MATLAB's objects."""
 MATLAB_NUMBERS = (
     "double", "single", "logical", "char", "cell", "struct", "int8", "uint8", "int16", "uint16", "int32", "uint32",
     "int64", "uint64",
@@ -94,7 +96,10 @@ def _collect_group(
         )
     _visit(group, visited)
     for key in group:
-        name = f"{path}/{key}".lstrip("/")
+        is_octave = key == "value" and "OCTAVE_NEW_FORMAT" in group.attrs
+        name = path if is_octave else f"{path}/{key}".lstrip("/")
+        if name == MATLAB_OBJECTS:
+            continue
         member = _resolve_member(columns, group, key, name)
         if member is None:
             continue

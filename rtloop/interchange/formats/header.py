@@ -34,7 +34,10 @@ _FOLDED_BLANKS = (r"\s{2,}|\t", r"\s+(?![\[(<])", r"\s*[,;]\s*")
 """Separators of names that themselves have blanks, in a table of blanks."""
 _QUANTITY = re.compile(r"(\w[\w .]*)\s*/\s*(\S+)")
 """A quantity divided by its unit, as ISO 80000-1 writes it: U/V."""
+_UNIT_LABELS = frozenset(["unit", "units", "einheit", "einheiten", "unité", "unités"])
+"""Words before a row of units."""
 _SHOWN = 60
+MOST_SHOWN = 8
 NO_NAMES = Reading("--header-row 0", "no column has a name; they are column_1, column_2, …")
 
 
@@ -58,8 +61,9 @@ class HeaderReader:
         """Take the records above the table apart. Reads nothing else."""
         self._path, self._grid, self._rows, self._hints = path, grid, rows, hints
         self._columns = (*grid.dates, *grid.numbers)
-        self._used = max(self._columns) + 1
-        """Number of columns up to the last one that holds values."""
+        filled = [k for row in rows if len(row) == grid.width for k, field in enumerate(row) if field]
+        self._used = max([*self._columns, *filled]) + 1
+        """Number of columns up to the last one that holds values or texts."""
         first = [row[0] for row in rows if len(row) == grid.width]
         self._is_counted = first[:2] in (["0", "1"], ["1", "2"])
         self._records = [self._clean(record) for record in grid.above]
@@ -76,11 +80,14 @@ class HeaderReader:
         place, units_place = self._find_names()
         names, units = [""] * grid.width, [""] * grid.width
         if units_place is not None:
-            units = self._widen([_unit(field) for field in records[units_place].fields])
+            label, *fields = records[units_place].fields
+            units = self._widen(["" if label.casefold() in _UNIT_LABELS else _unit(label), *map(_unit, fields)])
         if place is not None:
             values = records[units_place].fields[self._used :] if units_place is not None else []
             extra = zip(records[place].fields[self._used :], values, strict=False)
             statements += [statement(records[place].line, name, [value]) for name, value in extra if name and value]
+            beyond = [read_statement(records[place].line, name) for name in records[place].fields[self._used :]]
+            statements += [entry for entry in beyond if entry]
             names = self._place_names(records[place], has_values=bool(values))
         else:
             for k, (name, unit) in self._stated_names(statements).items():
@@ -156,6 +163,7 @@ class HeaderReader:
             first = Reading(f"--header-row {names.line}", f"{_shown(names)!r} are the names of the columns")
             second = Reading(f"--skip-rows {names.line}", "this line is left out")
             raise ask(self._path, f"line {names.line} may hold names or values", first, second)
+        lines: list[str] = []
         for record in reversed(between):
             entry = statement(record.line, record.fields[0], record.fields[1:])
             values = [value for value, _ in entry.numbers(self._grid.decimal)]
@@ -164,10 +172,9 @@ class HeaderReader:
                 k, value = next((k, value) for k, value in places if value not in (0.0, 1.0))
                 name = names.fields[k] if k < len(names.fields) else f"column_{k + 1}"
                 raise ask_for_scale(self._path, entry, name, value, str(record.line))
-            if len(entry.values) != 1:
-                self._notes.append(
-                    f"line {record.line}, {_shown(record)!r}, stands between names and numbers, and is left out"
-                )
+            lines.append(f"line {record.line}, {_shown(record)!r}")
+        if lines:
+            self._notes.append(f"left out between names and numbers: {'; '.join(lines[:MOST_SHOWN])}")
 
     def _place_names(self, record: Record, has_values: bool) -> list[str]:
         """Return a name for each column, "" without one. Raises AmbiguousData for a name too few or too many."""
@@ -182,7 +189,7 @@ class HeaderReader:
                 )
             self._notes.append(f"line {line} has a name less than there are columns: the first one has none")
             return self._widen(["", *names])
-        surplus = [name for name in names[used:] if name]
+        surplus = [name for name in names[used:] if name and not read_statement(line, name)]
         if surplus and self._hints.header_row is None and not has_values and len(names) != self._grid.width:
             raise ask(
                 self._path,

@@ -177,6 +177,21 @@ def split_lines(text: str) -> list[str]:
     return _LINE.findall(text)
 
 
+def logical_lines(lines: Sequence[str]) -> list[str]:
+    """Return the lines, those that quotes hold together as one, with a blank for each break."""
+    joined, position = list[str](), 0
+    while position < len(lines):
+        count, quotes = 1, lines[position].count('"')
+        while quotes % 2 and count <= LONGEST_RECORD and position + count < len(lines):
+            quotes += lines[position + count].count('"')
+            count += 1
+        count = count if quotes % 2 == 0 else 1
+        *begin, end = lines[position : position + count]
+        joined.append("".join(line.rstrip("\r\n") + " " for line in begin) + end)
+        position += count
+    return joined
+
+
 def split_fields(line: str, delimiter: str | None) -> list[str]:
     """Return the fields of a record's text, without blanks and quotes around them; [] if it cannot be split.
 
