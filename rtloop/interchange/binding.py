@@ -67,7 +67,7 @@ def bind(table: Table, path: Path, selection: ColumnSelection) -> Binding:
     """
     notes = [*table.notes]
     if not is_from_recording(table):
-        table = _join_seconds(table, notes)
+        table = _join_seconds(table, selection.clock, notes)
         table = replace(table, units={name: _SINCE.sub(r"\1", unit) for name, unit in table.units.items()})
         table = replace(table, columns=_mark_missing(table, path, selection, notes))
     units = {name: column_unit(table, name) for name in table.columns}
@@ -96,7 +96,7 @@ def bind(table: Table, path: Path, selection: ColumnSelection) -> Binding:
     return Binding(path, table, units, clock, frozenset(filter(None, time_columns)), time_base, fault, notes)
 
 
-def _join_seconds(table: Table, notes: list[str]) -> Table:
+def _join_seconds(table: Table, clock: str | None, notes: list[str]) -> Table:
     """Return the table with one column of times in s for seconds and a fraction in a second column, as ROS has them.
 
     A header's stamp is the time of the measurement, and thereby the table's, if it grows.
@@ -112,7 +112,7 @@ def _join_seconds(table: Table, notes: list[str]) -> Table:
         if not np.all(np.diff(values) > 0) or joined in table.columns:
             continue
         notes.append(f"{joined}: {name} and {other} together")
-        if table.time is not None:
+        if table.time is not None and clock is None:
             notes.append(f"the times are {joined}, of the measurement; --clock {table.time} for those of the log")
         renamed = {joined if key == name else key: column for key, column in table.columns.items() if key != other}
         origins = {**table.origins, joined: table.origins.get(name, 0) + int(seconds[0])}

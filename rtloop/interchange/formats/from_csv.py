@@ -19,7 +19,7 @@ from rtloop.interchange.formats.cells import NO_MARKER, NO_NUMBER, is_missing, p
 from rtloop.interchange.formats.clock_groups import split_clocks
 from rtloop.interchange.formats.dates import dates_ns, has_one_order, unroll_days
 from rtloop.interchange.formats.dialect import Grid, find_grid
-from rtloop.interchange.formats.groups import MAX_BYTES, MAX_COLUMNS, exact_floats, select_table, unique_name
+from rtloop.interchange.formats.groups import MAX_BYTES, MAX_COLUMNS, are_codes, exact_floats, select_table, unique_name
 from rtloop.interchange.formats.header import Header, HeaderReader, ask_for_scale
 from rtloop.interchange.formats.stated import scale_statements, stated_rates, stated_ticks
 from rtloop.interchange.formats.table import MAX_ROWS, NO_HINTS, Hints, Reading, Table, UnreadableData, ask
@@ -343,19 +343,12 @@ def _require_no_codes(reader: _Reader, columns: dict[str, Real]) -> None:
     entries = [
         e for e in scale_statements(reader.header.statements, reader.grid.decimal) if e.line <= reader.grid.first
     ]
-    name = next((name for name, values in columns.items() if _are_codes(name, values)), None)
+    name = next((name for name, values in columns.items() if are_codes(values) and not is_counter_name(name)), None)
     if not entries or name is None:
         return
     entry, skip = entries[0], ",".join(str(e.line) for e in entries)
     factor = entry.numbers(reader.grid.decimal)[0][0]
     raise ask_for_scale(reader.path, entry, name, factor, skip)
-
-
-def _are_codes(name: str, values: Real) -> bool:
-    """Whether values are whole numbers that do not count and do not tell the time."""
-    known = values[np.isfinite(values)]
-    is_varied = known.size > 2 and bool(np.ptp(known) > 2) and not np.all(np.diff(known) > 0)
-    return is_varied and bool(np.all(known == np.rint(known))) and not is_counter_name(name)
 
 
 def _group_of(groups: dict[str, Table], clock: str | None) -> str | None:

@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rtloop.foundation.arrays import Real
-from rtloop.interchange.formats.stated import parameters, stated_rates, stated_ticks
+from rtloop.interchange.formats.stated import parameters, scale_statements, stated_rates, stated_ticks
 from rtloop.interchange.formats.table import MAX_ROWS, Table, UnreadableData
 from rtloop.interchange.names import TIME_NAMES, bare_name, is_time_name
 from rtloop.values import count_text
@@ -31,7 +31,8 @@ class FileColumns:
 
     `left_out` and `in_other_files` name columns that are not read; the latter because the file only points to them.
     `bytes` is the memory that `require_room` has counted. `single` are single numbers by path, which may state a sample
-    rate. `origins`, `made_up` (columns of matrices) and `notes` go into the tables: see Table.
+    rate. `origins`, `made_up` (columns of matrices; `row_wise` those that were first rows) and `notes` go into the
+    tables: see Table.
     """
 
     path: Path
@@ -43,6 +44,7 @@ class FileColumns:
     single: dict[str, object] = field(default_factory=dict)
     origins: dict[str, int] = field(default_factory=dict)
     made_up: set[str] = field(default_factory=set)
+    row_wise: set[str] = field(default_factory=set)
     notes: list[str] = field(default_factory=list)
 
     def require_room(self, name: str, shape: tuple[int, ...]) -> None:
@@ -66,6 +68,9 @@ class FileColumns:
         if the file has more than MAX_COLUMNS columns.
         """
         array = np.asarray(values)
+        if array.dtype.kind == "M" and array.ndim == 1 and array.size > 1:
+            ns = array.astype("datetime64[ns]").astype(np.int64)
+            array, unit = (ns - ns[0]) * 1e-9, "s"
         if array.dtype.kind not in "fiub":
             if array.size > 1 or array.dtype.kind != "U":
                 self.left_out.append(f"{name} ({_kind_description(array)})")
@@ -73,6 +78,8 @@ class FileColumns:
         array = np.squeeze(array) if array.ndim > 1 else array
         if array.ndim == 2 and min(array.shape) <= MATRIX_COLUMNS:
             is_row_wise = array.shape[0] < array.shape[1]
+            if is_row_wise:
+                self.row_wise.add(f"{name}_1")
             for number, column in enumerate(array if is_row_wise else array.T, start=1):
                 self.add_column(f"{name}_{number}", column, unit)
                 self.made_up.add(f"{name}_{number}")
@@ -90,6 +97,11 @@ class FileColumns:
                 self.origins[name] = origin
             if unit:
                 self.units[name] = unit
+
+    def _is_note_of(self, note: str, names: Sequence[str]) -> bool:
+        """Whether a note, which may begin with a column's name, concerns one of the names, or all columns."""
+        owner = note.partition(": ")[0]
+        return owner in names or owner not in self.columns
 
     def grouped_tables(self) -> dict[str, Table]:
         """Return tables by group name: each has the columns of one length with the same nearest column of times.
@@ -114,6 +126,9 @@ class FileColumns:
             short_names = {name: name[begin:] for name in names}
             statements = parameters({key: value for key, value in self.single.items() if _concerns(key, names)})
             group = _shared_folder(names).strip("/") or (time or "").rpartition("/")[0] or count_text(rows, "row")
+            codes = [name for name in names if name != time and are_codes(self.columns[name])]
+            scales = [entry.text for entry in scale_statements(statements)] if codes else []
+            unscaled = [f"{codes[0]} holds whole numbers; {', '.join(scales)} is not applied"] if scales else []
             tables[unique_name(group, tables)] = Table(
                 {short_names[name]: self.columns[name] for name in names},
                 {short_names[name]: self.units[name] for name in names if name in self.units},
@@ -123,11 +138,7 @@ class FileColumns:
                 tick_hz=stated_ticks(statements),
                 unnamed=tuple(short_names[name] for name in names if name in self.made_up),
                 origins={short_names[name]: self.origins[name] for name in names if name in self.origins},
-                notes=tuple(
-                    note
-                    for note in self.notes
-                    if (owner := note.partition(": ")[0]) in names or owner not in self.columns
-                ),
+                notes=(*unscaled, *(note for note in self.notes if self._is_note_of(note, names))),
             )
         return tables
 
@@ -167,6 +178,13 @@ def select_table(
         "other groups": ", ".join(other_groups[:MAX_SHOWN_NAMES]) + ", …" * (len(other_groups) > MAX_SHOWN_NAMES),
     }
     return replace(table, about={**table.about, **group_notes})
+
+
+def are_codes(values: Real) -> bool:
+    """Whether values are whole numbers that vary and do not count, as a converter's codes."""
+    known = values[np.isfinite(values)]
+    is_varied = known.size > 2 and bool(np.ptp(known) > 2) and not np.all(np.diff(known) > 0)
+    return is_varied and bool(np.all(known == np.rint(known)))
 
 
 def with_left_out(table: Table, left_out: Sequence[str]) -> Table:
