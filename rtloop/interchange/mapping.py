@@ -68,7 +68,7 @@ def map_column(table: Table, path: Path, signal: str, source: str) -> MappedColu
     converted to the signal's, or the factor is too large or too small.
     """
     match = None if source in table.columns else _SOURCE.fullmatch(source)
-    parts = match.groupdict() if match else {}
+    parts = match.groupdict() if match else {"unit": split_unit(source)[1]}
     name = find_column(table, path, parts.get("column") or source)
     sensitivity_unit, target = parts.get("by") or "", signal_unit(signal)
     in_file = column_unit(table, name)

@@ -162,6 +162,8 @@ def clock_column(table: Table, path: Path, selection: ColumnSelection, units: Ma
     if is_from_recording(table):
         return RECORDING_TIME_COLUMNS[1]
     if selection.clock not in (None, STATED):
+        if table.time is not None and selection.clock == table.about.get("group"):
+            return table.time
         return find_column(table, path, selection.clock)
     clocks = _clocks(table, units)
     growing = [name for name in clocks if _grows(table.columns[name])]
@@ -267,9 +269,8 @@ def find_time_unit(
     if len(stated) == 1:
         notes.append(f"the time {name!r} has no unit; {stated[0]} agrees with {table.rates[0][1]!r}")
         return stated[0]
-    is_whole = bool(np.all(known == np.rint(known)))
     is_day = "d" in rates and any(low <= begin <= high for low, high in DAY_NUMBERS)
-    if "s" in rates and not is_whole and rates["s"] >= USUAL_RATE_HZ and not is_day:
+    if "s" in rates and rates["s"] >= USUAL_RATE_HZ and not is_day:
         notes.append(f"the time {name!r} has no known unit; s is assumed")
         return "s"
     readings = [

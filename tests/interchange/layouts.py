@@ -298,8 +298,7 @@ LAYOUTS: list[Layout] = [
         "SCPI instrument",
         "9.91E37 and 9.9E37",
         "SCPI 1999, volume 1, 7.2.1.4",
-        HEAD
-        + rows(T, U, [("9.91E37", "9.9E37", "-9.9E+37")[k % 3] if k in OVER else f"{x:.4f}" for k, x in enumerate(X)]),
+        HEAD + rows(T, U, [{7: "9.91E37", 8: "9.9E37", 40: "-9.9E+37"}.get(k, f"{x:.4f}") for k, x in enumerate(X)]),
         {"u [V]": ("V", U), "x [um]": ("um", X_OVER)},
     ),
     text(

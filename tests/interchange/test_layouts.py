@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from pathlib import Path
 from typing import Any
 
@@ -11,9 +12,10 @@ from numpy.testing import assert_allclose
 
 from rtloop.interchange.binding import Binding, bind
 from rtloop.interchange.columns import ColumnSelection
-from rtloop.interchange.formats.table import AmbiguousData
+from rtloop.interchange.formats.table import AmbiguousData, UnreadableData
 from rtloop.interchange.reading import read_in_process
-from tests.interchange.layouts import LAYOUTS, QUESTIONS, Layout, Question, T
+from tests.command_line import run
+from tests.interchange.layouts import LAYOUTS, QUESTIONS, Layout, Question, T, U, X, rows
 
 
 def read(path: Path, **answers: Any) -> Binding:
@@ -54,3 +56,47 @@ def test_a_file_with_two_readings_asks_for_the_option_that_decides(question: Que
     lines = [line.strip() for line in str(caught.value).splitlines()[1:]]
     for option in question.options:
         assert any(line.partition("  ")[0].endswith(option) for line in lines), str(caught.value)
+
+
+@pytest.mark.parametrize("question", QUESTIONS, ids=lambda question: question.ambiguity)
+def test_each_answer_settles_its_question(question: Question, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """An answer gives a recording, or one other fault; the first answer that lists columns leads to a recording."""
+    monkeypatch.setattr("rtloop.interchange.isolated_reader.read_table", read_in_process)
+    path = write(tmp_path, question)
+    asked = run("import", path, "--all").stderr
+    options = [line.strip().partition("   ")[0].partition("  ")[0] for line in asked.splitlines()[1:]]
+    assert len(options) >= 2, asked
+    for number, option in enumerate(options):
+        arguments = shlex.split(option.replace("SIGNAL", "signal").replace("HZ", "1000").replace("COLUMN", "u"))
+        result = run("import", path, *arguments, "--all", "--out", tmp_path / f"{number}.mcap")
+        assert result.exit_code in (0, 1, 65), result.output
+        assert result.stderr.splitlines()[:1] != asked.splitlines()[:1], option
+
+
+def test_two_clocks_are_two_groups_of_their_own_length(tmp_path: Path):
+    slow = 0.002 + 4 * T[:20]
+    cells = [f"{t:.4f},{x:.4f}" for t, x in zip(slow, X, strict=False)] + [","] * (len(T) - 20)
+    path = tmp_path / "scan.csv"
+    path.write_text("Time [s],u [V],Time [s],x [um]\n" + rows(T, U, cells))
+    fast = read(path)
+    assert_allclose(fast.table.columns["u [V]"], U)
+    assert fast.table.about["other groups"] == "'Time [s] (2)' (20 rows, 2 columns)"
+    for answer in ("group", "clock"):
+        other = read(path, **{answer: "Time [s] (2)"})
+        assert_allclose(other.table.columns["x [um]"], X[:20])
+        assert other.require_time().rate_hz == 2500.0
+
+
+def test_a_table_with_cells_of_several_lines_loses_no_row(tmp_path: Path):
+    path = tmp_path / "scan.csv"
+    path.write_text("Time [s],note,u [V]\n" + rows(T, ['"first\nsecond"'] * len(T), U))
+    binding = read(path)
+    assert_allclose(binding.table.columns["u [V]"], U)
+    assert binding.require_time().rate_hz == 10_000.0
+
+
+def test_a_unit_behind_some_values_alone_is_refused(tmp_path: Path):
+    path = tmp_path / "scan.csv"
+    path.write_text("Time [s],u\n" + rows(T, [f"{u:.4f} V" if k > 30 else f"{u:.4f}" for k, u in enumerate(U)]))
+    with pytest.raises(UnreadableData, match="some values have a unit behind them, others have none"):
+        read(path)
