@@ -81,7 +81,7 @@ def bind(table: Table, path: Path, selection: ColumnSelection) -> Binding:
         table = _without_empty_rows(table, clock, notes)
     time_base, fault = None, None
     try:
-        time_base = find_time_base(table, path, selection, units)
+        time_base = find_time_base(table, path, selection, units, clock)
     except AmbiguousData:
         raise
     except UnreadableData as error:

@@ -66,11 +66,13 @@ class TimeBase(NamedTuple):
     column: str | None
 
 
-def find_time_base(table: Table, path: Path, selection: ColumnSelection, units: Mapping[str, str | None]) -> TimeBase:
+def find_time_base(
+    table: Table, path: Path, selection: ColumnSelection, units: Mapping[str, str | None], clock: str | None
+) -> TimeBase:
     """Return the times by the rate or the column of `selection`, or else by the evidence of the file.
 
-    The evidence: a column that is declared, named or measured in a unit as times, and rates that the file states.
-    `units` are the units of all columns. Raises AmbiguousData where two readings remain; UnreadableData without a
+    The evidence: the column `clock`, as `clock_column` finds it, and rates that the file states. `units` are the units
+    of all columns. Raises AmbiguousData where two readings remain; UnreadableData without a
     column of times, for fewer than two samples, for a time that does not grow, is not finite, spans too long or has an
     unknown unit, and for times that give a rate outside LOWEST_RATE_HZ to HIGHEST_RATE_HZ.
     """
@@ -85,7 +87,7 @@ def find_time_base(table: Table, path: Path, selection: ColumnSelection, units: 
         return _from_column(table, path, column, unit or "s", notes)
     if selection.clock == STATED:
         return _by_stated_rate(table, path)
-    name, notes = clock_column(table, path, selection, units), []
+    name, notes = clock, []
     if name is None:
         if table.rates:
             return _by_stated_rate(table, path)

@@ -530,6 +530,15 @@ LAYOUTS: list[Layout] = [
         "dt;0.1 ms\nTime;u;x\n" + rows(1e3 * T, U, X, sep=";"),
         BARE,
     ),
+    text("a logger", "a rate with thousands", SEEN, "Sampling Rate: 10,000 Hz\n" + "u [V],x [um]\n" + rows(U, X)),
+    text("a logger", "the unit of a rate in the next cell", SEEN, "Sample Rate,10.0,kHz\nu [V],x [um]\n" + rows(U, X)),
+    text(
+        "a logger",
+        "units behind values below another unit",
+        SEEN,
+        "Time [s],u [V]\n" + rows(T, [f"{1e3 * u:.1f} mV" for u in U]),
+        {"u [V]": ("V", U)},
+    ),
     text("a logger", "the same times twice", SEEN, "Time [s],u [V],Time [s],x [um]\n" + rows(T, U, T, X)),
 ]
 

@@ -24,7 +24,7 @@ from rtloop.interchange.formats.header import Header, HeaderReader, ask_for_scal
 from rtloop.interchange.formats.stated import scale_statements, stated_rates, stated_ticks
 from rtloop.interchange.formats.table import MAX_ROWS, NO_HINTS, Hints, Reading, Table, UnreadableData, ask
 from rtloop.interchange.formats.text_source import LineStream, TextSource
-from rtloop.interchange.names import is_counter_name
+from rtloop.interchange.names import is_counter_name, split_unit
 from rtloop.interchange.units import UnknownUnit, factor_between
 from rtloop.values import count_text
 
@@ -209,7 +209,7 @@ class _Reader:
             self.long.pop(values.name)
         if values.dtype.kind in "iufb":
             self.plain.add(values.name)
-            if values.name in self.units and not self.header.units[values.name]:
+            if self._lacks_unit(values.name):
                 raise self._unit_for_some(values.name, int(values.index[0]))
             return values.to_numpy() if values.dtype.kind in "iu" else values.to_numpy(np.float64)
         text = values.astype(str).str.strip()
@@ -225,7 +225,7 @@ class _Reader:
     def _odd_cells(self, values: Any, text: Any, numbers: Real, odd: npt.NDArray[np.bool_]) -> None:
         """Read the cells `odd`, which are no plain numbers, into `numbers`."""
         column = values.name
-        target = self.units.get(column) or self.header.units[column]
+        target = self.units.get(column) or self.header.units[column] or split_unit(self.header.names[column])[1] or ""
         counts = self.markers.setdefault(column, Counter())
         has_units = False
         for row in np.flatnonzero(odd):
@@ -243,9 +243,14 @@ class _Reader:
         if has_units:
             self.units[column] = target
         is_plain = ~odd & np.isfinite(numbers)
-        if column in self.units and not self.header.units[column] and (is_plain.any() or column in self.plain):
+        if self._lacks_unit(column) and (is_plain.any() or column in self.plain):
             row = int(values.index[int(np.argmax(is_plain if is_plain.any() else odd))])
             raise self._unit_for_some(column, row)
+
+    def _lacks_unit(self, column: int) -> bool:
+        """Whether a column with units behind its numbers has none in its header."""
+        stated = self.header.units[column] or split_unit(self.header.names[column])[1]
+        return column in self.units and not stated
 
     def _unit_for_some(self, column: int, row: int) -> UnreadableData:
         return UnreadableData(

@@ -12,8 +12,9 @@ from rtloop.interchange.units import UnknownUnit, factor_between
 
 _INTERVAL = re.compile(
     r"x?[ _]?inc(rement)?|x[ _]?increment|delta[ _]?(x|t|time)|dt|(wf|t)[ _]?inc(rement)?|wf_increment|d[ _]?time|Δt|"
-    r"(time[ _]?)?(sample|sampling|scan|time|sample_time)[ _.]?(interval|period|time|step|increment|resolution)|"
-    r"interval|horizontal[ _]?(resolution|interval)|h[ _]?resolution|abtast(intervall|zeit|periode)|timestep|tsample"
+    r"(time[ _]?)?(sample|sampling|scan|time)[ _.]?(interval|period|time|step|increment|resolution)|"
+    r"interval|horizontal[ _]?(resolution|interval)|h[ _]?resolution|abtast(intervall|zeit|periode)|"
+    r"timestep|tsample|ts|t_s"
 )
 _RATE = re.compile(
     r"fs|f_s|f[ _]?sample|f[ _]?samp|sfreq|sps|srate|rate|(sample|sampling|scan|acquisition|acq|data|daq|logging)[ _.]?"
@@ -32,7 +33,7 @@ NAME_KEYS = frozenset(
 )
 UNIT_KEYS = frozenset(["unit", "units", "vunit", "y_unit_label", "yunit", "yunits", "vertical units", "y units"])
 _NUMBERED_NAME = re.compile(r"name[ _]?(\d+)")
-_PAIR = re.compile(r"(?P<key>[^=:;\t,\"]{1,60}?)\s*(?:=|:|\t|;|,)\s*(?P<values>.*\S)")
+_PAIR = re.compile(r"(?P<key>[^=:;\t,\"]{1,60}?)\s*(?P<sign>=|:|\t|;|,)\s*(?P<values>.*\S)")
 _RATE_UNIT = re.compile(r"([kMG]?)(?:Hz|S/s|Sa/s|sps|samples?/s(?:ec)?|1/s|SPS)", re.IGNORECASE)
 _PREFIX = {"": 1.0, "k": 1e3, "m": 1e6, "g": 1e9}
 
@@ -51,8 +52,7 @@ class Statement(NamedTuple):
         found = []
         for value in self.values:
             text = re.sub(r"^[A-Za-z]\w*\s*:\s*", "", value)
-            match = _with_rate_unit(text, decimal) or parse_cell(text, decimal) or parse_cell(text, ".")
-            if match is not None:
+            if match := parse_value(text, decimal):
                 found.append((match[0], match[1] or self.unit))
         return found
 
@@ -67,7 +67,12 @@ class Rate(NamedTuple):
 def read_statement(line: int, text: str) -> Statement | None:
     """Return what a line such as "Sample Interval,1e-4", "# dt = 0.1 ms" or "Fs: 10 kHz" states; None for others."""
     match = _PAIR.fullmatch(text.strip())
-    return statement(line, match["key"], re.split(r"\s*[;\t,]\s*", match["values"])) if match else None
+    if match is None:
+        return None
+    # Behind a colon or an equals sign, a comma may stand in a number: Rate: 10,000 Hz.
+    is_number = match["sign"] in ":=" and parse_value(match["values"], ".") is not None
+    values = [match["values"]] if is_number else re.split(r"\s*[;\t,]\s*", match["values"])
+    return statement(line, match["key"], values)
 
 
 def statement(line: int, key: str, values: Iterable[str]) -> Statement:
@@ -89,12 +94,13 @@ def stated_rates(statements: Iterable[Statement], decimal: str = ".") -> list[Ra
             numbers = numbers[:1]
         found: list[float] = []
         if _RATE.fullmatch(entry.key):
-            found = [value * _rate_factor(unit) for value, unit in numbers]
+            unit_cell = next((value for value in entry.values if _RATE_UNIT.fullmatch(value)), "")
+            found = [value * _rate_factor(unit or unit_cell) for value, unit in numbers]
         elif _INTERVAL.fullmatch(entry.key):
             unit_cell = next((value for value in entry.values if is_time_unit(value)), "s")
             factors = [_interval_factor(unit or unit_cell) for _, unit in numbers]
             found = [1 / (value * f) if value * f > 0 else 0.0 for (value, _), f in zip(numbers, factors, strict=True)]
-        rates += [Rate(float(f"{hz:.12g}"), entry.text) for hz in found if 0 < hz < 1e12]
+        rates += [Rate(float(f"{hz:.12g}"), entry.text) for hz in found if 1e-3 <= hz < 1e12]
     unique: list[Rate] = []
     for rate in rates:
         if not any(abs(rate.hz - other.hz) <= 1e-4 * other.hz for other in unique):
@@ -138,6 +144,14 @@ def keyed_row(statements: Iterable[Statement], keys: frozenset[str], columns: in
 def parameters(values: Mapping[str, object]) -> list[Statement]:
     """Return the single numbers of a file by name, such as a variable `Fs` of a MAT file, as statements."""
     return [statement(0, name.rpartition("/")[2], [str(value)]) for name, value in values.items()]
+
+
+def parse_value(text: str, decimal: str) -> tuple[float, str] | None:
+    """Return a number and the unit behind it, also a unit of rates; the other decimal sign is tried last."""
+    for sign in (decimal, *{".", ","} - {decimal}):
+        if match := _with_rate_unit(text, sign) or parse_cell(text, sign):
+            return match[0], match[1]
+    return None
 
 
 def _with_rate_unit(text: str, decimal: str) -> tuple[float, str] | None:
