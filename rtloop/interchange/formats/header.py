@@ -29,7 +29,9 @@ from rtloop.interchange.formats.text_source import Record
 from rtloop.interchange.names import is_counter_name, is_time_name, split_unit, unit_in_name
 from rtloop.interchange.units import is_unit
 
-_COMMENT = re.compile(r"\s*(#|%|//|;|')+\s*")
+_COMMENT = re.compile(r"\s*(#|%|//|;)+\s*")
+_INVISIBLE = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u200b\ufeff]")
+"""Characters that a terminal obeys, or shows as nothing."""
 _FOLDED_BLANKS = (r"\s{2,}|\t", r"\s+(?![\[(<])", r"\s*[,;]\s*")
 """Separators of names that themselves have blanks, in a table of blanks."""
 _QUANTITY = re.compile(r"(\w[\w .]*)\s*/\s*(\S+)")
@@ -266,11 +268,13 @@ class HeaderReader:
 
     def _clean(self, record: Record) -> Record:
         """Return a record without its comment sign and the empty fields at its end; blanks in names hold together."""
-        text = _COMMENT.sub("", record.text, count=1) if _COMMENT.match(record.text) else record.text
+        visible = _INVISIBLE.sub(" ", record.text)
+        text = visible[match.end() :] if (match := _COMMENT.match(visible)) else visible
         fields = self._grid.split(text)
         if self._grid.delimiter is None and len(fields) != self._used:
             parts = [[part for part in re.split(pattern, text.strip()) if part] for pattern in _FOLDED_BLANKS]
             fields = next((part for part in parts if len(part) == self._used), fields)
+        fields = [field[1:-1] if field[:1] == field[-1:] == "'" else field for field in fields]
         while fields and not fields[-1]:
             fields = fields[:-1]
         return record._replace(fields=fields, text=text)
