@@ -41,8 +41,10 @@ CLOCK_TOLERANCE = 1e-3
 USUAL_RATE_HZ = 20.0
 """From this rate on, times with fractions and without a unit count as s: in ms the rate were above 20 kHz."""
 EPOCH_UNITS = {"s": 1.0, "ms": 1e-3, "µs": 1e-6, "ns": 1e-9}
-EPOCH_S = (6e8, 4.2e9)
-"""Times since 1970 of the years 1989 to 2103; LabVIEW counts from 1904."""
+EPOCH_S = (1e9, 4.2e9)
+"""Times since 1970 of the years 2001 to 2103; LabVIEW counts from 1904."""
+LEAST_EPOCH_RATE_HZ = 0.1
+"""Slower stamps since 1970 are rather the ticks of a device that has run for long."""
 BISECTIONS = 60
 DAY_NUMBERS = ((2e4, 8e4), (6e5, 8e5))
 """Days that spreadsheets count from 1900, and MATLAB from the year 0, of our time."""
@@ -260,11 +262,11 @@ def find_time_unit(
     if known.size < 2:
         return "s"
     begin = table.origins.get(name, 0) + known[0]
+    step = float(np.ptp(known)) / (known.size - 1)
     sizes = [unit for unit, factor in EPOCH_UNITS.items() if EPOCH_S[0] <= begin * factor <= EPOCH_S[1]]
-    if sizes:
+    if sizes and step * _seconds(sizes[0]) * LEAST_EPOCH_RATE_HZ <= 1:
         notes.append(f"the time {name!r} has no unit; by their size, the values count {sizes[0]} since 1970")
         return sizes[0]
-    step = float(np.ptp(known)) / (known.size - 1)
     rates = {unit: 1 / (step * _seconds(unit)) for unit in ("s", "ms", "µs", "ns", "d") if step > 0}
     rates = {unit: hz for unit, hz in rates.items() if LOWEST_RATE_HZ <= hz <= HIGHEST_RATE_HZ * 1.001}
     stated = [unit for unit, hz in rates.items() if any(abs(hz - rate) <= 0.01 * rate for rate, _ in table.rates)]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import sys
 from pathlib import Path
 from typing import Any
@@ -10,6 +11,7 @@ import h5py
 import numpy as np
 import pytest
 from asammdf import MDF, Signal
+from mcap.writer import Writer
 from nptdms import ChannelObject, GroupObject, RootObject, TdmsWriter
 from scipy.io import netcdf_file, savemat
 
@@ -219,6 +221,35 @@ def test_a_rate_stated_beside_the_data_is_the_clock(tmp_path: Path):
     assert "Fs 10000.0" in binding.require_time().description
     np.savez(tmp_path / "a.npz", u=U, dt=1e-3)
     assert read(tmp_path / "a.npz").require_time().rate_hz == 1000.0
+
+
+def test_labone_counts_ticks_of_its_clock(tmp_path: Path):
+    with h5py.File(tmp_path / "scan.h5", "w") as file:
+        device = file.create_group("000/dev1234")
+        device["clockbase/value"] = np.array([60_000_000.0])
+        device["demods/0/sample/timestamp"] = (1 << 60) + 6000 * np.arange(ROWS, dtype="u8")
+        device["demods/0/sample/x"] = U
+    binding = read(tmp_path / "scan.h5")
+    assert has(binding, "x", None, U)
+    assert binding.require_time().rate_hz == RATE
+    assert "counts ticks of 60000000 Hz" in binding.require_time().notes[0]
+
+
+def test_a_stamp_of_ros_is_the_time_and_the_log_is_named(tmp_path: Path):
+    stamps = 1_700_000_000_000_000_000 + 100_000 * np.arange(ROWS)
+    late = np.random.default_rng(1).integers(0, 60_000, ROWS)
+    with (tmp_path / "scan.mcap").open("wb") as stream:
+        writer = Writer(stream)
+        writer.start()
+        channel = writer.register_channel("x", "json", 0)
+        for stamp, delay, u in zip(stamps.tolist(), late.tolist(), U.tolist(), strict=True):
+            header = {"stamp": {"sec": stamp // 10**9, "nanosec": stamp % 10**9}}
+            writer.add_message(channel, stamp + delay, json.dumps({"header": header, "u": u}).encode(), stamp)
+        writer.finish()
+    binding = read(tmp_path / "scan.mcap")
+    assert binding.require_time().rate_hz == RATE
+    assert "the times are header.stamp, of the measurement; --clock log_time_s for those of the log" in binding.notes
+    assert "jitter" in " ".join(read(tmp_path / "scan.mcap", clock="log_time_s").require_time().notes)
 
 
 def ask_matrix(path: Path) -> None:

@@ -87,7 +87,7 @@ class FileColumns:
             if array.size > 1:
                 self.left_out.append(f"{name} ({'×'.join(map(str, array.shape))})")
             elif array.size == 1:
-                self.single[name] = array.item()
+                self.single[name.removesuffix("/value")] = array.item()  # LabOne keeps a setting's value so
         elif len(self.columns) == MAX_COLUMNS:
             raise UnreadableData(f"{self.path}: too many columns; allowed: up to {MAX_COLUMNS}")
         else:
