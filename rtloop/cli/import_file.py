@@ -31,7 +31,7 @@ LISTING_EXIT_CODE = 2
 SENSITIVITY = "FACTOR"
 MAX_COLUMNS = 60
 """Columns of a file that are listed."""
-MAX_SKIPPED = 100_000
+MAX_SKIPPED = 10_000
 SHOWN_COLUMNS = 12
 """Columns whose first and last rows are printed."""
 EXAMPLE_SIGNALS = (("x_drive_v", "V"), ("x_position_um", "µm"))

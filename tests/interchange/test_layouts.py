@@ -15,7 +15,7 @@ from rtloop.interchange.columns import ColumnSelection
 from rtloop.interchange.formats.table import AmbiguousData, UnreadableData
 from rtloop.interchange.reading import read_in_process
 from tests.command_line import run
-from tests.interchange.layouts import LAYOUTS, QUESTIONS, Layout, Question, T, U, X, rows
+from tests.interchange.layouts import BODY, HEAD, LAYOUTS, QUESTIONS, Layout, N, Question, T, U, X, rows
 
 
 def read(path: Path, **answers: Any) -> Binding:
@@ -100,3 +100,27 @@ def test_a_unit_behind_some_values_alone_is_refused(tmp_path: Path):
     path.write_text("Time [s],u\n" + rows(T, [f"{u:.4f} V" if k > 30 else f"{u:.4f}" for k, u in enumerate(U)]))
     with pytest.raises(UnreadableData, match="some values have a unit behind them, others have none"):
         read(path)
+
+
+@pytest.mark.parametrize(
+    ("content", "note"),
+    [
+        (HEAD + "scale,1,1\n" + BODY, "left out between names and numbers: line 2, 'scale,1,1'"),
+        (
+            HEAD + "offset,0\ngain,1\n" + BODY,
+            "left out between names and numbers: line 2, 'offset,0'; line 3, 'gain,1'",
+        ),
+        (HEAD + BODY + "the end\n", "1 line below the numbers left out: 'the end'"),
+        (HEAD + BODY + ",,\n,,\n", "2 rows without a value at the end left out"),
+        (HEAD + BODY.replace("0.0030,", ",,\n0.0030,"), "1 row without any value left out"),
+        (HEAD + rows(T, U, ["OVER" if k < 2 else "1.5" for k in range(N)]), "x [um]: 2 values missing: 2 × 'OVER'"),
+        ("t,u\n" + rows(T, U), "the time 't' has no known unit; s is assumed"),
+        ("timestamp,u\n" + rows([str(1_700_000_000_000 + k) for k in range(N)], U), "the values count ms since 1970"),
+    ],
+)
+def test_each_loss_and_each_assumption_is_named(content: str, note: str, tmp_path: Path):
+    (tmp_path / "scan.csv").write_text(content)
+    binding = read(tmp_path / "scan.csv")
+    notes = [*binding.notes, *binding.require_time().notes]
+    assert any(note in text for text in notes), notes
+    assert len(binding.require_time().deadline_ns) == N

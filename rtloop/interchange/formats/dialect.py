@@ -28,7 +28,6 @@ FOOTER_LINES = 20
 DELIMITERS = {"tab": "\t", "\\t": "\t", "blank": None, "blanks": None, "space": None, " ": None, "comma": ",",
               "semicolon": ";", "pipe": "|"}  # fmt: skip
 DECIMALS = {"point": ".", "comma": ",", ".": ".", ",": ","}
-DELIMITER_NAMES = {None: "blank", "\t": "tab"}
 Notation = tuple[str | None, str]
 _NOTATIONS: tuple[Notation, ...] = (
     (";", "."), ("\t", "."), (",", "."), ("|", "."), (";", ","), ("\t", ","), ("|", ","), (None, "."), (None, ","),

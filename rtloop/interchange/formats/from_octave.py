@@ -13,7 +13,6 @@ from rtloop.interchange.formats.table import Table, UnreadableData
 from rtloop.interchange.formats.text_source import TextSource
 
 _HEAD = re.compile(rb"#\s*Created by Octave|#\s*name:\s*\S+\r?\n#\s*type:")
-_NUMBERS = {"matrix": "rows", "range": "base", "scalar": "", "int matrix": "rows"}
 
 
 def is_octave(head: bytes) -> bool:
