@@ -270,9 +270,15 @@ def _suggest_mapping(columns: Sequence[Column], time: str | None) -> list[tuple[
     `ColumnListing`.
     """
     from rtloop.interchange.names import is_counter_name, name_without_unit
+    from rtloop.interchange.units import is_unit
 
     candidates = [
-        c for c in columns if c["name"] != time and not _is_clock(c) and not is_counter_name(c["unit"] or c["name"])
+        column
+        for column in columns
+        if column["name"] != time
+        and not _is_clock(column)
+        and not is_counter_name(column["unit"] or column["name"])
+        and (not column["unit"] or is_unit(column["unit"]))
     ]
     suggestions: dict[str, str] = {}
     for is_fitting in (

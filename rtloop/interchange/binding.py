@@ -34,7 +34,7 @@ _FRACTION = re.compile(
     rf"(.*?)[._/ ]?(nsecs?|nanosecs?|nanoseconds?|nanos|tv_nsec|{'|'.join(_MICROSECONDS)})", re.IGNORECASE
 )
 _MARKER = re.compile(
-    r"9{3,}\.?9*|99\.9+|32767|32768|65535|2147483647|2147483648|1e\+?\d\d\d?|3\.40282\d*e\+38|1\.79769\d*e\+308"
+    r"10{6,}|9{3,}\.?9*|99\.9+|32767|32768|65535|2147483647|2147483648|1e\+?\d\d\d?|3\.40282\d*e\+38|1\.79769\d*e\+308"
 )
 MARKER_RATIO = 5.0
 """A value beyond all others by this factor is suspected to mark missing ones, if it looks like a marker."""

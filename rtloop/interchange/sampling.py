@@ -46,6 +46,8 @@ EPOCH_S = (1e9, 4.2e9)
 LEAST_EPOCH_RATE_HZ = 0.1
 """Slower stamps since 1970 are rather the ticks of a device that has run for long."""
 BISECTIONS = 60
+MOST_DIGITS = 7
+"""Digits of times that a program has rounded, such as six by %g."""
 DAY_NUMBERS = ((2e4, 8e4), (6e5, 8e5))
 """Days that spreadsheets count from 1900, and MATLAB from the year 0, of our time."""
 FEWEST_ROUNDED = 8
@@ -352,53 +354,68 @@ class EvenTimes(NamedTuple):
 def even_times(times: Real, stated_periods: Sequence[float] = ()) -> EvenTimes | None:
     """Return even times that differ from `times` by no more than their rounding; None where none do.
 
-    Of all periods that fit, it is a stated one, or the one whose rate or itself has the fewest digits.
+    The times are rounded to a decimal, or to a number of digits. Of all periods that fit, it is a stated one, or the
+    one whose rate or itself has the fewest digits.
     """
-    resolution = _resolution(times)
-    if resolution is None or times.size < FEWEST_ROUNDED:
-        return None
     steps = np.diff(times)
     median = float(np.median(steps))
-    if median <= 0:
+    if median <= 0 or times.size < FEWEST_ROUNDED:
         return None
     mean = float(np.mean(steps[steps < GAP_PERIODS * median]))
     counts = np.append(0.0, np.cumsum(np.maximum(np.rint(steps / mean), 1)))
-    least, largest = _fitting_periods(times, counts, resolution)
-    if largest < least:
-        return None
-    rounded = [(_roundest(1 / largest, 1 / least), 0), (_roundest(least, largest), 1)]
-    (_, value), is_period = min(rounded, key=lambda entry: (entry[0][0], entry[1]))
-    stated = [period for period in stated_periods if least <= period <= largest]
-    period = stated[0] if stated else value if is_period else 1 / value
-    rest = times - counts * period
-    begin = min(max(float(times[0]), float(rest.max()) - resolution / 2), float(rest.min()) + resolution / 2)
-    return EvenTimes(counts * period + begin, period, resolution, (largest - least) / 2 / period)
+    resolution = _resolution(times)
+    for widths in (None if resolution is None else np.full(times.size, resolution), _digit_widths(times)):
+        if widths is None:
+            continue
+        half = widths / 2
+        least, largest = _fitting_periods(times, counts, half)
+        if largest < least:
+            continue
+        rounded = [(_roundest(1 / largest, 1 / least), 0), (_roundest(least, largest), 1)]
+        (_, value), is_period = min(rounded, key=lambda entry: (entry[0][0], entry[1]))
+        stated = [period for period in stated_periods if least <= period <= largest]
+        period = stated[0] if stated else value if is_period else 1 / value
+        rest = times - counts * period
+        begin = min(max(float(times[0]), float((rest - half).max())), float((rest + half).min()))
+        return EvenTimes(counts * period + begin, period, float(widths.max()), (largest - least) / 2 / period)
+    return None
 
 
-def _fitting_periods(times: Real, counts: Real, resolution: float) -> tuple[float, float]:
-    """Return the least and the largest period with which even times round to `times`; (1, 0) without one."""
+def _fitting_periods(times: Real, counts: Real, half: Real) -> tuple[float, float]:
+    """Return the least and the largest period of even times within `half` of `times`; (1, 0) without one."""
 
-    def spread(period: float) -> float:
-        return float(np.ptp(times - counts * period))
+    def excess(period: float) -> float:
+        rest = times - counts * period
+        return float((rest - half).max() - (rest + half).min())
 
     middle = float(times[-1] - times[0]) / float(counts[-1])
-    reach = 2 * resolution / float(counts[-1])
+    reach = 4 * float(half.max()) / float(counts[-1])
     low, high = middle - reach, middle + reach
-    for _ in range(BISECTIONS):  # the spread is convex in the period
+    for _ in range(BISECTIONS):  # the excess is convex in the period
         third = (high - low) / 3
-        low, high = (low, high - third) if spread(low + third) < spread(high - third) else (low + third, high)
-    best = (low + high) / 2
-    limit = resolution * (1 + 1e-6)
-    if spread(best) > limit:
+        low, high = (low, high - third) if excess(low + third) < excess(high - third) else (low + third, high)
+    best, limit = (low + high) / 2, 2e-6 * float(half.max())
+    if excess(best) > limit:
         return 1.0, 0.0
     bounds = []
     for outer in (middle - 2 * reach, middle + 2 * reach):
         inner = best
         for _ in range(BISECTIONS):
             trial = (inner + outer) / 2
-            inner, outer = (trial, outer) if spread(trial) <= limit else (inner, trial)
+            inner, outer = (trial, outer) if excess(trial) <= limit else (inner, trial)
         bounds.append(inner)
     return bounds[0], bounds[1]
+
+
+def _digit_widths(times: Real) -> Real | None:
+    """Return the unit of the last digit of each time, if all have no more than MOST_DIGITS digits; else None."""
+    size = np.abs(times)
+    exponents = np.floor(np.log10(np.where(size > 0, size, size[size > 0].min(initial=1.0))))
+    for digits in range(3, MOST_DIGITS + 1):
+        units = 10.0 ** (exponents - digits + 1)
+        if np.all(np.abs(times / units - np.rint(times / units)) <= 1e-4):
+            return units
+    return None
 
 
 def _roundest(low: float, high: float) -> tuple[int, float]:
@@ -480,8 +497,8 @@ def _deadlines_ns(path: Path, name: str, times: Real, unit: str) -> tuple[Real, 
 
 
 def _rate_hz(deadlines: Real, period_ns: float) -> float:
-    """Return the rate in Hz: by the mean period if all are within ROUNDED_NS of the median `period_ns`, else by it."""
-    is_even = bool(np.all(np.abs(np.diff(deadlines) - period_ns) <= ROUNDED_NS))
+    """Return the rate in Hz: by the mean period if all are near the median `period_ns`, else by it."""
+    is_even = bool(np.all(np.abs(np.diff(deadlines) - period_ns) <= max(ROUNDED_NS, JITTER_TOLERANCE * period_ns)))
     period_ns = float(deadlines[-1] - deadlines[0]) / (deadlines.size - 1) if is_even else period_ns
     return float(f"{1e9 / period_ns:.9g}")
 

@@ -124,3 +124,16 @@ def test_each_loss_and_each_assumption_is_named(content: str, note: str, tmp_pat
     notes = [*binding.notes, *binding.require_time().notes]
     assert any(note in text for text in notes), notes
     assert len(binding.require_time().deadline_ns) == N
+
+
+@pytest.mark.parametrize(
+    ("form", "rate_hz"), [("{:.6f}", 51_200.0), ("{:.6g}", 51_200.0), ("{:.5f}", 12_800.0), ("{:.4f}", 3_000.0)]
+)
+def test_a_rounded_clock_has_even_samples(form: str, rate_hz: float, tmp_path: Path):
+    count = 5000
+    (tmp_path / "scan.csv").write_text(
+        "Time [s],u\n" + rows([form.format(k / rate_hz) for k in range(count)], [1.5] * count)
+    )
+    base = read(tmp_path / "scan.csv").require_time()
+    assert base.rate_hz == rate_hz
+    assert np.abs(base.deadline_ns - np.arange(count) * 1e9 / rate_hz).max() <= 1
