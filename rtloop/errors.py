@@ -12,6 +12,7 @@
     ├── InputFileError   66  a file that was named cannot be read  (rtloop.configuration.text_files)
     ├── UnreadableNote   69  a hardware note that cannot be opened (rtloop.supervision.hardware)
     ├── UnreadableData    1  a file of another program; 66 where it cannot be opened (rtloop.interchange.formats.table)
+    │   └── AmbiguousData 65  a file with two readings; the message lists the options that decide
     ├── UnsuitableData    1  recordings that tell too little       (rtloop.design.identification.axis_recording)
     └── Refusal, UnconfirmedCommand  1  a command that a running loop refused, or did not confirm  (rtloop.service.desk)
 

@@ -4,23 +4,28 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
+from dataclasses import fields
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from rtloop.configuration.text_files import parse_toml, read_text
 from rtloop.errors import ConfigError
+from rtloop.interchange.formats.table import Hints
 from rtloop.recording.file.topics.validation import HIGHEST_RATE_HZ, LOWEST_RATE_HZ
 
 NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_]{0,99}")
 MAPPING_FILE_NAME = "map.toml"
+STATED = "stated"
+"""The clock of a file that states its sample rate and has other times, too."""
 
 
 class ColumnSelection(BaseModel):
     """Columns to import: `signals` by name, each with its mapping; `keep`, columns under their own names; the time.
 
     `all`: every other column too. `group` picks a raster, group or topic. `rate_hz` replaces the column `time`.
+    `clock` and `time_unit` decide between several readings of the times; the others are those of `Hints`.
     `position_first`: in each row the position was sampled before the drive changed; else both at the same time. A
     mapping file has these keys.
     """
@@ -34,6 +39,19 @@ class ColumnSelection(BaseModel):
     rate_hz: float | None = Field(default=None, ge=LOWEST_RATE_HZ, le=HIGHEST_RATE_HZ)
     group: str | None = None
     position_first: bool = False
+    clock: str | None = None
+    time_unit: str | None = None
+    header_row: int | None = Field(default=None, ge=0)
+    skip_rows: Annotated[tuple[int, ...], Field(strict=False)] = ()
+    delimiter: str | None = None
+    decimal: str | None = None
+    dates: Literal["day", "month"] | None = None
+    missing: Annotated[tuple[str, ...], Field(strict=False)] = ()
+
+    @property
+    def hints(self) -> Hints:
+        """Answers for the reader of the file."""
+        return Hints(**{key.name: getattr(self, key.name) for key in fields(Hints)})
 
     def __bool__(self) -> bool:
         """Whether any column is selected."""

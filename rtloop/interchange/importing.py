@@ -18,6 +18,7 @@ import numpy as np
 
 from rtloop.foundation.arrays import Real
 from rtloop.foundation.trusted import open_user_file
+from rtloop.interchange.binding import Binding, bind
 from rtloop.interchange.columns import NAME, ColumnSelection
 from rtloop.interchange.formats.groups import row_count
 from rtloop.interchange.formats.table import Table, UnreadableData
@@ -25,21 +26,14 @@ from rtloop.interchange.isolated_reader import read_table
 from rtloop.interchange.mapping import (
     MappedColumn,
     axis_names,
-    column_unit,
     default_signal_name,
     find_column,
     map_column,
-    name_without_unit,
+    require_one_unit,
     signal_name,
 )
-from rtloop.interchange.sampling import (
-    RECORDING_TIME_COLUMNS,
-    TimeBase,
-    find_time_base,
-    grows_evenly,
-    is_from_recording,
-    time_column,
-)
+from rtloop.interchange.names import name_without_unit
+from rtloop.interchange.sampling import RECORDING_TIME_COLUMNS, TimeBase, grows_evenly, is_from_recording
 from rtloop.recording.columns import signal_unit
 from rtloop.recording.file.topics import format
 from rtloop.recording.file.topics.contents import Message
@@ -50,6 +44,8 @@ from rtloop.version import __version__
 
 UNFINISHED_SUFFIX = ".importing"
 MAX_TEXT_CHARACTERS = 200
+OUTER_ROWS = 2
+"""First and last rows that are reported as they were read."""
 
 ReportTicks = Callable[[int], None]
 
@@ -86,12 +82,12 @@ def import_data(
     the format's package is missing; OutputError if the output exists or cannot be written; OSError if the file
     disappears meanwhile. An incomplete output is removed.
     """
-    table = read_table(path, selection.group) if table is None else table
-    time_base = find_time_base(table, path, selection.time, selection.rate_hz)
-    signals = _select_signals(table, path, selection, time_base)
+    binding = bind(read_table(path, selection.hints) if table is None else table, path, selection)
+    signals, time_base = _select_signals(binding, selection), binding.require_time()
     output = output or path.with_name(f"{path.stem}{'.imported' if path.suffix == '.mcap' else ''}.mcap")
     header = _make_header(path, signals, time_base, selection.position_first)
     _write_recording(output, header, signals, time_base.rate_hz, progress or (lambda _: None))
+    shown = {name: signals.columns[name] for name in signals.units}
     return {
         "file": str(path),
         "output": str(output),
@@ -104,32 +100,50 @@ def import_data(
             for name, unit in signals.units.items()
         ],
         "notes": signals.notes,
-        "about": dict(table.about),
-        "in_other_files": [*table.in_other_files],
+        **_outer_rows({"time_s": time_base.deadline_ns * 1e-9} | shown),
+        "about": dict(binding.table.about),
+        "in_other_files": [*binding.table.in_other_files],
     }
 
 
 def list_columns(path: Path, table: Table, selection: ColumnSelection) -> Mapping[str, object]:
     """Return the content of a file, with unit and extremes of each column.
 
-    Keys: file, rows, time, time_column, rate_hz, notes, columns, about, in_other_files; `columns` are {name, unit,
-    grows_evenly, least, largest}, `time_column` is the name of the column of times found, None without one;
-    `time` is a text on the source of the times. Only `time` and `rate_hz` of `selection` are used. If they give no
-    usable times, `time` and `rate_hz` are None, and `notes` says why.
+    Keys: file, rows, time, time_column, rate_hz, notes, columns, first_rows, last_rows, about, in_other_files;
+    `columns` are {name, unit, grows_evenly, least, largest}, `time_column` is the name of the column of times found,
+    None without one; `time` is a text on the source of the times; each of the rows has the values by column. The
+    columns of `selection` are not used. If nothing gives usable times, `time` and `rate_hz` are None, and `notes` says
+    why. Raises AmbiguousData where two readings remain.
     """
+    binding = bind(table, path, selection)
+    base, table = binding.time_base, binding.table
     columns = [
-        {"name": name, "unit": column_unit(table, name), "grows_evenly": grows_evenly(values), **extremes(values)}
+        {"name": name, "unit": binding.units[name], "grows_evenly": grows_evenly(values), **extremes(values)}
         for name, values in table.columns.items()
     ]
-    summary: dict[str, object] = {"time": None, "rate_hz": None, "time_column": time_column(table)}
-    try:
-        time_base = find_time_base(table, path, selection.time, selection.rate_hz)
-        summary |= {"time": time_base.description, "rate_hz": time_base.rate_hz, "notes": time_base.notes}
-    except UnreadableData as fault:
-        summary["notes"] = [str(fault).removeprefix(f"{path}: ")]
-    return {"file": str(path), "rows": row_count(table), **summary, "columns": columns, "about": dict(table.about)} | {
-        "in_other_files": [*table.in_other_files]
+    return {
+        "file": str(path),
+        "rows": row_count(table),
+        "time": base and base.description,
+        "rate_hz": base and base.rate_hz,
+        "time_column": binding.clock,
+        "notes": [*binding.notes, *(base.notes if base else [str(binding.fault).removeprefix(f"{path}: ")])],
+        "columns": columns,
+        **_outer_rows(table.columns),
+        "about": dict(table.about),
+        "in_other_files": [*table.in_other_files],
     }
+
+
+def _outer_rows(columns: Mapping[str, Real]) -> dict[str, list[dict[str, float | None]]]:
+    """Return {first_rows, last_rows}: OUTER_ROWS rows each, with the value of each column, None for no finite one."""
+    count = min(map(len, columns.values()), default=0)
+    rows = [
+        {name: float(values[k]) if np.isfinite(values[k]) else None for name, values in columns.items()}
+        for k in range(count)
+        if k < OUTER_ROWS or k >= count - OUTER_ROWS
+    ]
+    return {"first_rows": rows[:OUTER_ROWS], "last_rows": rows[OUTER_ROWS:]}
 
 
 def extremes(values: Real) -> dict[str, float | None]:
@@ -142,20 +156,23 @@ def extremes(values: Real) -> dict[str, float | None]:
     )
 
 
-def _select_signals(table: Table, path: Path, selection: ColumnSelection, time_base: TimeBase) -> ImportedSignals:
+def _select_signals(binding: Binding, selection: ColumnSelection) -> ImportedSignals:
     """Return the selected columns as signals, tick and deadline first.
 
     Raises UnreadableData if a column is missing, ambiguous or of another unit, a name is reserved or mapped twice, no
     column besides the time is left, or the values of a signal of whole numbers, such as flags, are not whole.
     """
-    signals = _select_columns(table, path, selection)
-    notes = [*time_base.notes, *(column.assumption for column in signals.values() if column.assumption)]
+    signals = _select_columns(binding, selection)
+    table, time_base = binding.table, binding.require_time()
+    notes = [*binding.notes, *time_base.notes, *(c.assumption for c in signals.values() if c.assumption)]
     ticks, tick_notes = _import_ticks(table, len(time_base.deadline_ns))
     columns = {RECORDING_TIME_COLUMNS[0]: ticks, RECORDING_TIME_COLUMNS[1]: time_base.deadline_ns}
     for name, column in signals.items():
         columns[name] = column.values(table)
         if name in INTEGER_COLUMNS and (fault := integer_problem(name, columns[name])):
-            raise UnreadableData(f"{path}: {fault}; give column {column.name!r} another name with --map NAME=COLUMN")
+            raise UnreadableData(
+                f"{binding.path}: {fault}; give column {column.name!r} another name with --map NAME=COLUMN"
+            )
     missing = {name: np.count_nonzero(~np.isfinite(values)) for name, values in columns.items()}
     if any(missing.values()):
         notes.append(
@@ -169,13 +186,14 @@ def _select_signals(table: Table, path: Path, selection: ColumnSelection, time_b
     )
 
 
-def _select_columns(table: Table, path: Path, selection: ColumnSelection) -> dict[str, MappedColumn]:
+def _select_columns(binding: Binding, selection: ColumnSelection) -> dict[str, MappedColumn]:
     """Return the selected columns by signal name; if none or `all` is selected, also all others except the times.
 
     A column kept under its own name gets a number appended if a signal, the tick or the deadline has this name.
     Raises UnreadableData for a missing or ambiguous column, a unit that does not fit, a reserved name, two mappings of
     one signal, and where no column besides the time is left.
     """
+    table, path = binding.table, binding.path
     signals: dict[str, MappedColumn] = {}
     for given_name, source in selection.signals.items():
         if (name := signal_name(given_name)) in RECORDING_TIME_COLUMNS:
@@ -191,7 +209,7 @@ def _select_columns(table: Table, path: Path, selection: ColumnSelection) -> dic
         signals[name] = map_column(table, path, name, source)
     plain_columns = [find_column(table, path, column_name) for column_name in selection.keep]
     if selection.all or not selection:
-        used = {column.name for column in signals.values()} | {*plain_columns, *_time_columns(table, path, selection)}
+        used = {column.name for column in signals.values()} | {*plain_columns, *binding.time_columns}
         plain_columns += [name for name in table.columns if name not in used]
     for column in plain_columns:
         name = column if is_from_recording(table) and NAME.fullmatch(column) else default_signal_name(column)
@@ -200,26 +218,16 @@ def _select_columns(table: Table, path: Path, selection: ColumnSelection) -> dic
             for candidate in (name, *(f"{name}_{k}" for k in range(2, len(signals) + 4)))
             if candidate not in signals and candidate not in RECORDING_TIME_COLUMNS
         )
-        unit = signal_unit(column) if is_from_recording(table) and not table.units else column_unit(table, column) or ""
+        if is_from_recording(table) and not table.units:
+            unit = signal_unit(column)
+        else:
+            unit = require_one_unit(table, path, column, free_name) or ""
         signals[free_name] = MappedColumn(
             column, Fraction(1), 0.0, unit, f"{name_without_unit(column)} [{unit}]" if unit else column, None
         )
     if not signals:
         raise UnreadableData(f"{path}: contains no column besides the time")
     return signals
-
-
-def _time_columns(table: Table, path: Path, selection: ColumnSelection) -> set[str | None]:
-    """Return the names of the columns that hold times, and are no signals; None stands for a column that is missing.
-
-    These are the table's column of times and that of `selection.time`; for a table from a recording, its ticks and
-    deadlines and the file's own column of times. Raises UnreadableData if the column of `selection.time` is not found,
-    is ambiguous, or has a unit that is unknown or does not fit.
-    """
-    if is_from_recording(table):
-        return {*RECORDING_TIME_COLUMNS, table.time}
-    time_column_name = None if selection.time is None else map_column(table, path, "time", selection.time).name
-    return {time_column(table), time_column_name}
 
 
 def _import_ticks(table: Table, rows: int) -> tuple[Real, list[str]]:

@@ -1,9 +1,9 @@
 """Reads a file in a separate process: a damaged file may crash a library, or exhaust the memory.
 
-    python -m rtloop.interchange.isolated_reader FILE [GROUP]
+    python -m rtloop.interchange.isolated_reader FILE HINTS
 
-prints a JSON object in a line, {"error", "kind"} or {"rows", "columns", "units", "time", "about", "in_other_files"},
-followed by the columns' doubles, one column after the other.
+HINTS are the fields of `Hints` as JSON. It prints a JSON object in a line, {"error", "kind"} or {"rows", "columns"}
+with the other fields of the `Table`, followed by the columns' doubles, one column after the other.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ import subprocess
 import sys
 from collections.abc import Mapping
 from contextlib import suppress
+from dataclasses import asdict, fields
 from pathlib import Path
 from typing import IO, cast
 
@@ -22,22 +23,22 @@ import numpy as np
 from rtloop.errors import MissingExtra, RtloopError
 from rtloop.foundation.children import child_environment, python_command
 from rtloop.interchange.formats.groups import MAX_BYTES, row_count
-from rtloop.interchange.formats.table import Table, UnopenedData, UnreadableData
+from rtloop.interchange.formats.table import NO_HINTS, AmbiguousData, Hints, Table, UnopenedData, UnreadableData
 from rtloop.interchange.reading import read_in_process
 
 MEMORY_BYTES = 6 * MAX_BYTES
 """Limit of address space: libraries, the data, and copies made while reading."""
 
 
-def read_table(path: Path, group: str | None = None) -> Table:
-    """Return the columns of a file, read in a separate process; `group` picks one of several rasters, groups or topics.
+def read_table(path: Path, hints: Hints = NO_HINTS) -> Table:
+    """Return the columns of a file, read in a separate process; `hints.group` picks one of several rasters or groups.
 
     None: the longest one with several columns, or else the longest one; an MCAP file must then have a single topic.
-    `group` is ignored for CSV, Parquet and Stabilizer files. Raises UnopenedData if the file cannot be opened;
-    UnreadableData if it is of no known format, damaged, too large or has no such group, or if the process is killed;
-    MissingExtra if the format's package is missing.
+    Raises UnopenedData if the file cannot be opened; AmbiguousData if `hints` must decide; UnreadableData if it is of
+    no known format, damaged, too large or has no such group, or if the process is killed; MissingExtra if the format's
+    package is missing.
     """
-    command = python_command(__name__, path, *([] if group is None else [group]))
+    command = python_command(__name__, path, json.dumps(asdict(hints)))
     environment = child_environment({"OPENBLAS_NUM_THREADS": "1"})
     devnull = subprocess.DEVNULL
     with subprocess.Popen(command, stdin=devnull, stdout=subprocess.PIPE, stderr=devnull, env=environment) as process:
@@ -61,19 +62,20 @@ def _receive_table(path: Path, stream: IO[bytes]) -> Table | None:
         return None
     message = json.loads(line)
     if "error" in message:
-        kinds = {kind.__name__: kind for kind in (MissingExtra, UnopenedData)}
+        kinds = {kind.__name__: kind for kind in (MissingExtra, UnopenedData, AmbiguousData)}
         raise kinds.get(message["kind"], UnreadableData)(message["error"])
-    columns = {name: np.empty(message["rows"]) for name in message["columns"]}
+    rows = message.pop("rows")
+    columns = {name: np.empty(rows) for name in message.pop("columns")}
     for values in columns.values():
         remaining = values.data.cast("B")
         while len(remaining) and (count := stream.readinto(remaining)):  # type: ignore[attr-defined]
             remaining = remaining[count:]
         if len(remaining):
             return None
-    return Table(columns, message["units"], message["time"], message["about"], tuple(message["in_other_files"]))
+    return Table(columns, **message)
 
 
-def _serve_table(path: Path, group: str | None) -> None:
+def _serve_table(path: Path, hints: Hints) -> None:
     """Read a file within the memory limit, and write the table, or the error, to stdout."""
     with suppress(ImportError):  # Windows limits no process by itself.
         import resource
@@ -81,7 +83,7 @@ def _serve_table(path: Path, group: str | None) -> None:
         resource.setrlimit(resource.RLIMIT_AS, (MEMORY_BYTES, MEMORY_BYTES))
     out = sys.stdout.buffer
     try:
-        table = read_in_process(path, group)
+        table = read_in_process(path, hints)
     except RtloopError as fault:
         _send_line(out, {"error": str(fault), "kind": type(fault).__name__})
         return
@@ -93,9 +95,8 @@ def _serve_table(path: Path, group: str | None) -> None:
     except Exception as fault:  # whatever a library lets through of a damaged file
         _send_line(out, {"error": f"{path}: damaged ({type(fault).__name__}: {str(fault)[:200]})", "kind": ""})
         return
-    header = {"rows": row_count(table), "columns": [*table.columns], "units": dict(table.units)}
-    header |= {"time": table.time, "about": dict(table.about), "in_other_files": [*table.in_other_files]}
-    _send_line(out, header)
+    evidence = {field.name: getattr(table, field.name) for field in fields(table)}
+    _send_line(out, evidence | {"rows": row_count(table), "columns": [*table.columns]})
     for values in table.columns.values():
         out.write(values.data.cast("B"))
     out.flush()
@@ -108,4 +109,4 @@ def _send_line(out: IO[bytes], message: Mapping[str, object]) -> None:
 
 
 if __name__ == "__main__":
-    _serve_table(Path(sys.argv[1]), sys.argv[2] if len(sys.argv) > 2 else None)
+    _serve_table(Path(sys.argv[1]), Hints(**json.loads(sys.argv[2])))

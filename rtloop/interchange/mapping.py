@@ -17,8 +17,9 @@ from typing import NamedTuple
 from unicodedata import normalize
 
 from rtloop.foundation.arrays import Real
-from rtloop.interchange.formats.table import Table, UnreadableData
-from rtloop.interchange.units import UnknownUnit, factor_between, is_unit, scale_values
+from rtloop.interchange.formats.table import Reading, Table, UnreadableData, ask
+from rtloop.interchange.names import name_without_unit, split_unit, unit_in_name
+from rtloop.interchange.units import UnknownUnit, factor_between, scale_values
 from rtloop.recording.columns import signal_unit
 from rtloop.signals import AXIS_SIGNALS, COMMON_SIGNALS, DRIVE
 
@@ -35,8 +36,6 @@ _SOURCE = re.compile(
     rf"(?:\s+\*\s*(?P<factor>{_NUMBER})(?:\s*(?P<by>[^\s\d]\S*))?)?"
     rf"(?:\s+(?P<sign>[-+])\s*(?P<offset>{_NUMBER})(?:\s*(?P<of>[^\s\d]\S*))?)?\s*"
 )
-_BRACKETED = re.compile(r"(.+?)\s*(?:\[([^\[\]]*)\]|\(([^()]*)\)|\s(?:/|in)\s+(\S+))")
-_SUFFIX = re.compile(r".*[^_]_([A-Za-zµ]+)")
 _RESERVED_NAME_PREFIX = "file_"
 
 
@@ -69,11 +68,11 @@ def map_column(table: Table, path: Path, signal: str, source: str) -> MappedColu
     converted to the signal's, or the factor is too large or too small.
     """
     match = None if source in table.columns else _SOURCE.fullmatch(source)
-    parts = match.groupdict() if match else {}
+    parts = match.groupdict() if match else {"unit": split_unit(source)[1]}
     name = find_column(table, path, parts.get("column") or source)
     sensitivity_unit, target = parts.get("by") or "", signal_unit(signal)
     in_file = column_unit(table, name)
-    source_unit = parts.get("unit") or in_file
+    source_unit = parts.get("unit") or require_one_unit(table, path, name, signal)
     unit = source_unit or (sensitivity_unit.partition("/")[2] if sensitivity_unit else target)
     result_unit = target or _product_unit(unit, sensitivity_unit)
     try:
@@ -170,20 +169,27 @@ def column_unit(table: Table, name: str) -> str | None:
 
     It is the unit that `table` states, or else the unit in the name, as in "drive [mV]", "drive in mV" or "drive_mV".
     """
-    if table.units.get(name):
-        return table.units[name]
-    if unit := _split_unit(name)[1]:
-        return unit
-    suffix = _SUFFIX.fullmatch(name)
-    return suffix[1] if suffix and is_unit(suffix[1]) else None
+    return table.units.get(name) or unit_in_name(name)
 
 
-def name_without_unit(name: str) -> str:
-    """Return a column's name without the unit at its end, as in "x [mV]", "x (mV)", "x / mV" or "x in mV".
+def require_one_unit(table: Table, path: Path, name: str, signal: str) -> str | None:
+    """Return the unit in the file of the column for `signal`, "" for the clock.
 
-    Any other name, such as "x_mV", is returned unchanged.
+    Raises AmbiguousData if its name has another one than the file states.
     """
-    return _split_unit(name)[0]
+    stated, named = table.units.get(name), split_unit(name)[1]
+    try:
+        agree = not stated or not named or factor_between(stated, named) == 1
+    except UnknownUnit:
+        agree = False
+    if not agree:
+        plain = name_without_unit(name)
+        readings = [
+            Reading(f'--map "{signal}={plain} [{unit}]"' if signal else f"--time-unit {unit}", f"in {unit}")
+            for unit in (named, stated)
+        ]
+        raise ask(path, f"column {name!r} has the unit {named} in its name, and {stated} beside it", *readings)
+    return column_unit(table, name)
 
 
 def signal_name(text: str) -> str:
@@ -197,7 +203,7 @@ def signal_name(text: str) -> str:
 def default_signal_name(column: str) -> str:
     """Return a column's name in a recording: without its unit, of ASCII letters, digits and underscores.
 
-    A long name loses its beginning: the last MAX_NAME_CHARACTERS stay. The prefix `column_` is added to a name that
+    A long name loses its beginning: the last MAX_NAME_CHARACTERS stay. The prefix column_ is added to a name that
     does not begin with a letter, `file_` to the name of a signal that every recording has, such as tick.
     """
     plain = (
@@ -228,16 +234,6 @@ def axis_names(signals: list[str]) -> list[str]:
         for axis in axes
         if axis in axes_with_drive or not any(axis.startswith(f"{other_axis}_") for other_axis in axes)
     ]
-
-
-def _split_unit(name: str) -> tuple[str, str | None]:
-    """Return (name, unit) of `name [unit]`, `name (unit)`, `name / unit` or `name in unit`.
-
-    Returns (whole text, None) where no known unit ends it.
-    """
-    match = _BRACKETED.fullmatch(name.strip())
-    unit = next(filter(None, match.groups()[1:]), "") if match else ""
-    return (match[1], unit) if match and is_unit(unit) else (name, None)
 
 
 def _normalised_name(name: str) -> str:

@@ -23,10 +23,15 @@ UNIT_NAMES = {
     "metres": "m", "micrometer": "µm", "micrometers": "µm", "micrometre": "µm", "micron": "µm", "microns": "µm",
     "nanometer": "nm", "nanometers": "nm", "sec": "s", "secs": "s", "second": "s", "seconds": "s", "sek": "s",
     "sekunden": "s", "msec": "ms", "usec": "µs", "millisecond": "ms", "milliseconds": "ms", "microseconds": "µs",
-    "hertz": "Hz", "hr": "h", "ampere": "A", "newton": "N", "angstrom": "Å", "count": "counts",
+    "microsecond": "µs", "nanosecond": "ns", "nanoseconds": "ns", "minute": "min", "minutes": "min", "mins": "min",
+    "hour": "h", "hours": "h", "hrs": "h", "day": "d", "days": "d", "microvolt": "µV", "microvolts": "µV",
+    "kilovolt": "kV", "kilovolts": "kV", "millimeter": "mm", "millimeters": "mm", "millimetre": "mm",
+    "hertz": "Hz", "hr": "h", "ampere": "A", "amp": "A", "amps": "A", "amperes": "A", "celsius": "°C", "percent": "%",
+    "vdc": "V", "vac": "V", "mvdc": "mV", "newton": "N", "angstrom": "Å", "count": "counts",
 }  # fmt: skip
 UNPREFIXED_UNITS = {
     "Å": (Fraction(1, 10**10), "m"), "min": (Fraction(60), "s"), "h": (Fraction(3600), "s"),
+    "d": (Fraction(86400), "s"),
     "%": (Fraction(1, 100), ""),
     "1": (Fraction(1), ""), "-": (Fraction(1), ""), "": (Fraction(1), ""), "°C": (Fraction(1), "degC"),
     "degC": (Fraction(1), "degC"), "rad": (Fraction(1), "rad"), "deg": (Fraction(1), "deg"), "°": (Fraction(1), "deg"),

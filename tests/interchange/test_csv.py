@@ -97,7 +97,7 @@ def test_dates_are_times(tmp_path: Path):
             "t,u\n" + "0,1\n" * 200 + "0,on\n" + "0,1\n" * 200,
             r"column 'u': 'on' is not a number \(about line 202\)",
         ),
-        ("t;u\n" + "0;1,5\n" * 200 + "0;1.234,5\n", r"column 'u': '1.234,5' is not a number \(about line 202\)"),
+        ("t;u\n" + "0;1,5\n" * 200 + "0;1.23,5\n", r"column 'u': '1.23,5' is not a number \(about line 202\)"),
         ("t,u\n" + "0,1\n" * 200 + "\n  \n0,on\n" + "0,1\n" * 200, r"'on' is not a number \(about line 204\)"),
         ("t,u\n" + "0,1\n" * 200 + "0,1,2\n", "line 202 has 3 columns; allowed: 2, as in most lines"),
         (

@@ -180,8 +180,9 @@ def test_a_column_with_infinite_values_is_no_clock():
 def test_a_given_rate_replaces_an_unusable_time(folder: Path):
     savemat(folder / "scan.mat", {"time": np.round(TIME, 3), "u": VOLTS})
     result = run("import", "scan.mat", "--all")
-    assert result.exit_code == 1
+    assert result.exit_code == 65
     assert "time 'time' does not grow from row 1 (0 s) to row 2 (0 s)" in result.stderr
+    assert "--rate 9996.67  even samples, with times rounded to 0.001 s" in result.stderr
     report = answer("import", "scan.mat", "--all", "--rate", 44_100)
     assert report["rate_hz"] == 44_100
     assert [signal["name"] for signal in report["signals"]] == ["u"]

@@ -14,7 +14,7 @@ from scipy.io import savemat
 
 from rtloop.interchange import isolated_reader
 from rtloop.interchange.formats import from_mat
-from rtloop.interchange.formats.table import UnreadableData
+from rtloop.interchange.formats.table import Hints, UnreadableData
 from rtloop.interchange.reading import read_in_process
 
 HUGE = 2 << 30
@@ -115,7 +115,7 @@ def test_an_isolated_process_reads_the_same(tmp_path: Path):
     }
     assert (table.time, dict(table.about)) == (expected.time, dict(expected.about))
     with pytest.raises(UnreadableData, match="no group 'x'"):
-        isolated_reader.read_table(tmp_path / "scan.mat", "x")
+        isolated_reader.read_table(tmp_path / "scan.mat", Hints("x"))
 
 
 def main() -> None:

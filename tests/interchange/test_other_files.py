@@ -13,7 +13,7 @@ import pytest
 from click.testing import CliRunner
 
 from rtloop.cli.import_file import import_command
-from rtloop.interchange.formats.table import UnreadableData
+from rtloop.interchange.formats.table import Hints, UnreadableData
 from rtloop.interchange.reading import read_in_process
 from rtloop.recording.load import load
 
@@ -98,7 +98,7 @@ def write_scan(path: Path, canary: Path, *pointers: Pointer) -> Path:
 @pytest.mark.parametrize("ending", ["h5", "mat"])
 @pytest.mark.parametrize("pointer", [*POINTERS, reference])
 def test_data_in_another_file_are_skipped_and_named(tmp_path: Path, canary: Path, ending: str, pointer: Pointer):
-    table = read_in_process(write_scan(tmp_path / f"scan.{ending}", canary, pointer), "scan")
+    table = read_in_process(write_scan(tmp_path / f"scan.{ending}", canary, pointer), Hints("scan"))
     columns = {name.rpartition("/")[2]: values for name, values in table.columns.items()}
     assert (columns["time"].tobytes(), columns["drive"].tobytes()) == (TIME.tobytes(), DRIVE.tobytes())
     assert not any(np.any(values == CANARY) for values in table.columns.values())

@@ -11,7 +11,7 @@ import pandas
 import pytest
 from scipy.io import savemat
 
-from rtloop.interchange.formats.table import Table, UnreadableData
+from rtloop.interchange.formats.table import Hints, Table, UnreadableData
 from rtloop.interchange.reading import read_in_process
 from tests.interchange.controldesk import write_controldesk
 
@@ -52,17 +52,17 @@ def test_rasters_are_named_and_selected(tmp_path: Path):
     table = read_in_process(tmp_path / "scan.mat")
     assert has_columns(table, Time=TIME, u=DRIVE)
     assert (table.about["group"], table.about["other groups"]) == ("fast", "'slow' (50 rows, 2 columns)")
-    assert has_columns(read_in_process(tmp_path / "scan.mat", "slow"), Time=TIME[::10], T=PLACE[::10])
+    assert has_columns(read_in_process(tmp_path / "scan.mat", Hints("slow")), Time=TIME[::10], T=PLACE[::10])
     with pytest.raises(UnreadableData, match="no group 'middle'; there are 'fast', 'slow'"):
-        read_in_process(tmp_path / "scan.mat", "middle")
+        read_in_process(tmp_path / "scan.mat", Hints("middle"))
 
 
 def test_rasters_of_one_length_keep_apart(tmp_path: Path):
     x = structure_array(("Name", "Data", "Raster"), ("", TIME[None], "fast"), ("", 10 * TIME[None], "slow"))
     y = structure_array(("Name", "Data", "XIndex"), ("u", DRIVE[None], 1.0), ("T", PLACE[None], 2.0))
     savemat(tmp_path / "scan.mat", {"scan": {"X": x, "Y": y}})
-    assert has_columns(read_in_process(tmp_path / "scan.mat", "fast"), Time=TIME, u=DRIVE)
-    assert has_columns(read_in_process(tmp_path / "scan.mat", "slow"), Time=10 * TIME, T=PLACE)
+    assert has_columns(read_in_process(tmp_path / "scan.mat", Hints("fast")), Time=TIME, u=DRIVE)
+    assert has_columns(read_in_process(tmp_path / "scan.mat", Hints("slow")), Time=10 * TIME, T=PLACE)
 
 
 def test_simulink(tmp_path: Path):
@@ -143,7 +143,7 @@ def test_hdf5_in_groups_with_links_that_lead_back(tmp_path: Path):
         "included), "
         "self (a link without a target)"
     )
-    assert has_columns(read_in_process(tmp_path / "a.h5", "run/2"), time=TIME, u=PLACE)
+    assert has_columns(read_in_process(tmp_path / "a.h5", Hints("run/2")), time=TIME, u=PLACE)
 
 
 def test_hdf5_of_nothing_but_a_loop(tmp_path: Path):

@@ -11,6 +11,7 @@ import os
 import warnings
 import zlib
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import IO, Any, TypeGuard
 
@@ -48,7 +49,18 @@ def read_mat(path: Path, group: str | None = None) -> Table:
                 tables[unique_name(raster or name, tables)] = table
         else:
             _collect_arrays(columns, name, value, 0)
-    return select_table(path, tables | columns.grouped_tables(), group, columns.in_other_files)
+    grouped = {name: _with_first_row(table, columns) for name, table in columns.grouped_tables().items()}
+    return select_table(path, tables | grouped, group, columns.in_other_files)
+
+
+def _with_first_row(table: Table, columns: FileColumns) -> Table:
+    """Return a table whose times are the first row of a matrix, if it grows, as Simulink's To File writes it."""
+    name = next(iter(table.columns))
+    is_first = name in columns.row_wise and len(table.columns) > 1 and bool(np.all(np.diff(table.columns[name]) > 0))
+    if not is_first or table.time is not None:
+        return table
+    note = f"the first row, {name}, counts as the time in s, as Simulink's To File writes it"
+    return replace(table, time=name, units={name: "s", **table.units}, notes=(*table.notes, note))
 
 
 def _load_variables(path: Path, head: bytes) -> dict[str, object]:
@@ -201,7 +213,7 @@ def _collect_arrays(columns: FileColumns, path: str, value: object, depth: int, 
             _collect_arrays(columns, f"{path}/{name or number}", element, depth + 1)
     elif type(value).__name__ in ("MatlabOpaque", "MatlabFunction"):
         columns.left_out.append(f"{path} (an object that only MATLAB can read; save a structure or an array instead)")
-    elif isinstance(value, np.ndarray):
+    elif isinstance(value, np.ndarray | float | int):
         columns.add_column(path, value, unit)
 
 

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     import pyarrow
 
 
-def read_parquet(path: Path) -> Table:
+def read_parquet(path: Path, group: str | None = None) -> Table:
     """Return all columns of numbers and times: durations in s, dates in s from the first row.
 
     The table's `about` names the other columns, which are left out. Raises UnreadableData if the file cannot be opened,
@@ -39,7 +39,7 @@ def read_parquet(path: Path) -> Table:
                 _add_field(columns, field, file.read(columns=[field.name]).column(0))
     except (pyarrow.ArrowException, OSError) as fault:
         raise UnreadableData(f"{path}: not a Parquet file, or damaged ({str(fault).splitlines()[0]})") from None
-    table = select_table(path, columns.grouped_tables(), None)
+    table = select_table(path, columns.grouped_tables(), group)
     time_column = next((field.name for field in schema if pyarrow.types.is_timestamp(field.type)), None)
     return replace(table, time=table.time or time_column)
 

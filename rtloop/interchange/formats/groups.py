@@ -6,12 +6,15 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import takewhile
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from rtloop.foundation.arrays import Real
+from rtloop.interchange.formats.stated import parameters, scale_statements, stated_rates, stated_ticks
 from rtloop.interchange.formats.table import MAX_ROWS, Table, UnreadableData
+from rtloop.interchange.names import TIME_NAMES, bare_name, is_time_name
 from rtloop.values import count_text
 
 MAX_BYTES = 1 << 30
@@ -19,8 +22,6 @@ MAX_BYTES = 1 << 30
 MAX_COLUMNS = 2000
 MATRIX_COLUMNS = 256
 """A matrix with more columns counts as an image or a map, and not as a table of signals."""
-TIME_NAMES = ("deadline_ns", "time", "t", "zeit", "time_s", "timestamp", "tout", "sim_time", "elapsed", "elapsed time")
-"""Usual names of a column of times, the likeliest first."""
 MAX_SHOWN_NAMES = 8
 
 
@@ -29,7 +30,9 @@ class FileColumns:
     """All columns found in a file, before grouping, by their path, with their units.
 
     `left_out` and `in_other_files` name columns that are not read; the latter because the file only points to them.
-    `bytes` is the memory that `require_room` has counted.
+    `bytes` is the memory that `require_room` has counted. `single` are single numbers by path, which may state a sample
+    rate. `origins`, `made_up` (columns of matrices; `row_wise` those that were first rows) and `notes` go into the
+    tables: see Table.
     """
 
     path: Path
@@ -38,6 +41,11 @@ class FileColumns:
     left_out: list[str] = field(default_factory=list)
     in_other_files: list[str] = field(default_factory=list)
     bytes: int = 0
+    single: dict[str, object] = field(default_factory=dict)
+    origins: dict[str, int] = field(default_factory=dict)
+    made_up: set[str] = field(default_factory=set)
+    row_wise: set[str] = field(default_factory=set)
+    notes: list[str] = field(default_factory=list)
 
     def require_room(self, name: str, shape: tuple[int, ...]) -> None:
         """Add the size of an array of doubles of `shape` to `bytes`.
@@ -60,6 +68,9 @@ class FileColumns:
         if the file has more than MAX_COLUMNS columns.
         """
         array = np.asarray(values)
+        if array.dtype.kind == "M" and array.ndim == 1 and array.size > 1:
+            ns = array.astype("datetime64[ns]").astype(np.int64)
+            array, unit = (ns - ns[0]) * 1e-9, "s"
         if array.dtype.kind not in "fiub":
             if array.size > 1 or array.dtype.kind != "U":
                 self.left_out.append(f"{name} ({_kind_description(array)})")
@@ -67,18 +78,30 @@ class FileColumns:
         array = np.squeeze(array) if array.ndim > 1 else array
         if array.ndim == 2 and min(array.shape) <= MATRIX_COLUMNS:
             is_row_wise = array.shape[0] < array.shape[1]
+            if is_row_wise:
+                self.row_wise.add(f"{name}_1")
             for number, column in enumerate(array if is_row_wise else array.T, start=1):
                 self.add_column(f"{name}_{number}", column, unit)
+                self.made_up.add(f"{name}_{number}")
         elif array.ndim != 1 or array.size < 2:
             if array.size > 1:
                 self.left_out.append(f"{name} ({'×'.join(map(str, array.shape))})")
+            elif array.size == 1:
+                self.single[name.removesuffix("/value")] = array.item()  # LabOne keeps a setting's value so
         elif len(self.columns) == MAX_COLUMNS:
             raise UnreadableData(f"{self.path}: too many columns; allowed: up to {MAX_COLUMNS}")
         else:
             name = unique_name(name, self.columns)
-            self.columns[name] = np.ascontiguousarray(array, np.float64)
+            self.columns[name], origin = exact_floats(array)
+            if origin:
+                self.origins[name] = origin
             if unit:
                 self.units[name] = unit
+
+    def _is_note_of(self, note: str, names: Sequence[str]) -> bool:
+        """Whether a note, which may begin with a column's name, concerns one of the names, or all columns."""
+        owner = note.partition(": ")[0]
+        return owner in names or owner not in self.columns
 
     def grouped_tables(self) -> dict[str, Table]:
         """Return tables by group name: each has the columns of one length with the same nearest column of times.
@@ -89,8 +112,8 @@ class FileColumns:
         A group's name is the folder that all its columns share, which their names then lack; without one, the folder of
         the times, or else the number of rows, such as "100 rows".
         """
-        times = [name for name in self.columns if _base_name(name).casefold() in TIME_NAMES]
-        times.sort(key=lambda name: TIME_NAMES.index(_base_name(name).casefold()))
+        times = [name for name in self.columns if is_time_name(name)]
+        times.sort(key=lambda name: TIME_NAMES.index(bare_name(name)))
         members: dict[tuple[int, str | None], list[str]] = {}
         for name, values in self.columns.items():
             time_candidates = [time for time in times if self.columns[time].size == values.size]
@@ -101,12 +124,21 @@ class FileColumns:
         for (rows, time), names in members.items():
             begin = len(_shared_folder(names))
             short_names = {name: name[begin:] for name in names}
+            statements = parameters({key: value for key, value in self.single.items() if _concerns(key, names)})
             group = _shared_folder(names).strip("/") or (time or "").rpartition("/")[0] or count_text(rows, "row")
+            codes = [name for name in names if name != time and are_codes(self.columns[name])]
+            scales = [entry.text for entry in scale_statements(statements)] if codes else []
+            unscaled = [f"{codes[0]} holds whole numbers; {', '.join(scales)} is not applied"] if scales else []
             tables[unique_name(group, tables)] = Table(
                 {short_names[name]: self.columns[name] for name in names},
                 {short_names[name]: self.units[name] for name in names if name in self.units},
                 None if time is None else short_names[time],
                 about,
+                rates=tuple((rate.hz, rate.source) for rate in stated_rates(statements)),
+                tick_hz=stated_ticks(statements),
+                unnamed=tuple(short_names[name] for name in names if name in self.made_up),
+                origins={short_names[name]: self.origins[name] for name in names if name in self.origins},
+                notes=(*unscaled, *(note for note in self.notes if self._is_note_of(note, names))),
             )
         return tables
 
@@ -148,6 +180,25 @@ def select_table(
     return replace(table, about={**table.about, **group_notes})
 
 
+def are_codes(values: Real) -> bool:
+    """Whether values are whole numbers that vary and do not count, as a converter's codes."""
+    known = values[np.isfinite(values)]
+    is_varied = known.size > 2 and bool(np.ptp(known) > 2) and not np.all(np.diff(known) > 0)
+    return is_varied and bool(np.all(known == np.rint(known)))
+
+
+def with_left_out(table: Table, left_out: Sequence[str]) -> Table:
+    """Return a table that names what was left out of its file."""
+    return replace(table, about={**table.about, "left out": ", ".join(left_out[:MAX_SHOWN_NAMES])})
+
+
+def exact_floats(values: npt.NDArray[Any]) -> tuple[Real, int]:
+    """Return values as float64, and the whole number taken from all of them: 0, unless they would not fit."""
+    if values.dtype.kind in "iu" and values.size and max(abs(int(values.min())), abs(int(values.max()))) > 1 << 53:
+        return (values - values[0]).view(np.int64).astype(np.float64), int(values[0])  # right for unsigned ones, too
+    return np.ascontiguousarray(values, np.float64), 0
+
+
 def row_count(table: Table) -> int:
     """Return the number of samples of each column; 0 without columns."""
     return next((column.size for column in table.columns.values()), 0)
@@ -163,9 +214,10 @@ def unique_name(name: str, names: Iterable[str]) -> str:
     return candidate
 
 
-def _base_name(name: str) -> str:
-    """Return the last part of a path."""
-    return name.rpartition("/")[2]
+def _concerns(path: str, names: Iterable[str]) -> bool:
+    """Whether a single number belongs to one of the columns, to a folder of one, or to the whole file."""
+    owner = path.rpartition("/")[0]
+    return not owner or any(name == owner or name.startswith(f"{owner}/") for name in names)
 
 
 def _shared_folder(names: Sequence[str]) -> str:

@@ -18,6 +18,7 @@ import numpy as np
 from rtloop.errors import MissingExtra
 from rtloop.foundation.trusted import open_user_file
 from rtloop.interchange.formats.groups import FileColumns
+from rtloop.interchange.formats.scaling import SCOPE_ATTRIBUTES, unpack
 from rtloop.interchange.formats.table import UnreadableData
 from rtloop.interchange.hdf5_signals import descriptor_path
 
@@ -28,7 +29,13 @@ MAX_DEPTH = 32
 MAX_OBJECTS = 100_000
 CONTROL = r"[\x00-\x1f\x7f-\x9f\ud800-\udfff]"
 """Characters of a name that control a terminal, or that it cannot show."""
-UNIT_ATTRIBUTES = ("unit", "units", "Unit", "Units")
+MATLAB_OBJECTS = "#subsystem#"
+"""Group of the contents of MATLAB's objects."""
+MATLAB_NUMBERS = (
+    "double", "single", "logical", "char", "cell", "struct", "int8", "uint8", "int16", "uint16", "int32", "uint32",
+    "int64", "uint64",
+)  # fmt: skip
+"""Classes of MATLAB whose arrays are what they seem."""
 
 
 @contextmanager
@@ -60,6 +67,8 @@ def collect_datasets(columns: FileColumns) -> None:
         _collect_group(columns, datasets, file, "", set(), 0)
         for name, dataset in datasets.items():
             columns.require_room(name, dataset.shape)
+        for key, value in file.attrs.items():
+            columns.single[key] = value
         for name, dataset in datasets.items():
             _read_dataset(columns, dataset, name)
 
@@ -87,7 +96,10 @@ def _collect_group(
         )
     _visit(group, visited)
     for key in group:
-        name = f"{path}/{key}".lstrip("/")
+        is_octave = key == "value" and "OCTAVE_NEW_FORMAT" in group.attrs
+        name = path if is_octave else f"{path}/{key}".lstrip("/")
+        if name == MATLAB_OBJECTS:
+            continue
         member = _resolve_member(columns, group, key, name)
         if member is None:
             continue
@@ -168,13 +180,27 @@ class _OtherFileLink(Exception):
 
 
 def _read_dataset(columns: FileColumns, dataset: h5py.Dataset, name: str) -> None:
-    """Add a dataset of numbers, with its unit, to `columns`; a dataset of records adds its fields, without units."""
-    unit = next((_as_text(dataset.attrs[key]) for key in UNIT_ATTRIBUTES if key in dataset.attrs), None)
+    """Add a dataset of numbers, by its attributes, to `columns`; a dataset of records adds its fields, without units.
+
+    A scope's attributes may stand at its group. A MATLAB object is listed as left out.
+    """
+    attributes = {key: value for key, value in dataset.parent.attrs.items() if key in SCOPE_ATTRIBUTES} | dict(
+        dataset.attrs
+    )
+    if is_matlab_object(dataset):
+        columns.left_out.append(f"{name} (a MATLAB object, {_as_text(attributes['MATLAB_class'])})")
+        return
     values = dataset[()]
     for field in dataset.dtype.names or ():
         columns.add_column(f"{name}/{field}", values[field])
     if not dataset.dtype.names:
-        columns.add_column(name, values, unit)
+        unpack(columns, name, values, attributes)
+
+
+def is_matlab_object(dataset: h5py.Dataset) -> bool:
+    """Whether a dataset is the marker of an object that MATLAB alone can read."""
+    kind = _as_text(dataset.attrs.get("MATLAB_class", b"double"))
+    return "MATLAB_object_decode" in dataset.attrs or (kind not in MATLAB_NUMBERS and "MATLAB_class" in dataset.attrs)
 
 
 def _visit(member: h5py.HLObject, visited: set[tuple[int, int]]) -> bool:
@@ -239,6 +265,9 @@ def _member_value(columns: FileColumns, file: h5py.File, member: Any, name: str,
         return fields
     if not isinstance(member, h5py.Dataset) or _is_in_other_files(columns, member, name):
         return np.empty(0)
+    if is_matlab_object(member):
+        columns.left_out.append(f"{name} (a MATLAB object, {_as_text(member.attrs['MATLAB_class'])})")
+        return ""
     kind = _as_text(member.attrs.get("MATLAB_class", b"double"))
     if "MATLAB_empty" in member.attrs or member.shape is None:
         return "" if kind == "char" else np.empty(0)
