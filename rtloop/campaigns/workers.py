@@ -79,7 +79,7 @@ class ProcessWorkers:
         self.name = f"{self.count} worker process{'es' if self.count > 1 else ''}"
         self._context = multiprocessing.get_context("forkserver")
         self._context.set_forkserver_preload([preload])
-        _start_forkserver()
+        self._has_server = False
         self._executor = self._start()
 
     def submit(self, function: Callable[..., Result], *arguments: object) -> Future[Result]:
@@ -87,6 +87,9 @@ class ProcessWorkers:
 
         Raises BrokenProcessPool if a process of the pool has died.
         """
+        if not self._has_server:
+            _start_forkserver()
+            self._has_server = True
         return self._executor.submit(function, *arguments)
 
     def explain(self, error: BaseException) -> BaseException:
@@ -109,9 +112,9 @@ class ProcessWorkers:
 
 def _start_forkserver() -> None:
     """Start the server that makes worker processes, with the environment of a child; no effect if it runs already."""
-    before = dict(os.environ)
+    before, environment = dict(os.environ), child_environment()
     os.environ.clear()
-    os.environ.update(child_environment())
+    os.environ.update(environment)
     try:
         multiprocessing.forkserver.ensure_running()
     finally:

@@ -214,7 +214,8 @@ class _HelperImporter:
         """Run a text as the module `name` of `sys.modules`, and return it. Raises what the text raises."""
         self._loaded[name] = None
         module = sys.modules[name] = ModuleType(name, text)
-        module.__file__ = file
+        if file:
+            module.__file__ = file
         module.__dict__["__builtins__"] = {**vars(builtins), "__import__": self._import}
         # optimize: an `assert` of the law stays one of its steps, whatever `python -O` or PYTHONOPTIMIZE says
         exec(compile(text, file, "exec", dont_inherit=True, optimize=0), module.__dict__)

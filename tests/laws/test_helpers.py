@@ -16,7 +16,7 @@ import rtloop
 from rtloop.configuration.file import load
 from rtloop.configuration.laws import Library
 from rtloop.configuration.prepare import prepare
-from rtloop.errors import ConfigError
+from rtloop.errors import ConfigError, RtloopError
 from rtloop.laws.helpers import read_helpers
 from rtloop.laws.registry import law_class, law_from_text
 from rtloop.recording.errors import RecordingError
@@ -219,9 +219,7 @@ def test_a_running_service_keeps_the_helpers_that_it_loaded(tmp_path: Path):
     config = write(tmp_path)
     service = Service(config)
     (tmp_path / "numbers_ki.py").write_text("KI_PER_S = 50.0\n")
-    with pytest.raises(
-        rtloop.RtloopError, match=r"law mine: not loaded when the service started, or changed in its file"
-    ):
+    with pytest.raises(RtloopError, match=r"law mine: not loaded when the service started, or changed in its file"):
         service.reload_now()
     coefficients = np.asarray(prepare(service.configuration).plan.coefficients)
     write(tmp_path)

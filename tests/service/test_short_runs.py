@@ -137,6 +137,7 @@ class StoppedLoop:
 
 def test_a_loop_that_was_stopped_before_anybody_saw_it_ready_was_ready() -> None:
     supervisor: Any = object.__new__(Supervisor)
+    supervisor._heart = SimpleNamespace(watch=lambda: None)
     supervisor._loop, supervisor._reports = StoppedLoop(), {}
     supervisor.recorder = SimpleNamespace(state=ProcessState.READY, exit_code=None)
     supervisor._await_ready()
@@ -165,6 +166,7 @@ def test_the_limit_of_a_start_begins_again_with_each_compiled_function(
     monkeypatch.setattr(cache, "CACHE_FOLDER", tmp_path)
     monkeypatch.setattr(supervisor_module, "START_TIMEOUT_S", 0.0)
     supervisor: Any = object.__new__(Supervisor)
+    supervisor._heart = SimpleNamespace(watch=lambda: None)
     supervisor._loop, supervisor._reports = CompilingLoop(tmp_path, 20, ends=not is_quiet), {}
     supervisor.recorder = SimpleNamespace(state=ProcessState.READY, exit_code=None)
     if is_quiet:

@@ -9,7 +9,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from scipy.signal import detrend
 
 from rtloop.errors import RtloopError
 from rtloop.foundation.arrays import Real
@@ -234,12 +233,17 @@ def require_rising(run: AxisRecording) -> None:
     It falls if its correlation with the drive is below LARGEST_ANTICORRELATION, which is negative, both without their
     straight lines: a drift is no evidence. A drive that is little more than a line gives none.
     """
-    drive_v, position_um = detrend(run.drive_v[:-1]), detrend(run.position_um[1:])
+    drive_v, position_um = _without_line(run.drive_v[:-1]), _without_line(run.position_um[1:])
     if np.var(drive_v) < LEAST_TURNING * np.var(run.drive_v):
         return
     if np.corrcoef(drive_v, position_um)[0, 1] < LARGEST_ANTICORRELATION:
         slope = float(np.polyfit(drive_v, position_um, 1)[0])
         raise wrong_sign(run.name, f"the position falls by {-slope:.3g} µm per volt of drive")
+
+
+def _without_line(values: Real) -> Real:
+    ticks = np.arange(values.size)
+    return values - np.polyval(np.polyfit(ticks, values, 1), ticks)
 
 
 def wrong_sign(name: str, observation: str) -> UnsuitableData:

@@ -23,7 +23,7 @@ from rtloop.laws.registry import LawReference, law_layout
 from rtloop.recording.errors import RecordingError
 from rtloop.recording.file.reader import Snapshot
 from rtloop.recording.file.run_readers import ReportTicks
-from rtloop.recording.file.topics.events import GAP, RECOVERED, Event, json_value, message_from_event
+from rtloop.recording.file.topics.events import GAP, RECOVERED, ROTATED, Event, json_value, message_from_event
 from rtloop.recording.file.topics.overview import uncovered_ranges
 from rtloop.recording.file.topics.validation import header_extras
 from rtloop.recording.load import Recording, load
@@ -90,10 +90,11 @@ def recorded_commands(recording: Recording, kinds: Sequence[Kind]) -> npt.NDArra
 def misplaced_command(recording: Recording) -> int | None:
     """Tick of the first command to the law that is recorded twice, after one of a later tick, or after the run's end.
 
-    None if none is. A command that a second file of the run holds too must be equal there.
+    None if none is. A command that a second file of the run holds too must be equal there. A file that another one
+    follows, or that was repaired, may end before its last command.
     """
     last = recording.extents[-1].totals
-    end_tick = last["ticks_executed"] if last and last["result"] != RECOVERED else math.inf
+    end_tick = last["ticks_executed"] if last and last["result"] not in (RECOVERED, ROTATED) else math.inf
     last_tick, executed_keys = 0, set()
     for event in recording.events:
         if event["kind"] not in LAW_COMMAND_NAMES:
