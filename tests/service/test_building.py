@@ -38,7 +38,7 @@ def test_what_is_built_beside_is_what_is_built_here(limited_process: LimitedProc
         limited_process.run(prepare, configuration(TEXT.replace(*UNSTABLE)))
     pid = limited_process.pid
     limited_process.limit_s = 0.0
-    with pytest.raises(UnavailableError, match="processor time .*was stopped"):
+    with pytest.raises(UnavailableError, match=r"processor time .*was stopped"):
         limited_process.run(prepare, configuration())
     assert limited_process.pid is None
     limited_process.limit_s = 60.0

@@ -41,7 +41,8 @@ def _fork(command: list[bytes | str], *rest: Any) -> int:
                     os.close(fd)
         os.setpgid(0, 0)
         sys.stdin, sys.stdout = os.fdopen(0, closefd=False), os.fdopen(1, "w", closefd=False)
-        module, *sys.argv[1:] = [os.fsdecode(word) for word in command[2:]]
+        words = [os.fsdecode(word) for word in command]
+        module, *sys.argv[1:] = words[words.index("-m") + 1 :]
         process.prepare_realtime = _prepare_unpaced
         code = importlib.import_module(module).main()
         sys.stdout.flush()
