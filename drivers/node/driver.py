@@ -323,6 +323,8 @@ class NodeDriver(Driver):
             if isinstance(answer, Sample) and answer.flags & frames.READY:
                 return sequence, seal
             if isinstance(answer, frames.Refusal):
+                if answer.reason in (frames.UNKNOWN, frames.WATCHDOG):
+                    continue  # No node answers an OPEN so: somebody sent a false copy before it.
                 if answer.reason != frames.BUSY or time.monotonic() > start_s + BUSY_S:
                     raise DriverError(f"{self._options.label}: {failure_text(answer.reason)}")
                 time.sleep(RETRY_S)

@@ -6,6 +6,7 @@ import os
 import pickle
 import re
 import sys
+import zlib
 from pathlib import Path
 
 import numpy as np
@@ -249,6 +250,28 @@ def test_forged_descriptions_keep_no_loop_from_its_node(tmp_path: Path):
     key = make_key(tmp_path)
     with relayed(ForgingNode(key=key)) as relay, open_driver(relay_driver(relay.port, key)) as calls:
         assert calls.read()[0] == 0
+
+
+class EarlyCopyNode(PythonNode):
+    """A node that an attacker's copy of the first OPEN reaches before it, without the flag OPEN."""
+
+    has_copied = False
+
+    def receive(self, data: bytes, sender: str, now_us: int) -> bytes:
+        """Return the node's refusal of the copy, which has the tag of the loop's own frame; then its own answers."""
+        if self.has_copied or data[2] != frames.DRIVE or not data[12] & frames.OPEN:
+            return super().receive(data, sender, now_us)
+        self.has_copied = True
+        copy = data[:12] + bytes([frames.ANSWER]) + data[13:-4]
+        return super().receive(copy + zlib.crc32(copy).to_bytes(4, "little"), sender, now_us)
+
+
+def test_a_refusal_that_a_copy_elicits_keeps_no_loop_from_its_node(tmp_path: Path):
+    key = make_key(tmp_path)
+    node = EarlyCopyNode(key=key)
+    with relayed(node) as relay, open_driver(relay_driver(relay.port, key)) as calls:
+        assert calls.read()[0] == 0
+    assert node.has_copied
 
 
 def test_a_key_that_is_replaced_while_the_loop_runs_takes_effect_at_the_next_start(tmp_path: Path):
