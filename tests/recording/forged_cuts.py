@@ -568,10 +568,10 @@ def _command_answer(paths: Sequence[Path], jobs: int) -> dict[str, Any] | str:
     """Return the report of `rtloop replay`, or the message of its error; its exit code must agree with the report."""
     command = [sys.executable, "-m", "rtloop", "replay", *map(str, paths), "--json", "--jobs", str(jobs)]
     process = subprocess.run(command, capture_output=True, text=True, check=False)
-    if not process.stdout:
-        assert process.returncode == 66, process
-        return process.stderr.removeprefix("rtloop: ").rstrip("\n")
     report = json.loads(process.stdout)
+    if "error" in report:
+        assert process.returncode == 66, process
+        return report["error"]
     assert process.returncode == (0 if report["identical"] else 1), process
     return report
 
