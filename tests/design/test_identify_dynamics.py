@@ -8,6 +8,7 @@ import mpmath
 import numpy as np
 import pytest
 from scipy.optimize import least_squares
+from scipy.signal import cont2discrete, dlsim
 
 from rtloop.design.identification.axis_recording import UnsuitableData
 from rtloop.design.identification.dynamics.identify_dynamics import identify_dynamics
@@ -247,3 +248,21 @@ def test_a_model_of_no_numbers_predicts_nothing() -> None:
     """The optimiser may try a model with infinite gains; `errors` returns None for it."""
     model = Innovations(1e-4, np.array([-100.0 + 0j]), np.array([1.0 + 0j]), np.array([np.inf + 0j]), 0.0)
     assert model.errors(np.ones(10), np.ones(10)) is None
+
+
+def test_a_wrong_level_of_the_way_down_hides_no_pole() -> None:
+    """A mode with a sensor's lag; the drive returns to 0.3 µm, and the model of the hysteresis says 0 µm."""
+    w, lag = 2 * np.pi * 332.46, 2 * np.pi * 1136.0
+    a = np.array([[0, 1, 0], [-w * w, -2 * 0.00438 * w, 0], [lag, 0, -lag]])
+    b, c = np.array([[0], [w * w], [0]]), np.array([[0, 0, 1.0]])
+    drive = np.repeat([0.0, 20.0, 0.3], (1000, 5000, 5000))
+    _, position, _ = dlsim(cont2discrete((a, b, c, np.zeros((1, 1))), FAST_S), drive)
+    noise = 0.009 * np.random.default_rng(7).standard_normal(drive.size)
+    stated = np.where(drive == 20.0, 20.0, 0.0)
+    fit = identify_dynamics(Excitation("down", stated, position[:, 0] + noise, FAST_S))
+    light = min(fit.modes, key=lambda mode: mode.damping)
+    assert (fit.model.order, fit.delay_ticks) == (3, 0)
+    assert light.frequency_hz == pytest.approx(332.46, abs=0.005)
+    assert light.damping == pytest.approx(0.00438, rel=0.005)
+    assert max(mode.frequency_hz for mode in fit.modes) == pytest.approx(1136.0, rel=0.05)
+    assert fit.tests.is_independent

@@ -43,6 +43,7 @@ from rtloop.design.identification.dynamics.prediction_error import (
     prediction_errors,
     refine,
     rms_error,
+    with_held_out_levels,
 )
 from rtloop.design.identification.dynamics.residuals import LARGEST_CROSS_RATIO, residual_tests
 
@@ -125,8 +126,10 @@ def _identify_from_rest(
     eligible = [candidates[i] for i in _independent(models, fitted_part(recording, start))]
     chosen = _choose_candidate(eligible, score, by_aic=criterion != "validation" and start is None)
     model = models[candidates.index(chosen)]
-    if start is not None and (refitted := refine(model, recording)) and _has_settled(refitted, recording):
-        model = refitted
+    if start is not None:
+        recording = with_held_out_levels(model, recording, start)
+        if (refitted := refine(model, recording)) and _has_settled(refitted, recording):
+            model = refitted
     return _build_fit(model, recording, tuple(candidates), delay_ticks, corrected), recording
 
 

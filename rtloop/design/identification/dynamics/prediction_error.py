@@ -6,7 +6,7 @@ Each fit starts from a first guess of the modes: first as if all noise were the 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -184,19 +184,37 @@ def rms_error(model: Innovations, run: Excitation, start: int = 0) -> float:
 
 def judged_rms(model: Innovations, run: Excitation, errors: Real, start: int) -> float:
     """Return the rms of prediction errors (samples,) from sample `start` on, without what follows from wrong levels of
-    the input there: the model of the hysteresis errs by a constant at each level, which no order of D(s) can predict.
-
-    An input of more than MOST_LEVELS levels there has one such error, of its first change.
+    the input there (`_held_out_levels`).
     """
     judged = errors[start:]
     if start:
-        changes = np.flatnonzero(np.diff(run.input[start - 1 :]))
-        changes = changes if changes.size <= MOST_LEVELS else changes[:1]
-        steps = (np.arange(judged.size) >= changes[:, None]).astype(float)
-        columns = [model.simulate_output(step) - model.offset for step in steps]
-        level_errors = model.whiten(np.array(columns), model.predictor_poles()).T
-        judged = judged - level_errors @ np.linalg.lstsq(level_errors, judged, rcond=1e-12)[0]
+        _, responses, sizes = _held_out_levels(model, run, errors, start)
+        judged = judged - responses @ sizes
     return float(np.sqrt(np.mean(judged**2)))
+
+
+def with_held_out_levels(model: Innovations, run: Excitation, start: int) -> Excitation:
+    """Return the recording with the levels of its input from sample `start` on as `model` and the position show them.
+
+    Raises ArithmeticError for an unstable predictor.
+    """
+    steps, _, sizes = _held_out_levels(model, run, prediction_errors(model, run), start)
+    return replace(run, input=np.append(run.input[:start], run.input[start:] + sizes @ steps))
+
+
+def _held_out_levels(model: Innovations, run: Excitation, errors: Real, start: int) -> tuple[Real, Real, Real]:
+    """Return unit steps of the input from `start` on (levels, samples), their effect on the prediction errors (samples,
+    levels), and their sizes (levels,) by least squares.
+
+    The model of the hysteresis errs by a constant at each level, which no order of D(s) can predict. An input of more
+    than MOST_LEVELS levels has one such error, of its first change.
+    """
+    changes = np.flatnonzero(np.diff(run.input[start - 1 :]))
+    changes = changes if changes.size <= MOST_LEVELS else changes[:1]
+    steps = (np.arange(errors.size - start) >= changes[:, None]).astype(float)
+    columns = np.array([model.simulate_output(step) - model.offset for step in steps])
+    responses = model.whiten(columns, model.predictor_poles()).T
+    return steps, responses, np.linalg.lstsq(responses, errors[start:], rcond=1e-12)[0]
 
 
 def prediction_errors(model: Innovations, run: Excitation) -> Real:
