@@ -243,7 +243,7 @@ def require_rising(run: AxisRecording) -> None:
 
 def _without_line(values: Real) -> Real:
     ticks = np.arange(values.size)
-    return np.asarray(values - np.polyval(np.polyfit(ticks, values, 1), ticks), np.float64)
+    return values - np.polyval(np.polyfit(ticks, values, 1), ticks)
 
 
 def wrong_sign(name: str, observation: str) -> UnsuitableData:

@@ -214,7 +214,8 @@ def _held_out_levels(model: Innovations, run: Excitation, errors: Real, start: i
     steps = (np.arange(errors.size - start) >= changes[:, None]).astype(float)
     columns = np.array([model.simulate_output(step) - model.offset for step in steps])
     responses = model.whiten(columns, model.predictor_poles()).T
-    return steps, responses, np.linalg.lstsq(responses, errors[start:], rcond=1e-12)[0]
+    sizes, *_ = np.linalg.lstsq(responses, errors[start:], rcond=1e-12)
+    return steps, responses, np.asarray(sizes, np.float64)
 
 
 def prediction_errors(model: Innovations, run: Excitation) -> Real:
