@@ -114,13 +114,12 @@ def discretise_controller(
     that is held. Raises ValueError for a bad period, method or frequency, a pole or zero that the method cannot map,
     and where no anti-windup exists.
     """
-    _require_valid(period_s, method, prewarp_hz)
+    discrete = discretise_transfer(transfer, period_s, method, prewarp_hz)
     if _is_at_zero(transfer.poles, period_s).any() and (cancelled := _is_at_zero(transfer.zeros, period_s)).any():
         raise ValueError(
             f"zeros: {transfer.zeros[cancelled][0].real:g} rad/s cancels the controller's integrator at 0 rad/s; "
             "remove both"
         )
-    discrete = discretise_transfer(transfer, period_s, method, prewarp_hz)
     a, b, c, d = discrete.system
     return DiscreteController(
         method, float(period_s), prewarp_hz, discrete.zeros, discrete.poles, discrete.gain, discrete.form,
