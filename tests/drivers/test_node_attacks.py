@@ -2,11 +2,18 @@
 
 from __future__ import annotations
 
+import ctypes
+import fcntl
+import multiprocessing
 import os
+import random
 import socket
 import struct
+import time
 import tty
 from collections.abc import Callable, Iterator
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import suppress
 from itertools import product
 from pathlib import Path
 
@@ -34,6 +41,9 @@ SHARING = (socket.SO_REUSEADDR, socket.SO_REUSEPORT)
 ADDRESSES = (("", socket.AF_INET), ("127.0.0.1", socket.AF_INET), ("::", socket.AF_INET6),
              ("::ffff:127.0.0.1", socket.AF_INET6))  # fmt: skip
 """Addresses whose sockets receive datagrams to 127.0.0.1, with their family."""
+NODE_PORT, ONLY_PORT = 5747, 40_000
+CLONE_NEWNET, SIOCSIFFLAGS, IFF_UP = 0x4000_0000, 0x8914, 1
+"""Numbers of Linux: a new network for unshare(2); the request and the flag that switch an interface on."""
 
 
 def bound_as_attacker(port: int) -> list[tuple[str, tuple[int, ...]]]:
@@ -55,6 +65,70 @@ def bound_as_attacker(port: int) -> list[tuple[str, tuple[int, ...]]]:
         return bound
 
     return as_user(ATTACKER, attempt)
+
+
+def enter_namespace_with_one_free_port() -> None:
+    """Move this process into a network of its own, where a socket that asks for any port gets ONLY_PORT."""
+    assert ctypes.CDLL(None, use_errno=True).unshare(CLONE_NEWNET) == 0, os.strerror(ctypes.get_errno())
+    with UNWATCHED(socket.AF_INET, socket.SOCK_DGRAM) as any_socket:
+        fcntl.ioctl(any_socket, SIOCSIFFLAGS, struct.pack("16sH14x", b"lo", IFF_UP))
+    Path("/proc/sys/net/ipv4/ip_local_port_range").write_text(f"{ONLY_PORT} {ONLY_PORT}")
+
+
+def hammer_port(seed: int) -> None:
+    """Bind ONLY_PORT with every option, again and again; end with code 1 if a datagram of the node arrives."""
+    os.setgid(ATTACKER)
+    os.setuid(ATTACKER)
+    draw = random.Random(seed)
+    while True:
+        address, family = draw.choice(ADDRESSES)
+        with UNWATCHED(family, socket.SOCK_DGRAM) as thief:
+            if family == socket.AF_INET6:
+                thief.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_V6ONLY, 0)
+            for option in draw.choice(((), SHARING[:1], SHARING[1:], SHARING)):
+                thief.setsockopt(socket.SOL_SOCKET, option, 1)
+            time.sleep(draw.uniform(0.0, 0.001))
+            for _ in range(200):
+                with suppress(OSError):
+                    thief.bind((address, ONLY_PORT))
+                    thief.connect(("::ffff:127.0.0.1" if family == socket.AF_INET6 else "127.0.0.1", NODE_PORT))
+                    thief.settimeout(0.0003)
+                    if thief.recv(100) == b"node":
+                        os._exit(1)
+
+
+def open_beside_thieves(opens: int) -> int:
+    """Open links at ONLY_PORT between two thieves, and send ten datagrams to each. Returns how many were not received.
+
+    An open that finds the port taken is tried again.
+    """
+    enter_namespace_with_one_free_port()
+    thieves = [multiprocessing.get_context("fork").Process(target=hammer_port, args=(seed,)) for seed in (1, 2)]
+    for thief in thieves:
+        thief.start()
+    lost = 0
+    with UNWATCHED(socket.AF_INET, socket.SOCK_DGRAM) as node:
+        node.bind(("127.0.0.1", NODE_PORT))
+        while opens:
+            try:
+                opened = UdpLink(UdpOptions(host="127.0.0.1", port=NODE_PORT))
+            except DriverError:
+                continue
+            opens -= 1
+            for _ in range(10):
+                node.sendto(b"node", ("127.0.0.1", ONLY_PORT))
+            lost += sum(opened.receive(0.0 if lost else 1.0) != b"node" for _ in range(10))
+            opened.close()
+    for thief in thieves:
+        thief.kill()
+        thief.join()
+    return lost
+
+
+@ROOT_ONLY
+def test_thieves_that_know_the_next_port_get_no_datagram_of_the_node():
+    with ProcessPoolExecutor(1, multiprocessing.get_context("fork")) as other_process:
+        assert other_process.submit(open_beside_thieves, 2000).result() == 0
 
 
 class WatchedSocket(socket.socket):

@@ -6,6 +6,7 @@ has even DRIVEs with the right key for other boots, openings and turns.
 
 from __future__ import annotations
 
+import ctypes
 import random
 import struct
 import zlib
@@ -13,19 +14,57 @@ import zlib
 import pytest
 
 from tests.node.bench import KEY, LOOP, OTHER, OUTPUTS, SAFE, Bench, keyed_node
-from tests.node.frames import ANSWER, APPLY, AT_SAFE, OPEN, PARK, READY, Sample, Seal, Welcome, drive, hello, parse
+from tests.node.frames import (
+    ANSWER,
+    APPLY,
+    AT_SAFE,
+    OPEN,
+    PARK,
+    READY,
+    Sample,
+    Seal,
+    Welcome,
+    cobs,
+    drive,
+    hello,
+    parse,
+)
 
+LONGEST = 36 + 4 * 255
 ACTS = (OPEN, APPLY, APPLY, 0, PARK)
 HOLD_US = 40_000
 FIELDS = ((4, "<I"), (8, "<I"), (12, "<B"), (14, "<H"), (16, "<I"), (20, "<I"), (24, "<i"), (28, "<i"), (32, "<Q"))
 """Offset and type of the fields of a DRIVE for two outputs."""
 
 
+class SerialLine:
+    """The line to a node: frames in COBS, which the node's receiver decodes. Both write whole lines to it."""
+
+    def __init__(self, bench: Bench, draw: random.Random) -> None:
+        self._bench, self._draw = bench, draw
+        self._receiver = ctypes.c_void_p(bench.library.cobs_new())
+        self._frame = ctypes.create_string_buffer(LONGEST)
+
+    def send(self, content: bytes, sender: int | None) -> bytes:
+        """Send a frame; a line of the attacker, which has a sender, is damaged at times. Returns the node's answer."""
+        line = cobs(content)
+        if sender is not None and self._draw.random() < 0.2:
+            damaged = bytearray(self._draw.randbytes(self._draw.randrange(20)) + line)
+            damaged[self._draw.randrange(len(damaged))] = self._draw.randrange(256)
+            line = bytes(damaged) + b"\0"
+        answer = b""
+        for byte in line:
+            if length := self._bench.library.cobs_receive(self._receiver, ctypes.c_uint8(byte), self._frame):
+                answer = self._bench.send_bytes(self._frame.raw[:length])
+        return answer
+
+
 class Attacked:
     """A node with a loop and an attacker. All frames, times and codes are chosen by `draw`."""
 
-    def __init__(self, bench: Bench, draw: random.Random) -> None:
+    def __init__(self, bench: Bench, draw: random.Random, *, is_serial: bool) -> None:
         self.bench, self.draw = bench, draw
+        self._line = SerialLine(bench, draw) if is_serial else None
         self.history: list[bytes] = []
         self.attacks = self.parks = 0
         self.session = self.sequence = self.boot = 1
@@ -38,6 +77,12 @@ class Attacked:
         assert self.bench.start(boot=self.boot, key=KEY)
         self.expected = list(SAFE)
 
+    def _send_bytes(self, content: bytes, sender: int | None = None) -> bytes:
+        """Send a frame, by `sender` if it is the attacker's; return the node's answer."""
+        if self._line:
+            return self._line.send(content, sender)
+        return self.bench.send_bytes(content, LOOP if sender is None else sender)
+
     def send(self, act: int, codes: list[int], sequence: int) -> Sample:
         """Send a DRIVE of the loop, which the node must accept, and record it.
 
@@ -47,7 +92,7 @@ class Attacked:
         turn, sequence = divmod(sequence, 2**32)
         content = drive(self.session, sequence, act | ANSWER, codes, 0, HOLD_US, self.seal._replace(turn=turn))
         self.history.append(content)
-        answer = self.bench.send_bytes(content)
+        answer = self._send_bytes(content)
         sample = parse(answer, self.seal._replace(turn=turn))
         assert isinstance(sample, Sample)
         return sample
@@ -58,7 +103,7 @@ class Attacked:
         self.session = draw.choice((self.session, draw.randint(1, 2**32 - 1)))
         self.sequence = draw.choice((0, draw.getrandbits(32), 2**32 - draw.randint(2, 40)))
         self.seal = Seal(KEY, self.boot)
-        welcome = parse(self.bench.send_bytes(hello(self.session)), self.seal)
+        welcome = parse(self._send_bytes(hello(self.session)), self.seal)
         assert isinstance(welcome, Welcome)
         self.seal = self.seal._replace(opening=welcome.opening)
         assert self.send(OPEN, SAFE, self.sequence).flags == READY | AT_SAFE
@@ -98,7 +143,7 @@ class Attacked:
         writes = self.bench.counters.writes
         for _ in range(count):
             content = self.forged()
-            self.bench.send_bytes(content, self.draw.choice((LOOP, LOOP, OTHER)))
+            self._send_bytes(content, self.draw.choice((LOOP, LOOP, OTHER)))
             assert self.bench.counters.writes == writes, content.hex()
         self.attacks += count
         assert self.bench.codes == self.expected
@@ -132,9 +177,9 @@ class Attacked:
             self.restart()
 
 
-def attack_a_node(bench: Bench, seed: int, count: int) -> None:
+def attack_a_node(bench: Bench, seed: int, count: int, *, is_serial: bool) -> None:
     """Let a loop run session after session until the attacker has sent `count` frames."""
-    attacked = Attacked(bench, random.Random(seed))
+    attacked = Attacked(bench, random.Random(seed), is_serial=is_serial)
     attacked.restart()
     while attacked.attacks < count:
         attacked.drive_under_attack()
@@ -144,12 +189,14 @@ def attack_a_node(bench: Bench, seed: int, count: int) -> None:
 
 @keyed_node
 @pytest.mark.parametrize("seed", [1, 2])
-def test_no_output_follows_an_attacker_and_each_park_is_obeyed(bench: Bench, seed: int):
-    attack_a_node(bench, seed, 10_000)
+@pytest.mark.parametrize("is_serial", [False, True], ids=["udp", "serial"])
+def test_no_output_follows_an_attacker_and_each_park_is_obeyed(bench: Bench, seed: int, is_serial: bool):
+    attack_a_node(bench, seed, 10_000, is_serial=is_serial)
 
 
 @keyed_node
 @pytest.mark.soak
 @pytest.mark.timeout(3600)
-def test_no_output_follows_a_million_frames_of_an_attacker(bench: Bench):
-    attack_a_node(bench, 3, 1_000_000)
+@pytest.mark.parametrize("is_serial", [False, True], ids=["udp", "serial"])
+def test_no_output_follows_a_million_frames_of_an_attacker(bench: Bench, is_serial: bool):
+    attack_a_node(bench, 3, 1_000_000, is_serial=is_serial)
