@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from mcap.stream_reader import StreamReader
 
 from rtloop.configuration.cautions import option_cautions
 from rtloop.configuration.file import load
@@ -157,6 +158,39 @@ def test_the_path_starts_at_the_folder_of_the_configuration_and_the_key_is_nowhe
     assert driver._options.key == key
     assert digits.encode() not in stored
     assert bytes.fromhex(digits) not in stored
+
+
+def test_a_recording_of_a_node_with_a_key_names_its_file_and_never_has_the_key(tmp_path: Path):
+    digits = Path(make_key(tmp_path)).read_text().strip()
+    place = f'host = "127.0.0.1"\nport = {free_udp_port()}\nwait_s = 60.0\nwatchdog_ms = 5000.0\nhold_ticks = 1000\n'
+    config = configuration(tmp_path, place + 'key = "node.key"')
+    node = start_rtloop("hil", "serve", config, "--udp")
+    try:
+        ran = completed(sys.executable, "-m", "rtloop", "run", config, "--duration", "0.5", "--out", tmp_path / "out")
+    finally:
+        node.terminate()
+        node.communicate()
+    assert "Traceback" not in ran.stderr
+    (recording,) = (tmp_path / "out").glob("*.mcap")
+    with recording.open("rb") as file:
+        contents = [content for record in StreamReader(file).records for content in _contents(record)]
+    written = b"".join([recording.read_bytes(), *contents, ran.stdout.encode(), ran.stderr.encode()])
+    assert b"node.key" in written
+    assert len(contents) > 20
+    for secret in (digits.encode(), bytes.fromhex(digits), bytes.fromhex(digits)[::-1], bytes.fromhex(digits)[:8]):
+        assert secret not in written
+
+
+def _contents(record: object) -> list[bytes]:
+    """Return all texts and bytes of an MCAP record, those of a map too."""
+    values = [
+        part
+        for value in vars(record).values()
+        for part in ([*value.keys(), *value.values()] if isinstance(value, dict) else [value])
+    ]
+    return [
+        str(value).encode() if isinstance(value, str) else value for value in values if isinstance(value, str | bytes)
+    ]
 
 
 @pytest.mark.parametrize(
