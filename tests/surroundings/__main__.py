@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import argparse
 import os
+import random
 import shutil
 import signal
 import subprocess
@@ -40,6 +41,8 @@ def main() -> int:
     parser.add_argument("--commands", help="commands, by their beginnings, separated by commas")
     parser.add_argument("--short", action="store_true", help="leave out commands that compute for seconds")
     parser.add_argument("--stock", type=Path, help="folder of the files that commands read, made if it is missing")
+    parser.add_argument("--share", type=float, default=1.0, help="part of the cells that is tried, drawn at random")
+    parser.add_argument("--seed", type=int, default=1, help="seed of this draw")
     parser.add_argument("--jobs", type=int, default=len(os.sched_getaffinity(0)))
     parser.add_argument("--text", action="store_true", help="print the messages of failed cells")
     options = parser.parse_args()
@@ -64,7 +67,9 @@ def main() -> int:
             make_stock(stock, environment)
         with _service(folder, stock, environment) as socket:
             bench = Bench(folder, stock, environment, socket)
-            return Table(bench, commands, options.jobs, options.text).run(rows)
+            draw = random.Random(options.seed)
+            drawn = {name: [word for word in commands if draw.random() < options.share] for name in rows}
+            return Table(bench, options.jobs, options.text).run(rows, drawn)
 
 
 class _service:
@@ -90,44 +95,43 @@ class _service:
 class Table:
     """Cells of the table, run by several threads; clients of the one service run one after the other."""
 
-    def __init__(self, bench: Bench, commands: list[Command], jobs: int, shows_text: bool) -> None:
+    def __init__(self, bench: Bench, jobs: int, shows_text: bool) -> None:
         self._bench, self._jobs, self._shows_text = bench, jobs, shows_text
-        self._alone = [command for command in commands if not command.shared]
-        self._shared = [command for command in commands if command.shared]
         self._number = 0
 
-    def run(self, rows: dict[str, Surrounding]) -> int:
-        """Run the clean cells twice, then each row; print what failed. Returns 1 if a cell failed."""
+    def run(self, rows: dict[str, Surrounding], commands: dict[str, list[Command]]) -> int:
+        """Run the clean cells twice, then the commands of each row; print what failed. Returns 1 if a cell failed."""
         begin_s = time.monotonic()
-        clean = list(zip(self._row(CLEAN), self._row(CLEAN), strict=True))
-        commands = [*self._alone, *self._shared]
-        for command, pair in zip(commands, clean, strict=True):
+        tried = list(dict.fromkeys(command for row in commands.values() for command in row))
+        clean = dict(zip(tried, zip(self._row(CLEAN, tried), self._row(CLEAN, tried), strict=True), strict=True))
+        for command, pair in clean.items():
             if found := faults(pair[0], pair, CLEAN) or pair[0].code != pair[1].code:
                 print(f"clean: {command.words}: {found}\n{pair[0].stderr[-1500:]}", flush=True)
-        tried = failed = 0
+        failed = 0
         for name, surrounding in rows.items():
-            endings = self._row(surrounding)
+            endings = zip(commands[name], self._row(surrounding, commands[name]), strict=True)
             bad = [
                 (command, ending, found)
-                for command, ending, pair in zip(commands, endings, clean, strict=True)
-                if (found := faults(ending, pair, surrounding))
+                for command, ending in endings
+                if (found := faults(ending, clean[command], surrounding))
             ]
-            tried, failed = tried + len(endings), failed + len(bad)
-            print(f"{name:32} {len(endings):4} cells {len(bad):4} failed", flush=True)
+            failed += len(bad)
+            print(f"{name:32} {len(commands[name]):4} cells {len(bad):4} failed", flush=True)
             for command, ending, found in bad:
                 print(f"    {command.words}: {'; '.join(found)}", flush=True)
                 if self._shows_text:
                     print("        " + ending.stderr[-1200:].replace("\n", "\n        "), flush=True)
         minutes = (time.monotonic() - begin_s) / 60
-        print(
-            f"{len(rows)} surroundings, {len(commands)} commands: {tried} cells, {failed} failed; {minutes:.0f} minutes"
-        )
+        cells = sum(map(len, commands.values()))
+        print(f"{len(rows)} surroundings, {len(tried)} commands: {cells} cells, {failed} failed; {minutes:.0f} minutes")
         return bool(failed)
 
-    def _row(self, surrounding: Surrounding) -> list[Ending]:
+    def _row(self, surrounding: Surrounding, commands: list[Command]) -> list[Ending]:
         with ThreadPoolExecutor(self._jobs) as pool, ThreadPoolExecutor(1) as clients:
-            futures = [pool.submit(self._cell, command, surrounding) for command in self._alone]
-            futures += [clients.submit(self._cell, command, surrounding) for command in self._shared]
+            pools = [clients if command.shared else pool for command in commands]
+            futures = [
+                chosen.submit(self._cell, command, surrounding) for chosen, command in zip(pools, commands, strict=True)
+            ]
             return [future.result() for future in futures]
 
     def _cell(self, command: Command, surrounding: Surrounding) -> Ending:
