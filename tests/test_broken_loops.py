@@ -82,7 +82,7 @@ def test_what_simulated_steps_miss_is_said_where_it_does_not_count(tmp_path: Pat
     assert result.exit_code == 0, result.output
     answer = result.stdout.strip().splitlines()[-1]
     assert answer.startswith(
-        "as it will run, the linear loop meets its specification; the simulated steps, which do not count, miss "
+        "as it will run, the loop meets its specification; simulated steps that do not count miss "
     )
     assert "overshoot of 1 µm steps" in answer
 
@@ -94,9 +94,11 @@ def test_every_broken_loop_is_reported(name: str, tmp_path: Path) -> None:
     assert "meets its specification" not in result.stdout
     assert "the loop misses" in result.stdout or "the loop is UNSTABLE" in result.stdout
     assert PROBLEMS[name] in result.stderr
+    assert result.exit_code == 1
     assert CliRunner().invoke(main, ["check", str(config), "--strict"]).exit_code == 78
     (axis,) = json.loads(CliRunner().invoke(main, ["check", str(config), "--json"]).stdout)["axes"]
     assert axis["meets"] is False
+    assert axis["problems"]
 
     preview = loop_figures(prepare(load(config)), 0)
     assert any(PROBLEMS[name] in problem for problem in preview["problems"])
@@ -111,6 +113,33 @@ def test_every_broken_loop_is_reported(name: str, tmp_path: Path) -> None:
     if not tripped:
         assert np.isinf(metrics.settling_time_ms)
         assert metrics.static_error_percent > 50.0
+
+
+@pytest.mark.parametrize(("ticks", "is_reported"), [(1.0, False), (0.7, False), (0.2, True), (None, True)])
+def test_dynamics_that_carry_a_delay_contradict_no_rig(ticks: float | None, is_reported: bool, tmp_path: Path) -> None:
+    """The model states two of the rig's three samples; a zero at 2/T beside a pole at -2/T delays by the time T."""
+    gain, numerator, denominator = "gain = -20.7\n", "numerator = [", "denominator = ["
+    model = TEXT[TEXT.index(MODEL) : TEXT.index("[", TEXT.index(denominator, TEXT.index(MODEL)) + 20)]
+    changed = model.replace(MODEL, f"{MODEL}delay_ticks = 2\n")
+    if ticks is not None:
+        place = 2 / (ticks * 1e-4)
+        changed = changed.replace("gain = -", "gain = ").replace(numerator, f"{numerator}[1.0, {-place}], ")
+        changed = changed.replace(denominator, f"{denominator}[1.0, {place}], ")
+    config = write_configuration(tmp_path, (DELAY, "latency_ticks = 3"), (model, changed))
+    result = CliRunner().invoke(main, ["check", str(config)])
+    assert ("axis.x.model.delay_ticks: 2, but" in result.stderr) == is_reported, result.stderr
+
+
+def test_a_step_beyond_the_reach_is_missed(tmp_path: Path, few_simulated_steps: None) -> None:
+    config = write_configuration(tmp_path)
+    spec = tmp_path / "spec.toml"
+    for height_um, exit_code in ((20.0, 0), (60.0, 1)):
+        command = f"[specification.command]\nreference_um = {height_um}\ncommand_um = {10 * height_um}\n"
+        spec.write_text(SPECIFICATION.replace("3.0", "30.0") + command)
+        result = CliRunner().invoke(main, ["design", "verify", str(config)])
+        assert result.exit_code == exit_code, result.output
+        answer = result.stdout.strip().splitlines()[-1]
+        assert ("steps of 60 µm, which the command's range of" in answer) == bool(exit_code)
 
 
 def test_a_reversed_gain_is_a_fault(tmp_path: Path) -> None:

@@ -17,10 +17,11 @@ from rtloop.workbench.tables import console
 @click.option("--strict", is_flag=True, help="Treat warnings as faults.")
 @JSON
 @report_errors
-def check(config: Path, strict: bool, as_json: bool) -> None:
+def check(config: Path, strict: bool, as_json: bool) -> int:
     """Show and judge the loop of CONFIG; touches no hardware.
 
-    Shows limits, C(z) against C(s), margins on the model, and the verdict by the axis's specification.
+    Shows limits, C(z) against C(s), margins on the model, and the verdict by the axis's specification. Exit 1 where
+    the hardware of CONFIG contradicts the judged loop, or the loop does not follow its reference.
     """
     require_readable(config)
     from rtloop.workbench.check import check as judge
@@ -28,6 +29,7 @@ def check(config: Path, strict: bool, as_json: bool) -> None:
     result = judge(config, strict=strict)
     if as_json:
         echo_json(result.as_dict())
-        return
-    result.print_text(console())
-    print_warnings(result.warnings)
+    else:
+        result.print_text(console())
+        print_warnings(result.warnings)
+    return int(any(judgement.problems for judgement in result.axes.values()))

@@ -21,6 +21,9 @@ LARGEST_STROKE_RATIO = 3.0
 """Strokes that differ by more than this factor belong to different actuators."""
 SAME_SCALE = 0.01
 """Relative difference up to which two scales of a sensor are the same."""
+COMPARED = np.linspace(0.1, 0.5, 9)
+"""Frequencies at which delays of plants are compared, relative to the lower of the lowest mode and a tenth of the rate.
+"""
 
 
 class RigComparison(NamedTuple):
@@ -34,24 +37,19 @@ class RigComparison(NamedTuple):
     on_rig: AxisCheck | None
 
 
-def contradictions(configuration: Configuration, axis: AxisOptions, check: AxisCheck) -> list[str]:
-    """Return a line for each contradiction between the axis and its hardware, [] for none: the weights against the
-    simulated actuator and the sensor's range, `um_per_v` against the simulated sensor, the delay against rig or driver.
-
-    A contradiction means that another loop than the checked one would run.
-    """
-    return [
-        *_weights(configuration, axis),
-        *_sensor_scale(configuration, axis),
-        *_delay(configuration, axis, check),
-    ]
-
-
 def compare_with_rig(configuration: Configuration, axis: AxisOptions, check: AxisCheck) -> RigComparison:
     """Return the contradictions of an axis, and its check on the simulated rig if there are contradictions or the loop
     is unstable on the rig.
+
+    A contradiction means that another loop than the checked one would run: by the weights against the simulated
+    actuator and the sensor's range, `um_per_v` against the simulated sensor, the delay against rig or driver.
     """
-    lines, on_rig = contradictions(configuration, axis, check), _check_on_rig(configuration, axis, check)
+    on_rig = _check_on_rig(configuration, axis, check)
+    lines = [
+        *_weights(configuration, axis),
+        *_sensor_scale(configuration, axis),
+        *_delay(configuration, axis, check, on_rig),
+    ]
     if not lines and on_rig is not None and on_rig.on_model is not None and on_rig.on_model.is_stable:
         on_rig = None
     return RigComparison(lines, on_rig)
@@ -179,13 +177,29 @@ def _sensor_scale(configuration: Configuration, axis: AxisOptions) -> Iterator[s
     )
 
 
-def _delay(configuration: Configuration, axis: AxisOptions, check: AxisCheck) -> Iterator[str]:
-    """Yield a line for a model that states less delay than the simulated rig or the driver has.
+def _delay(
+    configuration: Configuration, axis: AxisOptions, check: AxisCheck, on_rig: AxisCheck | None
+) -> Iterator[str]:
+    """Yield a line for a model that states less delay than the driver has, unless the model's dynamics are as late as
+    the simulated rig, to half a sample.
 
     The margins are computed with the model's delay.
     """
-    if axis.model is not None and check.delay_ticks < driver_delay_ticks(configuration):
+    if axis.model is None or check.delay_ticks >= driver_delay_ticks(configuration):
+        return
+    if on_rig is None or _later_ticks(on_rig, check, configuration.loop.rate_hz) > 0.5:
         yield delay_difference(configuration, axis, axis.model.delay_ticks, check)
+
+
+def _later_ticks(later: AxisCheck, earlier: AxisCheck, rate_hz: float) -> float:
+    """Return by how many samples the plant of one check is later than that of another, by their phases at COMPARED."""
+    assert later.plant is not None
+    assert earlier.plant is not None
+    modes = [abs(pole) for plant in (later.plant, earlier.plant) for pole in plant.poles if pole.imag > 0]
+    radians = COMPARED * min([*modes, 2 * np.pi * rate_hz / 10])
+    ratio = earlier.plant.response(1j * radians) / later.plant.response(1j * radians)
+    phases = np.unwrap(np.angle(ratio))
+    return later.delay_ticks - earlier.delay_ticks + float(np.median(phases / radians)) * rate_hz
 
 
 def delay_difference(configuration: Configuration, axis: AxisOptions, model_ticks: int, check: AxisCheck) -> str:

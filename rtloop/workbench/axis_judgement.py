@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 from rtloop.analysis.loop_analysis import LoopAnalysis
 from rtloop.analysis.perturbation import PercentRange, loop_builder, plant_changes, stability_range
 from rtloop.configuration.axis import AxisOptions
+from rtloop.configuration.cautions import rig_problem, tracking_problem
 from rtloop.configuration.checks import AxisCheck
 from rtloop.configuration.prepare import Prepared
 from rtloop.configuration.simulated import compare_with_rig
@@ -26,7 +27,9 @@ class AxisJudgement:
     "continuous" for C(s), "running" for the loop as it runs; an end is None if the search found no limit.
     `is_stable_on_rig` is None where configuration and simulated rig agree and the loop is stable there, and where no
     rig or loop is known; `verification` is None without a specification or loop. `spent` is the delay that this host
-    adds, and the loop's delay margin; None without a measurement or a stable loop.
+    adds, and the loop's delay margin; None without a measurement or a stable loop. `problems` has a sentence for each
+    contradiction between axis and hardware, because of which another loop would run, and for a loop that does not
+    follow its reference on its model or on the simulated rig.
     """
 
     axis: AxisOptions
@@ -35,6 +38,7 @@ class AxisJudgement:
     is_stable_on_rig: bool | None
     verification: Verification | None
     spent: SpentMargin | None
+    problems: tuple[str, ...] = ()
 
     @property
     def running(self) -> LoopAnalysis | None:
@@ -84,6 +88,7 @@ class AxisJudgement:
             and {"axes": list(coupled.axes), "margins": coupled.margins and coupled.margins.as_dict()},
             "meets": self.meets_specification,
             "missed": self.missed,
+            "problems": list(self.problems),
             "resonance_shift_tolerated_percent": {name: list(value) for name, value in self.shifts.items()},
         }
 
@@ -96,13 +101,17 @@ def judge_axis(prepared: Prepared, axis: AxisOptions, check: AxisCheck, host: Ho
     Raises ConfigError for an invalid specification, and where neither axis nor specification has a model of the plant;
     InputFileError for a specification that cannot be read.
     """
+    comparison = compare_with_rig(prepared.configuration, axis, check)
+    loop_problems = (tracking_problem(check), rig_problem(axis, check, comparison))
+    on_rig = comparison.on_rig
     return AxisJudgement(
         axis=axis,
         check=check,
         shifts=_tolerated_shifts(check),
-        is_stable_on_rig=_stability_on_rig(prepared, axis, check),
+        is_stable_on_rig=None if on_rig is None or on_rig.on_model is None else on_rig.on_model.is_stable,
         verification=_verify_axis(prepared, axis, check),
         spent=host and spent_margin(check, host),
+        problems=(*comparison.contradictions, *filter(None, loop_problems)),
     )
 
 
@@ -136,12 +145,3 @@ def _tolerated_shifts(check: AxisCheck) -> dict[str, PercentRange]:
     if check.controller is None:
         return {"running": running}
     return {"continuous": stability_range(loop_builder(check.controller), check.plant, resonance), "running": running}
-
-
-def _stability_on_rig(prepared: Prepared, axis: AxisOptions, check: AxisCheck) -> bool | None:
-    """Whether the loop of an axis is stable on the simulated rig: False if not, True if so in spite of contradictions.
-
-    None if it is stable and nothing contradicts the rig, for other drivers, and where no linear loop is known.
-    """
-    on_rig = compare_with_rig(prepared.configuration, axis, check).on_rig
-    return None if on_rig is None or on_rig.on_model is None else on_rig.on_model.is_stable

@@ -210,19 +210,19 @@ def test_a_model_stands_for_hardware() -> None:
 @pytest.mark.parametrize(
     ("specification", "simulation", "heights_um", "counts"),
     [
-        ({}, {}, (1.0, 5.0, 20.0, 40.0), False),
-        ({"command": {"reference_um": 18.0, "command_um": 20.0}}, {}, (1.0, 5.0, 20.0, 40.0, 18.0), False),
-        ({"command": {"reference_um": 40.1, "command_um": 50.0}}, {}, (1.0, 5.0, 20.0, 40.0), False),
-        ({"command": {"reference_um": 18.0, "command_um": 20.0}}, {"steps_um": [3.0]}, (3.0,), False),
-        ({}, {"residual_percent": 0.0}, (1.0, 5.0, 20.0, 40.0), True),
-        ({}, {"residual_percent": 3.0, "judged": False}, (1.0, 5.0, 20.0, 40.0), False),
-        ({}, {"judged": True}, (1.0, 5.0, 20.0, 40.0), True),
+        ({}, {}, (1.0, 5.0, 20.0, 40.0), ()),
+        ({"command": {"reference_um": 18.0, "command_um": 20.0}}, {}, (1.0, 5.0, 20.0, 40.0, 18.0), (18.0,)),
+        ({"command": {"reference_um": 40.1, "command_um": 50.0}}, {}, (1.0, 5.0, 20.0, 40.0), (40.0,)),
+        ({"command": {"reference_um": 18.0, "command_um": 20.0}}, {"steps_um": [3.0]}, (3.0,), (3.0,)),
+        ({}, {"residual_percent": 0.0}, (1.0, 5.0, 20.0, 40.0), (1.0, 5.0, 20.0, 40.0)),
+        ({}, {"residual_percent": 3.0, "judged": False}, (1.0, 5.0, 20.0, 40.0), ()),
+        ({}, {"judged": True}, (1.0, 5.0, 20.0, 40.0), (1.0, 5.0, 20.0, 40.0)),
     ],
 )
 def test_the_step_that_is_asked_for_is_simulated_and_judged(specification, simulation, heights_um, counts) -> None:
-    """The specification's height is simulated too; a stated residual hysteresis makes the steps count."""
+    """The specification's own height counts; named heights, or a stated residual hysteresis, make all of them count."""
     design = DesignOptions.model_validate({"specification": specification, "simulation": simulation})
-    assert (design.step_heights_um, design.judges_simulated_steps) == (heights_um, counts)
+    assert (design.step_heights_um, design.counted_heights_um) == (heights_um, counts)
 
 
 def test_what_cannot_run_is_not_simulated() -> None:

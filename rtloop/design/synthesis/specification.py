@@ -192,8 +192,8 @@ class SimulationOptions(Options):
     steps_um: Annotated[Numbers, Field(min_length=1, max_length=16)] | None = None
     """Heights of the steps; default STEP_HEIGHTS_UM and specification.command.reference_um."""
     judged: bool | None = None
-    """Whether simulated steps must meet static_error_percent, settling_ms and overshoot_percent. Default: yes if
-    residual_percent is given, because only then does the simulation have the stage's hysteresis.
+    """Whether simulated steps must meet static_error_percent, settling_ms and overshoot_percent. Default: those of
+    specification.command.reference_um; all if steps_um or residual_percent is given.
     """
     residual_percent: float = Field(default=0.0, ge=0, lt=100)
     """Hysteresis h/H left by the inverse, as a compensation experiment measures it. For drivers other than a
@@ -306,13 +306,21 @@ class DesignOptions(Options):
         return (*STEP_HEIGHTS_UM, command.reference_um)
 
     @property
-    def judges_simulated_steps(self) -> bool:
-        """Whether simulated steps must meet the specification: `simulation.judged`, else True if
-        `simulation.residual_percent` is given.
+    def counted_heights_um(self) -> tuple[float, ...]:
+        """Heights of the simulated steps that must meet the specification: `simulation.judged` says all or none.
+
+        Without it, all if `simulation` names heights or a residual hysteresis, else those of `specification.command`.
         """
-        if self.simulation.judged is not None:
-            return self.simulation.judged
-        return "residual_percent" in self.simulation.model_fields_set
+        simulation, command = self.simulation, self.specification.command
+        if simulation.judged is not None:
+            return self.step_heights_um if simulation.judged else ()
+        if simulation.model_fields_set & {"steps_um", "residual_percent"}:
+            return self.step_heights_um
+        return tuple(
+            height
+            for height in self.step_heights_um
+            if command and math.isclose(command.reference_um, height, rel_tol=SAME_HEIGHT)
+        )
 
 
 def build_weights(design: DesignOptions) -> Weights:

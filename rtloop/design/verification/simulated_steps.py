@@ -54,7 +54,7 @@ class SimulationResult:
     rest.
 
     `truth` names the simulated system, `command_range` has the static commands that are possible. `required` has the
-    limits, which count only if `is_judged`.
+    limits, which count for steps of `counted_heights_um` alone.
     """
 
     truth: str
@@ -64,7 +64,7 @@ class SimulationResult:
     noise_x_nm: float
     noise_v_nm: float
     required: Mapping[str, Limit]
-    is_judged: bool
+    counted_heights_um: tuple[float, ...]
 
     def is_met(self, step: SimulatedStep, name: str) -> bool | None:
         """Whether a step meets the limit on figure `name`, judged or not; None without limit."""
@@ -72,25 +72,33 @@ class SimulationResult:
 
     @property
     def violations(self) -> list[str]:
-        """Requirements that count and are not met: `missed`, or [] without `is_judged`."""
-        return self.missed if self.is_judged else []
+        """Requirements that count and are not met, as `_missed` has them, and counted heights outside the range."""
+        return self._missed(counts=True) + [
+            f"steps of {height:g} µm, which the command's range of {self.command_range} has no room for"
+            for height in self.omitted_heights_um
+            if height in self.counted_heights_um
+        ]
 
     @property
-    def missed(self) -> list[str]:
-        """Requirements that simulated steps do not meet, whatever `is_judged` says: a text for each height and figure,
-        then a text for each height whose steps trip.
-        """
+    def uncounted_violations(self) -> list[str]:
+        """Requirements that steps of other heights do not meet, as `_missed` has them."""
+        return self._missed(counts=False)
+
+    def _missed(self, *, counts: bool) -> list[str]:
+        """Return a text for each height and figure that misses its limit, then one for each height whose steps trip."""
+        steps = [step for step in self.steps if (step.height_um in self.counted_heights_um) == counts]
         return [
             f"{QUANTITIES[name][0]} of {step.height_um:g} µm steps"
-            for step in self.steps
+            for step in steps
             for name in JUDGED_QUANTITIES
             if self.is_met(step, name) is False
-        ] + [f"steps of {step.height_um:g} µm, which trip" for step in self.steps if step.trips]
+        ] + [f"steps of {step.height_um:g} µm, which trip" for step in steps if step.trips]
 
     def as_dict(self) -> dict[str, object]:
         """Return the result for JSON: `truth`; `steps`, each with the fields of SimulatedStep and `met` {figure:
         whether it meets its limit}, without figures that have no limit; `left_out_um`, the omitted heights; `range_um`
-        [low, high]; `noise_x_nm`; `noise_v_nm`; `judged`. Infinite figures are still infinite, not null.
+        [low, high]; `noise_x_nm`; `noise_v_nm`; `judged`, whether any height counts; `counted_um`, these. Infinite
+        figures are still infinite, not null.
         """
         steps = [
             {
@@ -106,5 +114,6 @@ class SimulationResult:
             "range_um": list(self.command_range),
             "noise_x_nm": self.noise_x_nm,
             "noise_v_nm": self.noise_v_nm,
-            "judged": self.is_judged,
+            "judged": bool(self.counted_heights_um),
+            "counted_um": list(self.counted_heights_um),
         }

@@ -49,10 +49,9 @@ def simulate(bench: Bench, axis: AxisOptions, slowest_s: float, design: DesignOp
     noise decides is run more often. Raises ValueError for a run whose recorded reference has no step, and for a
     hysteresis model without inverse.
     """
-    heights_um, is_judged = design.step_heights_um, design.judges_simulated_steps
     dwell_s = min(max(TIME_CONSTANTS * slowest_s, SHORTEST_DWELL_S), LONGEST_DWELL_S)
     command_range = _command_range(axis)
-    levels_by_height = {height: _levels(axis, command_range, height) for height in sorted(set(heights_um))}
+    levels_by_height = {height: _levels(axis, command_range, height) for height in sorted(set(design.step_heights_um))}
     simulated_steps = []
     for height, levels in levels_by_height.items():
         if levels is None:
@@ -66,10 +65,10 @@ def simulate(bench: Bench, axis: AxisOptions, slowest_s: float, design: DesignOp
     truth = "the configured rig" if bench.is_configured else "a rig built from the axis's models"
     omitted = tuple(height for height, levels in levels_by_height.items() if levels is None)
     noise_x_nm, noise_v_nm = _noise_at_rest_nm(bench, axis.name, max(command_range, key=abs))
-    required = required_limits(design.specification)
     return SimulationResult(
-        truth, tuple(simulated_steps), omitted, command_range, noise_x_nm, noise_v_nm, required, is_judged
-    )
+        truth, tuple(simulated_steps), omitted, command_range, noise_x_nm, noise_v_nm,
+        required_limits(design.specification), design.counted_heights_um,
+    )  # fmt: skip
 
 
 def _noise_at_rest_nm(bench: Bench, axis: str, reach_um: float) -> list[float]:

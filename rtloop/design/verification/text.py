@@ -175,10 +175,13 @@ def simulation_notes(verification: Verification) -> list[str]:
         heights = ", ".join(f"{height:g}" for height in result.omitted_heights_um)
         notes.append(f"Steps of {heights} µm were left out: the command's range is {result.command_range}.")
     notes += _static_error_notes(verification)
-    if result.required and not result.is_judged:
+    if result.required and (
+        uncounted := [step for step in result.steps if step.height_um not in result.counted_heights_um]
+    ):
+        heights = ", ".join(f"{step.height_um:g}" for step in uncounted)
         notes.append(
-            "The verdicts on the simulated steps do not count for the verdict on the loop; set [simulation] judged = "
-            "true in the specification to count them."
+            f"Steps of {heights} µm do not count for the verdict on the loop; set [simulation] judged = true in the "
+            "specification to count them."
         )
     return notes
 
@@ -284,10 +287,7 @@ def answer(verification: Verification, place: str = "as it will run") -> str:
         return f"not judged: {'; '.join(verification.contradictions)}"
     if all(row.limit is None for row in verification.rows):
         return "stable; nothing is specified"
-    missed = [] if verification.simulated is None else verification.simulated.missed
+    missed = [] if verification.simulated is None else verification.simulated.uncounted_violations
     if missed:
-        return (
-            f"{place}, the linear loop meets its specification; the simulated steps, which do not count, miss "
-            f"{', '.join(missed)}"
-        )
+        return f"{place}, the loop meets its specification; simulated steps that do not count miss {', '.join(missed)}"
     return f"{place}, the loop meets its specification"
