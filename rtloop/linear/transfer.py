@@ -18,7 +18,7 @@ import numpy.typing as npt
 from rtloop.foundation.arrays import Complex
 from rtloop.foundation.modal import conjugate_pairs, quadratic_roots
 from rtloop.linear.realisation import System
-from rtloop.linear.zeros import zeros_and_gain
+from rtloop.linear.zeros import factored_response, zeros_and_gain
 
 MAX_ORDER = 200
 """Largest order: far above the order of controllers that run, and roots still take only milliseconds."""
@@ -138,17 +138,6 @@ def require_order(order: int) -> None:
     """Raise ValueError for an order above MAX_ORDER, whose roots would take seconds."""
     if order > MAX_ORDER:
         raise ValueError(f"transfer function: order {order}; allowed: up to {MAX_ORDER}")
-
-
-def factored_response(zeros: Complex, poles: Complex, gain: float, complex_points: npt.ArrayLike) -> Complex:
-    """Return gain·Π(x − z)/Π(x − p) at complex points, in their shape, one ratio at a time to avoid overflow."""
-    points = np.asarray(complex_points, dtype=complex)
-    value = np.full(points.shape, complex(gain))
-    for i, pole in enumerate(poles):
-        value *= (points - zeros[i] if i < zeros.size else 1.0) / (points - pole)
-    for zero in zeros[poles.size :]:
-        value *= points - zero
-    return value
 
 
 def _finite(name: str, values: npt.ArrayLike) -> npt.NDArray[np.float64]:

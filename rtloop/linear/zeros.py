@@ -1,11 +1,19 @@
-"""Zeros and gain of a state space with one input and one output."""
+"""Zeros and gain of a state space with one input and one output, and the response of zeros, poles and gain."""
 
 from __future__ import annotations
 
+from contextlib import suppress
+
 import numpy as np
+import numpy.typing as npt
 
 from rtloop.foundation.arrays import Complex, Real
 from rtloop.linear.realisation import System
+
+LEAST_RATIO = 1e3
+POINTS = 25
+NOWHERE = 1e-12
+"""Zeros beyond the largest pole divided by this are at infinity."""
 
 
 def zeros_and_gain(system: System) -> tuple[Complex, float]:
@@ -16,7 +24,8 @@ def zeros_and_gain(system: System) -> tuple[Complex, float]:
     Zeros at infinity are removed one at a time (Emami-Naeini & Van Dooren, Automatica 18, 1982, for one input and one
     output): a reflection turns b into (β, 0, …, 0); while d = 0, the first state is the input of the other states, and
     β is a factor of the gain. Once d ≠ 0, the zeros are the generalised eigenvalues of [A b; c d] and [I 0; 0 0], which
-    are the eigenvalues of A − b c/d.
+    are the eigenvalues of A − b c/d. Beside a response far above d, these lose their digits; they are then found
+    from the reciprocals 1/(x − x₀), whose system has the direct gain G(x₀) (`_zeros_around`).
     """
     a, b, c, d = _balanced(system)
     gain = 1.0
@@ -29,7 +38,44 @@ def zeros_and_gain(system: System) -> tuple[Complex, float]:
         a, b, c, d = a[1:, 1:], a[1:, 0], c[1:], float(c[0])
     if abs(d) <= noise or gain == 0:
         return np.empty(0, dtype=complex), 0.0
+    if (around := _zeros_around(System(a, b, c, d))) is not None:
+        return around[0], gain * around[1]
     return np.linalg.eigvals(a - np.outer(b, c) / d).astype(complex), gain * d
+
+
+def factored_response(zeros: Complex, poles: Complex, gain: float, complex_points: npt.ArrayLike) -> Complex:
+    """Return gain·Π(x − z)/Π(x − p) at complex points, in their shape, one ratio at a time to avoid overflow."""
+    points = np.asarray(complex_points, dtype=complex)
+    value = np.full(points.shape, complex(gain))
+    for i, pole in enumerate(poles):
+        value *= (points - zeros[i] if i < zeros.size else 1.0) / (points - pole)
+    for zero in zeros[poles.size :]:
+        value *= points - zero
+    return value
+
+
+def _zeros_around(system: System) -> tuple[Complex, float] | None:
+    """Return zeros and gain of a system from its response at the real point x₀ where this is largest.
+
+    None if no response is above LEAST_RATIO times the direct gain. With N = (A − x₀ I)⁻¹, the zeros are x₀ + 1/w for
+    the eigenvalues w of N + N b c N/G(x₀); one without a reciprocal is at infinity.
+    """
+    a, b, c, d = system
+    poles = np.linalg.eigvals(a)
+    largest, chosen = LEAST_RATIO * abs(d), None
+    sizes = np.abs(poles[poles != 0])
+    for point in [0.0, *(np.geomspace(sizes.min(), sizes.max(), POINTS) if sizes.size else ())]:
+        shifted = a - point * np.eye(b.size)
+        with suppress(np.linalg.LinAlgError):
+            value = d - c @ np.linalg.solve(shifted, b)
+            if largest < abs(value) < np.inf:
+                largest, chosen = abs(value), (point, value, np.linalg.inv(shifted))
+    if chosen is None:
+        return None
+    point, value, inverse = chosen
+    reciprocals = np.linalg.eigvals(inverse + np.outer(inverse @ b, c @ inverse) / value)
+    zeros = point + 1 / reciprocals[np.abs(reciprocals) * sizes.max(initial=0.0) > NOWHERE].astype(complex)
+    return zeros, float(value / factored_response(zeros, poles, 1.0, point).real)
 
 
 def _reflection(vector: Real) -> tuple[Real, float]:

@@ -99,8 +99,32 @@ def test_glovers_bound_and_what_each_method_keeps(seed, keep, method) -> None:
     rng = np.random.default_rng(seed)
     poles = -(10 ** rng.uniform(0, 3, 8))
     transfer = Transfer.from_zpk(-(10 ** rng.uniform(0, 3, 8)), poles, rng.uniform(0.1, 10))
+    require_glovers_bound(transfer, keep, method)
+
+
+def random_roots(rng: np.random.Generator, count: int) -> list[complex]:
+    """Return roots of a stable real system over five decades, about half of them in pairs with light damping."""
+    roots: list[complex] = []
+    while len(roots) < count:
+        size, damping = 10 ** rng.uniform(-1, 4), rng.uniform(0.01, 0.9)
+        root = size * complex(-damping, np.sqrt(1 - damping**2))
+        roots += [root, root.conjugate()] if rng.random() < 0.5 and count - len(roots) > 1 else [complex(-size)]
+    return roots
+
+
+@pytest.mark.parametrize("seed", range(30))
+def test_glovers_bound_for_strictly_proper_systems_of_high_order(seed) -> None:
+    rng = np.random.default_rng(seed)
+    order = int(rng.integers(9, 13))
+    transfer = Transfer.from_zpk(random_roots(rng, int(rng.integers(0, order))), random_roots(rng, order), 1.0)
+    for keep in range(1, order):
+        require_glovers_bound(transfer, keep, "residualise")
+
+
+def require_glovers_bound(transfer: Transfer, keep: int, method: str) -> None:
+    """Require of a reduction that its error is within Glover's bound, and that it keeps the gain it is to keep."""
     reduced = reduce_order(transfer, keep, method)
-    s = 1j * np.concatenate([[0.0], np.geomspace(1e-2, 1e8, 300)])
+    s = 1j * np.concatenate([[0.0], np.geomspace(1e-3, 1e8, 300), np.abs(transfer.poles)])
     error = np.abs(reduced.transfer.response(s) - transfer.response(s))
     size = np.abs(transfer.response(s)).max()
     assert error.max() <= reduced.error_bound + 1e-6 * size
