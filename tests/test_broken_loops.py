@@ -118,7 +118,7 @@ def test_every_broken_loop_is_reported(name: str, tmp_path: Path) -> None:
 @pytest.mark.parametrize(("ticks", "is_reported"), [(1.0, False), (0.7, False), (0.2, True), (None, True)])
 def test_dynamics_that_carry_a_delay_contradict_no_rig(ticks: float | None, is_reported: bool, tmp_path: Path) -> None:
     """The model states two of the rig's three samples; a zero at 2/T beside a pole at -2/T delays by the time T."""
-    gain, numerator, denominator = "gain = -20.7\n", "numerator = [", "denominator = ["
+    numerator, denominator = "numerator = [", "denominator = ["
     model = TEXT[TEXT.index(MODEL) : TEXT.index("[", TEXT.index(denominator, TEXT.index(MODEL)) + 20)]
     changed = model.replace(MODEL, f"{MODEL}delay_ticks = 2\n")
     if ticks is not None:

@@ -13,6 +13,7 @@ from rtloop.design.identification.axis_recording import (
     excitation_warnings,
     read_axis_recording,
 )
+from rtloop.design.identification.hysteresis.creep import is_creep_likely
 from rtloop.design.identification.hysteresis.identify_from_parts import PartsFit, identify_from_parts
 from rtloop.design.identification.hysteresis.identify_hysteresis import identify_hysteresis, unexplained_um
 from rtloop.design.identification.hysteresis.initial_rest import begins_at_rest
@@ -39,8 +40,8 @@ class HysteresisResult(IdentifiedModel):
     """Identified plays: `fit` has the model and the errors of the fit, `judgements` the held-out errors.
 
     `judgements` are two lists: of the fitted recordings `runs`, then of recordings that only validate the model.
-    `extra` are fields of the JSON report that depend on the start of the recordings: `unexplained_um` from rest, else
-    those of `_parts_fields`.
+    `extra` are fields of the JSON report that depend on the start of the recordings: `unexplained_um` and
+    `creep_likely` from rest, else those of `_parts_fields`.
     """
 
     fit: HysteresisFit
@@ -101,6 +102,7 @@ class HysteresisResult(IdentifiedModel):
                 "model_h_percent": fit.model_loop.percent,
                 "invertible": fit.is_invertible,
                 "unexplained_um": None,
+                "creep_likely": None,
             }
             | self.extra
             | {"held_out": self.held_out, "held_out_all": combined, "output": self.output, "plot": self.picture}
@@ -149,7 +151,9 @@ def fit_hysteresis(
         if is_from_rest:
             fit = identify_hysteresis(runs, operators, placement, thresholds, weights)
             fitted, validating = evaluate_from_rest(runs, fit, validation_runs)
-            extra: dict[str, object] = {"unexplained_um": unexplained_um(runs, fit)}
+            left_um = unexplained_um(runs, fit)
+            is_creep = bool(left_um) and all(is_creep_likely(run) for run in runs)
+            extra: dict[str, object] = {"unexplained_um": left_um, "creep_likely": is_creep}
         else:
             parts_fit = identify_from_parts(runs, operators, placement, thresholds, weights, validation_runs)
             fit, fitted, validating = parts_fit.hysteresis, parts_fit.judgements, parts_fit.other_judgements

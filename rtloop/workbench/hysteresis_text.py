@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from rtloop.design.identification.hysteresis.creep import describe_unexplained
 from rtloop.workbench.tables import format_number, table
 
 if TYPE_CHECKING:
@@ -28,11 +29,8 @@ def print_hysteresis(out: Console, report: Mapping[str, Any]) -> None:
     )
     _print_held_out(out, report)
     if report["unexplained_um"]:
-        out.print(
-            f"[yellow]the actuator is no sum of plays[/]: with any number of plays, an error of "
-            f"{report['unexplained_um']:.3g} µm rms remains. The error may be larger for small steps and for "
-            "hysteresis loops of other sizes"
-        )
+        cause, colon, error = describe_unexplained(report["unexplained_um"], report["creep_likely"]).partition(":")
+        out.print(f"[yellow]{cause}[/]{colon}{error}")
     out.print(
         "height of the hysteresis loop in percent of the position's range: "
         f"{format_number(report['measured_h_percent'], '.2f')} % measured, "

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rtloop.design.identification.axis_recording import AxisRecording, UnsuitableData, distinct, require_usable
-from rtloop.design.identification.hysteresis.creep import is_creep_likely
+from rtloop.design.identification.hysteresis.creep import describe_unexplained, is_creep_likely
 from rtloop.design.identification.hysteresis.identify_from_parts import identify_from_parts
 from rtloop.design.identification.hysteresis.identify_hysteresis import identify_hysteresis, unexplained_um
 from rtloop.design.identification.hysteresis.thresholds import place_thresholds
@@ -227,6 +227,7 @@ def test_what_plays_leave_is_called_creep_where_a_lag_over_time_explains_it(trut
     position = truth(drive) + 1e-3 * np.random.default_rng(3).normal(size=drive.size)
     run = AxisRecording("made", 15 * SLOW_S, drive, np.append(0.0, position[:-1]), position, True, "", "")
     assert unexplained_um([run], identify_hysteresis([run])) > 0
+    assert describe_unexplained(1.0, creeps).startswith("the position seems to creep: ") == creeps
     assert is_creep_likely(run) == creeps
 
 

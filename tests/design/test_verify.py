@@ -272,16 +272,29 @@ def no_robustness() -> Robustness:
 
 
 @pytest.mark.usefixtures("few_simulated_steps")
-def test_simulated_steps_are_shown_and_judged_where_they_are_asked_for(tmp_path) -> None:
-    unjudged = verify_paper(tmp_path, MODEST + "[simulation]\nsteps_um = [2.0, 60.0]\n", simulated=True)
+def test_simulated_steps_are_shown_and_judged_unless_they_are_not_to_count(tmp_path) -> None:
+    spec = MODEST + "[simulation]\nsteps_um = [2.0, 60.0]\n"
+    unjudged = verify_paper(tmp_path, f"{spec}judged = false\n", simulated=True)
     assert unjudged.meets_specification
     assert unjudged.simulated is not None
     assert unjudged.simulated.is_met(unjudged.simulated.steps[0], "overshoot_percent") is False
     assert unjudged.simulated.omitted_heights_um == (60.0,)
     assert any("Steps of 60 µm were left out" in note for note in text.simulation_notes(unjudged))
-    verification = verify_paper(tmp_path, MODEST + "[simulation]\nsteps_um = [2.0]\njudged = true\n", simulated=True)
+    verification = verify_paper(tmp_path, spec, simulated=True)
     assert not verification.meets_specification
     assert "simulated, settling (5 %) of 2 µm steps" in answer(verification)
+    assert "simulated, steps of 60 µm, which the command's range of" in answer(verification)
+
+
+@pytest.mark.usefixtures("few_simulated_steps")
+def test_the_step_of_the_specification_counts_on_the_simulated_stage(tmp_path) -> None:
+    """The linear loop settles in less than 4.1 ms; with the stage's hysteresis a step of 18 µm needs longer."""
+    command = "[specification.command]\nreference_um = 18.0\ncommand_um = 30.0\n"
+    spec = MODEST.replace("settling_ms = 5.0", "settling_ms = 4.08") + command
+    assert verify_paper(tmp_path, spec).meets_specification
+    verification = verify_paper(tmp_path, spec, simulated=True)
+    assert not verification.meets_specification
+    assert "of 18 µm steps" in answer(verification)
 
 
 @pytest.mark.usefixtures("few_simulated_steps")

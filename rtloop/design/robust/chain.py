@@ -22,7 +22,7 @@ from rtloop.configuration.checks import Findings, check_axes
 from rtloop.configuration.file import Configuration, parse
 from rtloop.configuration.rig import driver_delay_ticks
 from rtloop.design.chain import Stage, stage_configuration
-from rtloop.design.identification.hysteresis.creep import is_creep_likely
+from rtloop.design.identification.hysteresis.creep import describe_unexplained, is_creep_likely
 from rtloop.design.identification.hysteresis.identify_hysteresis import unexplained_um
 from rtloop.design.robust.options import MOST_TAPS, ShapeOptions
 from rtloop.design.robust.scenarios import Family
@@ -154,13 +154,6 @@ def _require_reachable_steps(
         raise NoDesign(str(error)) from None
 
 
-CREEP_TEXT = (
-    ". A lag over time explains most of this error, which suggests creep. To measure creep, give "
-    "`rtloop identify hysteresis` recordings at several speeds"
-)
-OTHER_SIZES_TEXT = ". The recording does not show how steps of other sizes behave"
-
-
 def _require_play_model(stage: Stage, design: DesignOptions) -> None:
     """Raise NoDesign if no sum of plays describes the actuator (`unexplained_um`), so that steps cannot be predicted.
 
@@ -168,12 +161,11 @@ def _require_play_model(stage: Stage, design: DesignOptions) -> None:
     """
     left_um = unexplained_um([stage.slow], stage.hysteresis)
     if left_um and "residual_percent" not in design.simulation.model_fields_set:
-        why = CREEP_TEXT if is_creep_likely(stage.slow) else OTHER_SIZES_TEXT
         raise NoDesign(
-            f"{stage.slow.name}: no sum of play operators describes the actuator: with any number of operators, an "
-            f"error of {left_um:.3g} µm rms remains{why}. Set simulation.residual_percent to the hysteresis (% of the "
-            "position's range) that remains with the feedforward; `rtloop experiment run compensation` measures this "
-            "number. The design then continues, and is verified with this hysteresis"
+            f"{stage.slow.name}: {describe_unexplained(left_um, is_creep_likely(stage.slow))}. Set "
+            "simulation.residual_percent to the hysteresis (% of the position's range) that remains with the "
+            "feedforward; `rtloop experiment run compensation` measures this number. The design then continues, and is "
+            "verified with this hysteresis"
         )
 
 

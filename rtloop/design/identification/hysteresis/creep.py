@@ -32,6 +32,20 @@ def is_creep_likely(run: AxisRecording) -> bool:
     return with_lags < EXPLAINED_SHARE**2 * plays_only
 
 
+def describe_unexplained(left_um: float, is_creep: bool) -> str:
+    """Return what an error that plays leave, in µm rms, says of the actuator, without full stop."""
+    error = f"with any number of play operators, an error of {left_um:.3g} µm rms remains"
+    if is_creep:
+        return (
+            f"the position seems to creep: {error}, and a lag over time explains most of it. To measure creep, give "
+            "`rtloop identify hysteresis` recordings at several speeds"
+        )
+    return (
+        f"no sum of play operators describes the actuator: {error}. It may be larger for small steps and for "
+        "hysteresis loops of other sizes"
+    )
+
+
 def _residual_mean_square(columns: Real, position_um: Real) -> float:
     """Return the mean square of the residual of `position_um` (n,) after least squares on `columns` (n, k)."""
     solution = np.linalg.lstsq(columns, position_um)[0]
