@@ -78,7 +78,12 @@ def test_a_working_loop_has_no_problems(tmp_path: Path) -> None:
 
 def test_what_simulated_steps_miss_is_said_where_it_does_not_count(tmp_path: Path, few_simulated_steps: None) -> None:
     """The linear loop of the paper meets these requirements; with its actuator, small steps overshoot further."""
-    result = CliRunner().invoke(main, ["design", "verify", str(write_configuration(tmp_path))])
+    config = write_configuration(tmp_path)
+    result = CliRunner().invoke(main, ["design", "verify", str(config)])
+    assert result.exit_code == 1
+    assert "the loop misses simulated, overshoot of 20 µm steps" in result.stdout.strip().splitlines()[-1]
+    (tmp_path / "spec.toml").write_text(f"{SPECIFICATION}[simulation]\njudged = false\n")
+    result = CliRunner().invoke(main, ["design", "verify", str(config)])
     assert result.exit_code == 0, result.output
     answer = result.stdout.strip().splitlines()[-1]
     assert answer.startswith(

@@ -109,7 +109,7 @@ def test_taps_step_in_the_middle_of_the_range() -> None:
 def make_result(step: SimulatedStep) -> SimulationResult:
     """Return a simulation with one step and limits on its static error and settling time."""
     limits = {"static_error_percent": Limit(0.2, True), "settling_ms": Limit(6.0, True)}
-    return SimulationResult("the rig", (step,), (), PositionRange(REMANENCE_UM, HIGH_UM), 1.0, 1.0, limits, False)
+    return SimulationResult("the rig", (step,), (), PositionRange(REMANENCE_UM, HIGH_UM), 1.0, 1.0, limits, ())
 
 
 def test_a_report_of_a_step_that_never_settles_is_valid_json(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -257,7 +257,7 @@ def simulate_plays(values: np.ndarray, model: PlayModel) -> np.ndarray:
 def test_as_many_steps_keep_what_is_said_of_them() -> None:
     """The oracle counts steps under other noise draws; noise decides the overshoot of the paper's loop."""
     height_um, cycles = 5.0, 12
-    design = DesignOptions().model_copy(update={"simulation": SimulationOptions(steps_um=(height_um,))})
+    design = DesignOptions().model_copy(update={"simulation": SimulationOptions(steps_um=(height_um,), judged=False)})
     bench = Bench(PAPER, {})
     (simulated,) = simulate(bench, PAPER.axes[0], 0.03, design).steps
     assert simulated.typical[0] < 0.9 * simulated.overshoot_percent

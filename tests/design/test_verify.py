@@ -176,7 +176,7 @@ def test_the_norm_says_that_it_is_without_delay_as_the_synthesis_is_not() -> Non
 @pytest.mark.usefixtures("few_simulated_steps")
 def test_a_specification_that_is_met(tmp_path) -> None:
     spec = tmp_path / "modest.toml"
-    spec.write_text(f"{MODEST}resonance_shift_percent = 1.0\n")
+    spec.write_text(f"{MODEST}resonance_shift_percent = 1.0\n[simulation]\njudged = false\n")
     result = run(str(DEPLOY / "paper.toml"), "--spec", str(spec), "--json")
     assert result.exit_code == 0, result.stderr
     axis = json.loads(result.stdout)["axes"][0]

@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from functools import reduce
+from itertools import pairwise
 from operator import or_
 from typing import NamedTuple
 
@@ -15,6 +16,7 @@ import numpy as np
 
 from rtloop.analysis.held_plant import POINTS
 from rtloop.configuration.axis import AxisOptions
+from rtloop.configuration.reference_options import StepsOptions
 from rtloop.design.synthesis.specification import DesignOptions
 from rtloop.design.verification.bench import Bench
 from rtloop.design.verification.judgement import required_limits
@@ -31,6 +33,8 @@ from rtloop.signals import Flag, trip_causes
 
 SHORTEST_DWELL_S, LONGEST_DWELL_S, TIME_CONSTANTS = 0.1, 1.0, 12.0
 """Dwell at a level: TIME_CONSTANTS times the slowest time constant, within these limits."""
+MOST_LEVELS = 8
+"""Most levels of an axis's own reference that are simulated."""
 REST_S, SETTLING_S = 2.0, 0.5
 """Duration of the evaluation at rest, and of the settling before it."""
 REST_PLACES = (0.03, 0.12, 0.24, 0.48)
@@ -45,15 +49,20 @@ LIMIT_FLAGS = {Flag.COMMAND_LIMITED: "command", Flag.DRIVE_LIMITED: "drive", Fla
 def simulate(bench: Bench, axis: AxisOptions, slowest_s: float, design: DesignOptions) -> SimulationResult:
     """Simulate steps and rest of an axis; `slowest_s` is 1/|Re s| in s of the slowest mode of its linear loop.
 
-    Each height is simulated where `_levels` places it; heights that fit nowhere are omitted. A height whose figures
-    noise decides is run more often. Raises ValueError for a run whose recorded reference has no step, and for a
-    hysteresis model without inverse.
+    Each height is simulated where `_levels` places it, and the axis's own reference as it is; heights that fit nowhere
+    are omitted. A height whose figures noise decides is run more often. Raises ValueError for a run whose recorded
+    reference has no step, and for a hysteresis model without inverse.
     """
     dwell_s = min(max(TIME_CONSTANTS * slowest_s, SHORTEST_DWELL_S), LONGEST_DWELL_S)
     command_range = _command_range(axis)
+    counted_um = design.counted_heights_um
     levels_by_height = {height: _levels(axis, command_range, height) for height in sorted(set(design.step_heights_um))}
+    if (own_levels := _own_levels(axis)) and design.simulation.judged is not False:
+        height_um = max(abs(after - before) for before, after in pairwise((*own_levels, own_levels[0])))
+        levels_by_height[height_um] = own_levels
+        counted_um = (*counted_um, height_um)
     simulated_steps = []
-    for height, levels in levels_by_height.items():
+    for height, levels in sorted(levels_by_height.items()):
         if levels is None:
             continue
         steps = [_run_steps(bench, axis.name, levels, dwell_s, draw) for draw in range(DRAWS)]
@@ -67,7 +76,7 @@ def simulate(bench: Bench, axis: AxisOptions, slowest_s: float, design: DesignOp
     noise_x_nm, noise_v_nm = _noise_at_rest_nm(bench, axis.name, max(command_range, key=abs))
     return SimulationResult(
         truth, tuple(simulated_steps), omitted, command_range, noise_x_nm, noise_v_nm,
-        required_limits(design.specification), design.counted_heights_um,
+        required_limits(design.specification), counted_um,
     )  # fmt: skip
 
 
@@ -117,6 +126,14 @@ def _levels(axis: AxisOptions, command_range: PositionRange, height_um: float) -
         if max(map(abs, levels)) <= limits.command_um and can_hold(actuator, levels, limits.lowest_v, limits.drive_v):
             return levels
     return None
+
+
+def _own_levels(axis: AxisOptions) -> tuple[float, ...]:
+    """Return the levels in µm of an axis's own reference; () for one without steps, or with more than MOST_LEVELS."""
+    if not isinstance(axis.reference, StepsOptions):
+        return ()
+    levels = axis.reference.levels
+    return levels if len(levels) <= MOST_LEVELS and len(set(levels)) > 1 else ()
 
 
 class _SteppedRecord(NamedTuple):
