@@ -22,10 +22,18 @@ from rtloop.workbench.tables import console
 def info(files: tuple[Path, ...], as_json: bool) -> None:
     """Summarise a recording.
 
-    Prints completeness, timing, errors and drives. The files of a rotated run count as one recording.
+    Prints completeness, timing, errors, drives and steps. The files of a rotated run count as one recording.
     """
+    from rtloop.recording.load import load
     from rtloop.recording.views.summary import summarise
+    from rtloop.workbench.run_text import print_steps
+    from rtloop.workbench.step_figures import steps_of_run
 
     with Counter("ticks read", sys.stderr) as counter:
         summary = summarise(files, counter.show)
-    echo_json(summary.as_dict()) if as_json else print_summary(console(), summary)
+    if as_json:
+        echo_json(summary.as_dict())
+        return
+    print_summary(console(), summary)
+    if steps := steps_of_run(summary, load(files)):
+        print_steps(console(), steps)

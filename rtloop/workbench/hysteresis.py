@@ -13,7 +13,7 @@ from rtloop.design.identification.axis_recording import (
     excitation_warnings,
     read_axis_recording,
 )
-from rtloop.design.identification.hysteresis.creep import is_creep_likely
+from rtloop.design.identification.hysteresis.creep import describe_unexplained, is_creep_likely
 from rtloop.design.identification.hysteresis.identify_from_parts import PartsFit, identify_from_parts
 from rtloop.design.identification.hysteresis.identify_hysteresis import identify_hysteresis, unexplained_um
 from rtloop.design.identification.hysteresis.initial_rest import begins_at_rest
@@ -41,7 +41,7 @@ class HysteresisResult(IdentifiedModel):
 
     `judgements` are two lists: of the fitted recordings `runs`, then of recordings that only validate the model.
     `extra` are fields of the JSON report that depend on the start of the recordings: `unexplained_um` and
-    `creep_likely` from rest, else those of `_parts_fields`.
+    its cause in words from rest, else those of `_parts_fields`.
     """
 
     fit: HysteresisFit
@@ -102,7 +102,7 @@ class HysteresisResult(IdentifiedModel):
                 "model_h_percent": fit.model_loop.percent,
                 "invertible": fit.is_invertible,
                 "unexplained_um": None,
-                "creep_likely": None,
+                "unexplained": None,
             }
             | self.extra
             | {"held_out": self.held_out, "held_out_all": combined, "output": self.output, "plot": self.picture}
@@ -152,8 +152,8 @@ def fit_hysteresis(
             fit = identify_hysteresis(runs, operators, placement, thresholds, weights)
             fitted, validating = evaluate_from_rest(runs, fit, validation_runs)
             left_um = unexplained_um(runs, fit)
-            is_creep = bool(left_um) and all(is_creep_likely(run) for run in runs)
-            extra: dict[str, object] = {"unexplained_um": left_um, "creep_likely": is_creep}
+            cause = describe_unexplained(left_um, all(is_creep_likely(run) for run in runs)) if left_um else None
+            extra: dict[str, object] = {"unexplained_um": left_um, "unexplained": cause}
         else:
             parts_fit = identify_from_parts(runs, operators, placement, thresholds, weights, validation_runs)
             fit, fitted, validating = parts_fit.hysteresis, parts_fit.judgements, parts_fit.other_judgements

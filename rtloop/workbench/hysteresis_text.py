@@ -6,7 +6,6 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from rtloop.design.identification.hysteresis.creep import describe_unexplained
 from rtloop.workbench.tables import format_number, table
 
 if TYPE_CHECKING:
@@ -28,8 +27,8 @@ def print_hysteresis(out: Console, report: Mapping[str, Any]) -> None:
         f"{report['noise_um']:.3g} µm rms"
     )
     _print_held_out(out, report)
-    if report["unexplained_um"]:
-        cause, colon, error = describe_unexplained(report["unexplained_um"], report["creep_likely"]).partition(":")
+    if report["unexplained"]:
+        cause, colon, error = report["unexplained"].partition(":")
         out.print(f"[yellow]{cause}[/]{colon}{error}")
     out.print(
         "height of the hysteresis loop in percent of the position's range: "

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -52,7 +53,8 @@ def print_replay(out: Console, path: Path, report: ReplayReport) -> None:
         if (difference["recorded"], difference["replayed"]) != (None, None):
             place += f": recorded {difference['recorded']!r}, replayed {difference['replayed']!r}"
         out.print(f"[red]different[/]: {name}: {place} ({extent} compared)")
-    out.print(f"not judged: {'; '.join(report.not_judged)}")
+    subjects = [re.split("[:,(]", entry)[0] for entry in report.not_judged[:2]]
+    out.print(f"not judged: {', '.join(subjects)}, and {len(report.not_judged) - 2} other contents that --json lists")
 
 
 def _range_text(entry: dict[str, Any]) -> str:

@@ -18,13 +18,11 @@ from rtloop.supervision.supervisor import RunResult as SupervisedRun
 from rtloop.values import count_text, to_jsonable
 from rtloop.workbench.result import Result
 from rtloop.workbench.run_text import print_run
-from rtloop.workbench.step_figures import recorded_steps
+from rtloop.workbench.step_figures import steps_of_run
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from rich.console import Console
-
-MAX_STEP_ANALYSIS_TICKS = 6_000_000
 
 
 @dataclass(frozen=True, repr=False, eq=False)
@@ -110,9 +108,7 @@ class RunResult(Result):
         {} after a trip, without a recording, and for a recording of more than MAX_STEP_ANALYSIS_TICKS; axes without
         steps are missing.
         """
-        if self.recording is None or self.trips or not 0 < self.ticks <= MAX_STEP_ANALYSIS_TICKS:
-            return {}
-        return recorded_steps(self.recording)
+        return {} if self.recording is None or self.summary is None else steps_of_run(self.summary, self.recording)
 
     @property
     def headline(self) -> str:

@@ -36,31 +36,29 @@ def print_run(
         return
     print_summary(out, summary)
     if steps:
-        _print_steps(out, configuration, steps)
+        print_steps(out, steps, configuration)
 
 
-def _print_steps(out: Console, configuration: Configuration, steps: Mapping[str, StepMetrics]) -> None:
+def print_steps(out: Console, steps: Mapping[str, StepMetrics], configuration: Configuration | None = None) -> None:
     """Print overshoot (%), settling time (ms) and static error (%) of each axis's steps, the worst and the median.
 
-    Limits and claims of the axis's specification follow, and an explanation if a limit is missed.
+    With a configuration, limits and claims of the axis's specification follow, and an explanation if a limit is missed.
     """
     is_missed = False
     rows = table("steps", "overshoot %", "settling ms (5 %)", "static error %")
-    for axis in configuration.axes:
-        metrics = steps.get(axis.name)
-        if metrics is None:
-            continue
+    axes = {axis.name: axis for axis in configuration.axes} if configuration else {}
+    for name, metrics in steps.items():
         for label, suffix in ((f"worst of {metrics.steps}", "_worst"), ("median", "")):
             overshoot, settling, error = (
                 getattr(metrics, f"{quantity}{suffix}")
                 for quantity in ("overshoot_percent", "settling_time_ms", "static_error_percent")
             )
             figures = (format_figure(overshoot, 2), format_figure(settling, 2), format_figure(error, 3))
-            rows.add_row(f"{axis.name}: {label}", *figures)
+            rows.add_row(f"{name}: {label}", *figures)
         if metrics.unreached:
             rows.add_row(f"  [red]{metrics.unreached} of {metrics.steps} steps hardly moved, or ended more than "
                           f"{100 * SETTLING_BAND:g} % of their height from the reference[/]")  # fmt: skip
-        for row in specification_rows(configuration, axis, metrics):
+        for row in specification_rows(configuration, axes[name], metrics) if configuration else ():
             label = escape(row.label) if row.error is None else f"[red]{escape(row.error)}[/]"
             rows.add_row(f"  {label}", *(_red(cell) if cell.endswith(MISSED) else escape(cell) for cell in row.cells))
             is_missed |= any(cell.endswith(MISSED) for cell in row.cells)

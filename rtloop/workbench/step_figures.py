@@ -12,8 +12,10 @@ from rtloop.configuration.file import Configuration
 from rtloop.errors import RtloopError
 from rtloop.recording.load import Recording
 from rtloop.recording.views.steps import StepMetrics, step_metrics
+from rtloop.recording.views.summary import Summary
 from rtloop.signals import Mode
 
+MAX_STEP_ANALYSIS_TICKS = 6_000_000
 STEP_QUANTITIES = ("overshoot_percent", "settling_ms", "static_error_percent")
 """Keys of a specification, in the order of the table's columns."""
 MISSED = ", MISSED"
@@ -29,6 +31,13 @@ class SpecificationRow(NamedTuple):
     label: str
     cells: list[str]
     error: str | None = None
+
+
+def steps_of_run(summary: Summary, recording: Recording) -> dict[str, StepMetrics]:
+    """Return `recorded_steps`; {} after a trip or damage, for an import, and beyond MAX_STEP_ANALYSIS_TICKS."""
+    if summary.trips or summary.problems or summary.imported or not 0 < summary.ticks_logged <= MAX_STEP_ANALYSIS_TICKS:
+        return {}
+    return recorded_steps(recording)
 
 
 def recorded_steps(recording: Recording) -> dict[str, StepMetrics]:

@@ -46,6 +46,7 @@ damping = [1.0]
 gain_percent = 0.0
 [simulation]
 steps_um = [10.0]
+judged = false
 """
 
 

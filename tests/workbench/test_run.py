@@ -73,9 +73,12 @@ def test_a_run_prints_and_returns_what_the_commands_do(paper_run: RunResult, com
     assert set(report) - set(summary) == {
         "recordings", "notes", "outcome", "error", "recorder", "warnings", "startup_s",
     }  # fmt: skip
-    summary_text = lines(command("info", file).stdout)
+    *summary_text, _, worst, median = lines(command("info", file).stdout)
     text = lines(str(paper_run))
     assert text[: len(summary_text)] == summary_text
+    steps = text[len(summary_text) + 1 : len(summary_text) + 3]
+    assert [re.split(r"\s{2,}", line) for line in steps] == [re.split(r"\s{2,}", line) for line in (worst, median)]
+    assert worst.startswith("x: worst of ")
     (row,) = (line for line in text if "paper-spec.toml asks" in line)
     assert re.split(r"\s{2,}", row.strip()) == ["paper-spec.toml asks", "≤ 0, MISSED", "≤ 3, MISSED", "≤ 0.1, MISSED"]
     assert any(line.startswith("MISSED: the worst recorded step") for line in text)
