@@ -181,7 +181,7 @@ def _layout(laws: tuple[LawReference, ...]) -> Layout:
 def _module(text: str, file: str, helpers: tuple[Helper, ...]) -> ModuleType:
     """Return a text as a module, run once in a process with the `helpers` that it imports; its output goes to stderr.
 
-    Raises ValueError with the error of the text or of a helper, or with the text's first mistake.
+    Raises ValueError with the error of the text or of a helper, or with all mistakes of the text.
     """
     name = MODULE_PREFIX + hashlib.sha256(repr((file, text, helpers)).encode()).hexdigest()[:16]
     importer = _HelperImporter(name, helpers)
@@ -195,9 +195,12 @@ def _module(text: str, file: str, helpers: tuple[Helper, ...]) -> ModuleType:
         raise ValueError(f"{_location(error, [file, *(helper.file for helper in helpers)])}: {message}") from error
     from rtloop.laws.mistakes import find_mistakes  # Only user laws have mistakes.
 
+    lines: dict[str, int] = {}
     for mistake in find_mistakes(text, vars(module)):
+        lines.setdefault(mistake.message, mistake.line)
+    if lines:
         importer.forget()
-        raise ValueError(f"{file}, line {mistake.line}: {mistake.message}")
+        raise ValueError(f"{file}, " + "; ".join(f"line {line}: {message}" for message, line in lines.items()))
     return module
 
 

@@ -168,6 +168,15 @@ def test_a_typo_is_one_sentence_with_its_line(name: str, tmp_path: Path) -> None
     assert re.search(sentence, faults[0]), faults[0]
 
 
+def test_all_typos_of_a_law_are_listed_each_once(tmp_path: Path) -> None:
+    law = LAW.replace("c.kp * told.error_um", "c.kpp * told.eror_um + c.kpp").replace("c.ki * told", "c.kii * told")
+    (tmp_path / "mine.py").write_text(law)
+    (tmp_path / "lab.toml").write_text(configuration(CONTROLLER, [], model=False))
+    message = run("check", tmp_path / "lab.toml").stderr
+    found = [(int(line), name) for line, name in re.findall(r"line (\d+): ([a-z.]+_?[a-z]*): unknown", message)]
+    assert sorted(found) == [(RETURN, "c.kpp"), (RETURN, "told.eror_um"), (ADDS, "c.kii")]
+
+
 @pytest.mark.parametrize(
     ("name", "message"), [("command_um", None), ("applied_um", "told.applied_um: has no value in the function")]
 )
