@@ -29,6 +29,8 @@ DRAWN_BINS = 80
 """Most bins between the ends of a histogram's axis, which the limit and the nominal rig widen."""
 LOGARITHMIC_RATIO = 10.0
 """Ratio of the largest to the least value from which an axis is logarithmic."""
+OUTLIER_SPANS = 1.5
+"""Spans between the 5 % and the 95 % quantile beyond the latter, from which on values lie beyond a histogram's axis."""
 MARKED_RIGS = 200
 """Most rigs beyond a limit that a histogram marks one by one."""
 DRAWN_RIGS = 5000
@@ -194,6 +196,7 @@ def _draw_histogram(figure: Any, curves: FigureValues, ink: Palette) -> None:
     Values beyond the limit have another colour, and a mark each if they are at most MARKED_RIGS.
     """
     panel, values = figure.subplots(), curves.values[np.isfinite(curves.values)]
+    values = values[values <= _axis_end(curves)]
     beyond = values[values > curves.limit]
     if values.size:
         drawn = np.append(values, _finite(curves.limit, curves.nominal))
@@ -217,10 +220,29 @@ def _draw_histogram(figure: Any, curves: FigureValues, ink: Palette) -> None:
     _add_legend(figure, ink)
 
 
+def _axis_end(curves: FigureValues) -> float:
+    """Return the largest finite value, or the end of an axis that leaves out outliers and shows limit and nominal rig.
+
+    At most 5 % of the values are outliers: they lie OUTLIER_SPANS beyond the 95 % quantile.
+    """
+    values = curves.values[np.isfinite(curves.values)]
+    if not values.size:
+        return np.inf
+    low, high = np.quantile(values, (0.05, 0.95), method="inverted_cdf")
+    end = max([high + OUTLIER_SPANS * (high - low), *_finite(curves.limit, curves.nominal)])
+    return float(min(end, values.max())) if high > low else float(values.max())
+
+
 def histogram_title(curves: FigureValues) -> str:
-    """Return in words the number of rigs with a finite value, those with +∞, and a nominal value of +∞, if any."""
+    """Return in words the number of rigs with a finite value, those with +∞, and a nominal value of +∞, if any.
+
+    Rigs beyond the end of the axis are counted too.
+    """
     finite, infinite = (int(np.count_nonzero(test(curves.values))) for test in (np.isfinite, np.isposinf))
     parts = [count_text(finite, "rig")]
+    if (outliers := curves.values[np.isfinite(curves.values) & (curves.values > _axis_end(curves))]).size:
+        verb = "lies" if outliers.size == 1 else "lie"
+        parts.append(f"{count_text(outliers.size, 'rig')} {verb} beyond this axis, up to {outliers.max():.4g}")
     if infinite:
         parts.append(f"{count_text(infinite, 'more rig')} {'has' if infinite == 1 else 'have'} an infinite value")
     if np.isposinf(curves.nominal):

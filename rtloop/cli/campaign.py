@@ -205,6 +205,7 @@ def _report(folder: Path, worst_count: int, as_json: bool, page: Path | None) ->
     if page is not None:
         from rtloop.campaigns.page import render_campaign
 
+        click.echo(f"drawing the pictures of {page}, for up to a minute", err=True)
         write_page(page, render_campaign(folder, summary, partial(path_from, page)))
     has_failed = summary.counts["failed"] + summary.counts["crashed"] > 0 or not summary.counts["passed"]
     return LoopFault.exit_code if has_failed else 0

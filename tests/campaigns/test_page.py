@@ -386,6 +386,15 @@ def require_pictures(values, limit):
     assert draw_pairs([(figure, figure)])["light"].startswith(b"\x89PNG")
 
 
+@pytest.mark.parametrize(("outliers", "text"), [
+    ([60.0, 812.0], "100 rigs; 2 rigs lie beyond this axis, up to 812"), ([10.0, 10.0], "100 rigs"),
+])  # fmt: skip
+def test_outliers_lie_beyond_the_axis_of_a_histogram_and_are_counted(outliers, text):
+    """98 values between 4 and 4.97; the axis reaches the limit, 12."""
+    figure = FigureValues("a", np.append(4 + 0.01 * np.arange(98), outliers), 12.0, 4.1)
+    assert histogram_title(figure) == text
+
+
 def test_infinite_values_are_counted_in_words():
     values = np.array([1.0, math.inf, 2.0, math.inf, math.nan])
     assert histogram_title(FigureValues("a", values, 1.0, 1.0)) == "2 rigs; 2 more rigs have an infinite value"

@@ -18,7 +18,7 @@ from rtloop.recording.errors import RecordingError
 from rtloop.recording.load import load
 from rtloop.recording.views.bands import read_bands
 from rtloop.recording.views.histogram import TimeHistogram
-from rtloop.recording.views.plot import plot
+from rtloop.recording.views.plot import draw_recording, plot
 from rtloop.recording.views.summary import AxisSummary, SignalExtremes, summarise
 from rtloop.signals import Flag, Mode
 from tests.recording.hand_made_loop import COLUMNS, make_rows, write_recording
@@ -245,3 +245,17 @@ def test_every_nth_tick_is_a_number_from_one_on(path: Path, every: int):
     for read in (load(path).to_pandas, load(path).to_xarray):
         with pytest.raises(RecordingError, match=f"^every: {every}; allowed: a whole number of ticks, 1 or more"):
             read(every=every)
+
+
+@pytest.mark.parametrize(("peak_um", "scale"), [(17.0, "symlog"), (0.05, "linear")])
+def test_a_peak_of_the_error_hides_no_ripple_in_a_picture(tmp_path: Path, peak_um: float, scale: str) -> None:
+    rows = make_rows(COUNT)
+    error = COLUMNS.index("x_error_um")
+    rows[:, error] = 0.01 * np.sin(np.arange(COUNT))
+    rows[3000, error] = peak_um
+    figure = draw_recording(load(write_recording(tmp_path / "ripple.mcap", rows)))
+    (panel,) = (panel for panel in figure.axes if panel.get_ylabel().startswith("x error / µm"))
+    assert panel.get_yscale() == scale
+    low, middle, high = panel.transData.transform([(0, -0.01), (0, 0.0), (0, 0.01)])[:, 1]
+    assert (high - middle) / panel.bbox.height > 0.05
+    assert middle - low == pytest.approx(high - middle, rel=1e-6)

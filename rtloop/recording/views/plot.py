@@ -30,6 +30,8 @@ if TYPE_CHECKING:
 FORMATS = (".png", ".pdf", ".svg")
 POINTS = 20_000
 MAX_LABELS = 12
+USUAL, HIDING = 0.75, 20.0
+"""Quantile of an error that its peaks exceed by this factor where they would hide it."""
 COLOURS = {
     "reference": "0.15", "position": "tab:blue", "error": "tab:red", "drive": "tab:green",
     "exec": "0.6", "lateness": "tab:purple",
@@ -93,12 +95,27 @@ def _draw(figure: Figure, drawing: DrawnRecording) -> None:
     for subplot, panel in zip(plots, panels, strict=True):
         for name in panel.names:
             _draw_trace(subplot, bands[name], signal_kind(name))
-        subplot.set_ylabel(f"{panel.label.replace('_', ' ')} / {panel.unit}", parse_math=False)
+        label = f"{panel.label.replace('_', ' ')} / {panel.unit}"
+        if (linear := _linear_part([bands[name] for name in panel.names if signal_kind(name) == "error"])) > 0:
+            subplot.set_yscale("symlog", linthresh=linear)
+            label += f"\nlogarithmic beyond ±{linear:.2g}"
+        subplot.set_ylabel(label, parse_math=False)
         subplot.grid(visible=True, alpha=0.3)
         subplot.margins(x=0)
         subplot.legend(loc="upper right", fontsize=8, framealpha=0.8, ncols=2)
     plots[-1].set_xlabel("time since the start of the run / s")
     _mark_events(plots, drawing.marks)
+
+
+def _linear_part(errors: list[Band]) -> float:
+    """Return the end of the linear part of an axis on which peaks do not hide the ripple between them.
+
+    It is the USUAL quantile of the sizes of errors with larger peaks than HIDING times this; 0 without such peaks.
+    """
+    sizes = np.abs([*(error.low for error in errors), *(error.high for error in errors)]).ravel()
+    sizes = sizes[np.isfinite(sizes)]
+    usual = float(np.quantile(sizes, USUAL)) if sizes.size else 0.0
+    return usual if sizes.size and sizes.max() > HIDING * usual else 0.0
 
 
 def _draw_trace(subplot: Axes, band: Band, kind: str) -> None:
