@@ -72,7 +72,7 @@ def _prepare_environment() -> None:
         _complain("warning: environment: PYTHONOPTIMIZE=2: help and descriptions are missing; unset it\n")
     for name in harmful_variables():
         del os.environ[name]
-    sys.warnoptions.clear()  # multiprocessing passes them on
+    sys.warnoptions[:] = ["default"] if sys.flags.dev_mode else []  # multiprocessing passes them on, and removes this
     warnings.resetwarnings()
     warnings.simplefilter("ignore")
     os.environ |= SAFE_PATH | {"MPLBACKEND": "agg", "MATPLOTLIBRC": os.devnull}

@@ -56,16 +56,17 @@ def _bind_law(reference: LawReference) -> npt.NDArray[np.void]:
 
 def _let_ticks_call(functions: Sequence[Callable[..., object]]) -> None:
     """Let compiled functions call these Python functions, which are compiled with the checks of `jit_strict`."""
-    from numba.extending import register_jitable
+    from rtloop.foundation.native.compiler import numba
 
     for function in functions:
-        register_jitable(error_model="python", boundscheck=True)(function)
+        numba.extending.register_jitable(error_model="python", boundscheck=True)(function)
 
 
 def function_signatures(law: type[Law], law_records: LawRecords) -> dict[str, Signature]:
     """Return the numba signature of each function that a law defines, by the function's name."""
-    from numba import from_dtype, types
+    from rtloop.foundation.native.compiler import numba
 
+    from_dtype, types = numba.from_dtype, numba.types
     input_type = from_dtype(control_dtype(law_records.axes)) if law_records.axes else types.float64
     returns = {
         "output": types.void if law_records.axes > 1 else types.float64,
@@ -128,9 +129,9 @@ def _compiler_message(error: Exception) -> str:
     A missing operation reads "no operation NAME for (TYPES)". Any other exception than numba's is returned as its type
     and text, of any length.
     """
-    from numba.core.errors import NumbaError
+    from rtloop.foundation.native.compiler import numba
 
-    if not isinstance(error, NumbaError):
+    if not isinstance(error, numba.core.errors.NumbaError):
         return f"{type(error).__name__}: {error}"
     lines = [line.strip() for line in str(error).splitlines()]
     message_lines = [

@@ -104,6 +104,38 @@ def test_every_child_has_the_one_command_and_environment() -> None:
     assert starts >= 7
 
 
+def test_numba_is_imported_in_one_place() -> None:
+    """Another import could be the first one, and read settings of the current folder."""
+    importers = set()
+    for path in sorted((ROOT / "rtloop").rglob("*.py")):
+        tree = ast.parse(path.read_text(encoding="utf-8"))
+        for node in ast.walk(tree):
+            if isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING":
+                node.body = []
+        names = {
+            name
+            for node in ast.walk(tree)
+            if isinstance(node, ast.Import | ast.ImportFrom)
+            for name in (
+                [node.module or ""] if isinstance(node, ast.ImportFrom) else [part.name for part in node.names]
+            )
+        }
+        if any(name.partition(".")[0] == "numba" for name in names):
+            importers.add(path.name)
+    assert importers == {"compiler.py", "numba_cache_file.py"}
+
+
+def test_a_law_is_compiled_whatever_the_folder_says_of_numba(bench: Bench) -> None:
+    result = ending(bench, "run {stock}/damping.toml --duration 0.05 --unpaced", SURROUNDINGS["planted"])
+    assert (result.markers, result.code) == ([], 0), result.stderr
+
+
+def test_processes_start_in_development_mode(bench: Bench) -> None:
+    result = ending(bench, "archive replay {stock}/short.mcap --jobs 1", SURROUNDINGS["PYTHONDEVMODE=1"])
+    assert "Traceback" not in result.stderr
+    assert "1 recording" in result.stdout
+
+
 def test_a_child_gets_no_variable_that_changes_it(monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("NUMBA_OPT", "NUMBA_DISABLE_JIT", "PYTHONWARNINGS", "PYTHONOPTIMIZE"):
         monkeypatch.setenv(name, "1")
