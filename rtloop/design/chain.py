@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -21,7 +21,7 @@ from rtloop.analysis.comparison import LIGHT_DAMPING
 from rtloop.configuration.axis import LimitsOptions, ModelOptions
 from rtloop.design.identification.axis_recording import AxisRecording, UnsuitableData, jumps, noise_std
 from rtloop.design.identification.dynamics.beginning import refer_to_beginning
-from rtloop.design.identification.dynamics.dynamics_fit import DynamicsFit
+from rtloop.design.identification.dynamics.dynamics_fit import DynamicsFit, Mode
 from rtloop.design.identification.dynamics.identify_in_loop import identify_recorded_dynamics
 from rtloop.design.identification.dynamics.prediction_error import Excitation
 from rtloop.design.identification.hysteresis.identify_hysteresis import identify_hysteresis
@@ -30,6 +30,7 @@ from rtloop.design.identification.model_sections import (
     dynamics_provenance,
     feedforward_values,
     hysteresis_provenance,
+    left_out_text,
     model_values,
     scale_hysteresis,
 )
@@ -47,6 +48,10 @@ LARGEST_NOISE_RATIO, HYSTERESIS_SHARE = 3.0, 3e-4
 """Largest rms prediction error of a model that a loop is designed on: a multiple of the noise, or if larger, of
 HYSTERESIS_SHARE times the range of the modelled hysteresis in the step, an error that its model may leave.
 """
+DWELL_SWINGS, DWELL_DECAYS = 50, 5
+"""Duration of each level of the written reference, in periods or, if less, in decay times of the slowest mode."""
+CREEP_SHARE = 0.1
+"""Share of D(0) of a well damped mode, below which it counts as creep, which the reference does not wait for."""
 SWINGS = 8
 """Swings of the slowest lightly damped mode that trip the written loop, each at most 3/4 of its period after the last.
 """
@@ -74,10 +79,17 @@ class Stage:
         return design.model_copy(update={"plant": plant, "controller": output})
 
     def describe(self) -> str:
-        """Return one line of text: relative height h/H of the modelled hysteresis loop (%), modes (Hz, ζ) and delay."""
+        """Return one line of text: relative height h/H of the modelled hysteresis loop (%), modes (Hz, ζ), delay,
+        error of the hysteresis at the levels of the step, and modes that were left out.
+        """
         modes = ", ".join(f"{mode.frequency_hz:.1f} Hz (ζ {mode.damping:.4f})" for mode in self.dynamics.modes)
         delay = f"{count_text(self.dynamics.delay_ticks, 'sample')} of delay"
-        return f"hysteresis h/H {self.hysteresis.model_loop.percent:.2f} %; modes at {modes}; {delay}"
+        text = f"hysteresis h/H {self.hysteresis.model_loop.percent:.2f} %; modes at {modes}; {delay}"
+        if self.dynamics.level_correction:
+            text += f"; the hysteresis model errs by up to {self.dynamics.level_correction:.2g} µm at the step's levels"
+        if self.dynamics.left_out_hz:
+            text += f"; {left_out_text(self.dynamics.left_out_hz)}"
+        return text
 
 
 @dataclass(frozen=True)
@@ -203,8 +215,22 @@ def reference_values(stage: Stage, axis: str | None) -> StepsReference:
     recording's axes, None the first. Raises ValueError for weights of the hysteresis without an inverse.
     """
     limits = LimitsOptions.model_validate(_axis_table(tomllib.loads(stage.fast.configuration), axis).get("limits", {}))
-    slowest_hz = min((mode.frequency_hz for mode in stage.dynamics.modes), default=math.inf)
-    return steps_reference(limits, stage.actuator, slowest_hz, stage.fast.period_s)
+    return steps_reference(limits, stage.actuator, dwell_s(stage.dynamics.modes), stage.fast.period_s)
+
+
+def dwell_s(modes: Sequence[Mode]) -> float:
+    """Return the duration of a level in s in which modes settle: DWELL_SWINGS periods, or if less DWELL_DECAYS decay
+    times 1/|Re s|, of the slowest one. A well damped mode of less than CREEP_SHARE of D(0) does not count: it is of
+    creep, which a loop need not wait for.
+    """
+    return max(
+        (
+            min(DWELL_SWINGS, DWELL_DECAYS / (2 * math.pi * mode.damping)) / mode.frequency_hz
+            for mode in modes
+            if mode.damping < LIGHT_DAMPING or mode.static_share >= CREEP_SHARE
+        ),
+        default=0.0,
+    )
 
 
 def _axis_table(configuration: Mapping[str, Any], axis: str | None) -> dict[str, Any]:

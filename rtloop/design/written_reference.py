@@ -9,10 +9,8 @@ from rtloop.configuration.axis import LimitsOptions
 from rtloop.hysteresis.play_model import PlayModel
 from rtloop.hysteresis.reach import reachable_range
 
-STEP_PART, LEAST_DWELL_S, DWELL_SWINGS = 0.25, 0.1, 50
-"""Step as a fraction of the largest command, and the least duration of each level, in s and in periods of the slowest
-mode.
-"""
+STEP_PART, LEAST_DWELL_S = 0.25, 0.1
+"""Step as a fraction of the largest command, and the least duration of each level."""
 
 
 class StepsReference(TypedDict):
@@ -23,16 +21,15 @@ class StepsReference(TypedDict):
     dwell_s: float
 
 
-def steps_reference(limits: LimitsOptions, actuator: PlayModel, slowest_hz: float, period_s: float) -> StepsReference:
+def steps_reference(limits: LimitsOptions, actuator: PlayModel, settling_s: float, period_s: float) -> StepsReference:
     """Return [axis.reference]: a square wave between 0 and STEP_PART of the largest command, to one significant digit.
 
     An actuator that does not come back to 0 within the drive's limits gets a square wave within the positions that it
-    does come back to. Each level lasts whole ticks: at least LEAST_DWELL_S, and at least DWELL_SWINGS periods of the
-    slowest mode, whose frequency is `slowest_hz` (inf without a mode). Its keys are `kind`, `levels` (two, in µm, the
-    farther from rest first) and `dwell_s`. Raises ValueError for an actuator without inverse.
+    does come back to. Each level lasts whole ticks: at least LEAST_DWELL_S, and at least `settling_s`. Its keys are
+    `kind`, `levels` (two, in µm, the farther from rest first) and `dwell_s`. Raises ValueError for an actuator without
+    inverse.
     """
-    dwell_s = max(LEAST_DWELL_S, DWELL_SWINGS / slowest_hz)
-    dwell_s = math.ceil(dwell_s / period_s) * period_s
+    dwell_s = math.ceil(max(LEAST_DWELL_S, settling_s) / period_s) * period_s
     levels_um = _levels_um(limits, actuator)
     return {"kind": "steps", "levels": levels_um, "dwell_s": round(dwell_s, 9)}
 

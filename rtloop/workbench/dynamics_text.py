@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from rtloop.design.identification.dynamics.residuals import LARGEST_CROSS_RATIO
 from rtloop.design.identification.frequency_response import SEGMENT_S
-from rtloop.design.identification.model_sections import static_gain_text
+from rtloop.design.identification.model_sections import left_out_text, static_gain_text
 from rtloop.values import count_text
 from rtloop.workbench.hysteresis_text import print_files
 from rtloop.workbench.tables import format_number, table
@@ -80,8 +80,10 @@ def print_dynamics(out: Console, report: Mapping[str, Any]) -> None:
         unit = "V" if report["input"] == "drive" else "µm"
         out.print(
             f"the levels of the input were corrected by up to {report['level_correction']:.3g} {unit}, so that they "
-            "agree with the settled position. The model of the hysteresis has this error at these levels."
+            "agree with the position. The model of the hysteresis has this error at these levels."
         )
+    if report["left_out_hz"]:
+        out.print(left_out_text(report["left_out_hz"]))
     _print_response(out, report["frequency_response"])
     print_files(out, report)
 

@@ -114,6 +114,15 @@ def static_gain_text(gain: float, input_kind: str, spread: str = "") -> str:
     return f"{number} µm/V is the only weight of [axis.feedforward], which then has no hysteresis"
 
 
+def left_out_text(frequencies_hz: Sequence[float]) -> str:
+    """Return a sentence on modes that were left out of the dynamics (`DynamicsFit.left_out_hz`)."""
+    modes = ", ".join(f"{frequency_hz:.3g} Hz" for frequency_hz in frequencies_hz)
+    return (
+        f"left out of the model: {count_text(len(frequencies_hz), 'mode')} at {modes}, whose poles this recording does "
+        "not tell from zeros; hysteresis or creep that the model of the actuator lacks is the likely cause"
+    )
+
+
 def proportional_actuator(gain_um_per_v: float) -> PlayModel | None:
     """Return an actuator without hysteresis, a play of threshold 0; None for a gain that is not above 0."""
     return PlayModel(np.zeros(1), np.array([gain_um_per_v])) if gain_um_per_v > 0 else None

@@ -8,6 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 
 from rtloop.design.identification.dynamics.innovations import Innovations
 from rtloop.design.identification.dynamics.inverse_hold import continuous_modal
@@ -17,8 +18,14 @@ from rtloop.linear.realisation import modal_realisation
 from rtloop.linear.transfer import Transfer
 from rtloop.linear.zeros import zeros_and_gain
 
+LARGEST_RELATIVE_STD = 0.1
+"""Largest standard deviation, relative to the frequency, of a mode that counts as identified."""
 FASTEST_DECAY = 14.0
 """Largest decay of a mode within a tick: e^−14 is about a millionth, which is negligible at the next tick."""
+FARTHEST_ZERO = 100.0
+"""Largest magnitude of a zero, in multiples of the Nyquist rate π/T. A farther one changes D(s) by less than 1 % at the
+Nyquist rate, as a shift by 0.3 % of a tick does: noise makes it, and its sign.
+"""
 
 
 @dataclass(frozen=True)
@@ -72,15 +79,22 @@ class DynamicsFit:
     """The motion (samples,) that was left out; None from rest."""
     level_correction: float = 0.0
     """Largest correction of a level that the input holds, in the input's unit (`measured_levels`)."""
+    left_out_hz: tuple[float, ...] = ()
+    """Frequencies |s|/2π of modes that were left out, because the recording does not tell their poles from zeros
+    (`uncertain_rates`).
+    """
 
 
 def continuous_transfer(model: Innovations) -> Transfer:
-    """Return D(s) of a sampled model, without delay, with D(0) = 1; decays are limited to FASTEST_DECAY per tick."""
+    """Return D(s) of a sampled model, without delay, with D(0) = 1; decays are limited to FASTEST_DECAY per tick, and
+    zeros beyond FARTHEST_ZERO are left out.
+    """
     discrete = model.discrete()
     rates = np.concatenate([model.rates, model.rates[model.rates.imag != 0].conj()])
     rates, residues = _limit_fast_rates(rates, discrete.residues / model.static_gain, model.period_s)
     modal = continuous_modal(rates, residues, discrete.direct, model.period_s)
     zeros, leading = zeros_and_gain(modal_realisation(modal))
+    zeros = zeros[np.abs(zeros) * model.period_s <= FARTHEST_ZERO * np.pi]
     transfer = Transfer.from_zpk(zeros, rates, leading)
     return Transfer.from_zpk(zeros, rates, leading / transfer.dc_gain)
 
@@ -108,6 +122,23 @@ def estimate_modes(model: Innovations, covariance: Real, *, noise: bool) -> tupl
         modes.append(Mode(size / (2 * np.pi), size_std / (2 * np.pi), damping, damping_std, float(share)))
         i += (3 if noise else 2) * width
     return tuple(sorted(modes, key=lambda mode: mode.frequency_hz))
+
+
+def uncertain_rates(model: Innovations, covariance: Real, *, noise: bool) -> npt.NDArray[np.bool_]:
+    """Return which of `model.rates` (m,) have a zero of D(s) within their standard deviation, if it is more than
+    LARGEST_RELATIVE_STD of the rate: the recording does not show that such a mode exists. A pole that decays within a
+    tick is a part of the delay, and is never among them.
+
+    `covariance` is as for `estimate_modes`.
+    """
+    zeros, uncertain, i = continuous_transfer(model).zeros, [], 0
+    for rate in model.rates:
+        width = 2 if rate.imag != 0 else 1
+        std = np.sqrt(max(np.trace(covariance[i : i + width, i : i + width]), 0.0))
+        is_hidden = zeros.size > 0 and std > max(np.abs(zeros - rate).min(), LARGEST_RELATIVE_STD * abs(rate))
+        uncertain.append(is_hidden and rate.real * model.period_s >= -FASTEST_DECAY)
+        i += (3 if noise else 2) * width
+    return np.array(uncertain, bool)
 
 
 def static_gain_std(model: Innovations, covariance: Real, *, noise: bool) -> float:

@@ -11,6 +11,7 @@ Poles beyond half the sampling rate cannot be seen: each appears, if at all, at 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from typing import Literal
 
@@ -23,6 +24,7 @@ from rtloop.design.identification.dynamics.dynamics_fit import (
     continuous_transfer,
     estimate_modes,
     static_gain_std,
+    uncertain_rates,
 )
 from rtloop.design.identification.dynamics.estimate_covariance import estimate_covariance
 from rtloop.design.identification.dynamics.identify_delay import (
@@ -33,7 +35,8 @@ from rtloop.design.identification.dynamics.identify_delay import (
 )
 from rtloop.design.identification.dynamics.initial_state import free_motion
 from rtloop.design.identification.dynamics.innovations import Innovations
-from rtloop.design.identification.dynamics.measured_levels import correct_levels
+from rtloop.design.identification.dynamics.markov import fit_residues
+from rtloop.design.identification.dynamics.measured_levels import correct_levels, fit_levels
 from rtloop.design.identification.dynamics.prediction_error import (
     LARGEST_ORDER,
     LEAST_IMPROVEMENT,
@@ -51,6 +54,12 @@ Criterion = Literal["aic", "held-out", "validation"]
 METHOD = "prediction errors (ARMAX), open loop"
 MOST_REPETITIONS = 3
 """Most further identifications of a recording, each without the free motion found before."""
+LARGEST_GROWTH = 1.5
+"""Largest growth of the rms prediction error by leaving out an uncertain mode."""
+LEAST_CORRECTION = 0.1
+"""Least correction of a level, in µm of the position, relative to the rms prediction error; a smaller one hides and
+makes no mode.
+"""
 LEAST_EXCITED_POLES = 4
 """Fewest poles that the input must excite if the order is searched."""
 
@@ -76,7 +85,7 @@ def identify_dynamics(
     left_out_um, duration_s, repetitions = np.zeros_like(run.position_um), 0.0, 0
     while True:
         rest_run = replace(run, position_um=run.position_um - left_out_um)
-        fit, recording = _identify_from_rest(rest_run, order, largest_order, criterion, validation, delay_ticks)
+        fit, recording = _identify_with_levels(rest_run, order, largest_order, criterion, validation, delay_ticks)
         motion = free_motion(fit.model, recording) if repetitions < MOST_REPETITIONS else None
         if motion is None:
             return replace(fit, free_motion_s=duration_s, free_motion_um=left_out_um) if duration_s else fit
@@ -84,7 +93,7 @@ def identify_dynamics(
         left_out_um, duration_s = left_out_um + motion.position_um, max(duration_s, motion.duration_s)
 
 
-def _identify_from_rest(
+def _identify_with_levels(
     run: Excitation,
     order: int | None,
     largest_order: int,
@@ -94,8 +103,36 @@ def _identify_from_rest(
 ) -> tuple[DynamicsFit, Excitation]:
     """Identify a model as `identify_dynamics`, of a run from rest. Returns also the run that the model was fitted to.
 
-    The input of that run is delayed, and the levels that the input holds are corrected (`correct_levels`); its position
+    The input of that run is delayed, and the levels that the input holds are corrected: by the settled position
+    (`correct_levels`), or else by first models (`fit_levels`), where a second one then predicts as well. Its position
     is relative to the first one. Raises as `identify_dynamics`.
+    """
+    settings = (order, largest_order, criterion, validation, delay_ticks)
+    first_run = replace(run, position_um=run.position_um - run.position_um[0])
+    corrected_run, correction = correct_levels(first_run)
+    fit, recording, models = _identify_from_rest(corrected_run, *settings)
+    if corrected_run is not first_run:
+        return replace(fit, level_correction=correction), recording
+    fitted_run, correction = fit_levels(first_run, models, fit.delay_ticks)
+    if correction * abs(fit.static_gain) <= LEAST_CORRECTION * fit.rms_error_um:
+        return fit, recording
+    with suppress(UnsuitableData, ArithmeticError):
+        second_fit, second_recording, _ = _identify_from_rest(fitted_run, *settings)
+        if second_fit.rms_error_um <= (1 + LEAST_IMPROVEMENT) * fit.rms_error_um:
+            return replace(second_fit, level_correction=correction), second_recording
+    return fit, recording
+
+
+def _identify_from_rest(
+    run: Excitation,
+    order: int | None,
+    largest_order: int,
+    criterion: Criterion,
+    validation: Sequence[Excitation],
+    delay_ticks: int | None,
+) -> tuple[DynamicsFit, Excitation, list[Innovations]]:
+    """Identify a model as `identify_dynamics`, of a run from rest whose position begins at 0. Returns also the run that
+    the model was fitted to, whose input is delayed, and all models that were compared. Raises as `identify_dynamics`.
     """
     if criterion == "validation" and not validation:
         raise ValueError("criterion 'validation' needs another recording for the validation; give a further RUN")
@@ -106,12 +143,11 @@ def _identify_from_rest(
             f"{run.name}: too little excitation: this input identifies at most {excited_poles} poles; the model needs "
             f"{needed_poles} or more. Use a step, or a chirp over all frequencies of interest"
         )
-    recording, corrected = correct_levels(replace(run, position_um=run.position_um - run.position_um[0]))
     orders = [order] if order else range(1, min(largest_order, excited_poles) + 1)
     if delay_ticks is None:
-        delay_ticks = identify_delay(recording, orders)
+        delay_ticks = identify_delay(run, orders)
     recording, validation = (
-        delay_input(recording, delay_ticks),
+        delay_input(run, delay_ticks),
         [delay_input(other_run, delay_ticks) for other_run in validation],
     )
     start = held_out_start(recording) if criterion == "held-out" else None
@@ -130,7 +166,7 @@ def _identify_from_rest(
         recording = with_held_out_levels(model, recording, start)
         if (refitted := refine(model, recording)) and _has_settled(refitted, recording):
             model = refitted
-    return _build_fit(model, recording, tuple(candidates), delay_ticks, corrected), recording
+    return _build_fit(model, recording, tuple(candidates), delay_ticks, prune=order is None), recording, models
 
 
 def _require_settled(models: Sequence[Innovations], run: Excitation) -> list[Innovations]:
@@ -203,14 +239,14 @@ def _choose_candidate(
 
 
 def _build_fit(
-    model: Innovations, run: Excitation, candidates: tuple[Candidate, ...], delay_ticks: int, corrected: float
+    model: Innovations, run: Excitation, candidates: tuple[Candidate, ...], delay_ticks: int, *, prune: bool
 ) -> DynamicsFit:
     """Return the result for the chosen model, with residual tests and standard deviations from the whole run.
 
-    `candidates` are all models compared. The input of `run` is delayed by `delay_ticks` already; `corrected` is the
-    largest correction of its levels (`correct_levels`), in its unit. Errors that follow from the input beyond
-    LARGEST_CROSS_RATIO of the bound widen the deviations by that ratio. Raises ArithmeticError for an unstable
-    predictor.
+    `candidates` are all models compared. The input of `run` is delayed by `delay_ticks` already. Errors that follow
+    from the input beyond LARGEST_CROSS_RATIO of the bound widen the deviations by that ratio. `prune` leaves out modes
+    whose pole the recording does not tell from a zero (`uncertain_rates`), one by one. Raises ArithmeticError for an
+    unstable predictor.
     """
     errors = prediction_errors(model, run)
     output_error_um = run.position_um - model.simulate_output(run.input)
@@ -218,6 +254,13 @@ def _build_fit(
     covariance = estimate_covariance(model, run, errors, white=tests.is_white)
     if tests.cross_ratio > LARGEST_CROSS_RATIO:
         covariance = covariance * tests.cross_ratio**2
+    if prune and model.rates.size > 1:
+        for mode in np.flatnonzero(uncertain_rates(model, covariance, noise=True)):
+            smaller = _without_mode(model, mode, run)
+            if smaller is not None:
+                fit = _build_fit(smaller, run, candidates, delay_ticks, prune=True)
+                left_out_hz = float(abs(model.rates[mode])) / (2 * np.pi)
+                return replace(fit, left_out_hz=(left_out_hz, *fit.left_out_hz))
     return DynamicsFit(
         continuous_transfer(model),
         model.static_gain,
@@ -230,5 +273,19 @@ def _build_fit(
         model,
         delay_ticks,
         METHOD,
-        level_correction=corrected,
     )
+
+
+def _without_mode(model: Innovations, mode: int, run: Excitation) -> Innovations | None:
+    """Return the model without one of its modes, fitted to `run`.
+
+    None if it is unstable, or if its prediction error is more than LARGEST_GROWTH times that of `model`.
+    """
+    rates, residues, gains = (np.delete(part, mode) for part in (model.rates, model.residues, model.noise_gains))
+    smaller = Innovations(model.period_s, rates, residues, gains, model.offset)
+    if smaller.errors(run.input, run.position_um) is None:
+        smaller = replace(smaller, noise_gains=np.zeros_like(gains))
+    fitted = refine(fit_residues(smaller, run.input, run.position_um), run)
+    if fitted is None or fitted.errors(run.input, run.position_um) is None:
+        return None
+    return fitted if rms_error(fitted, run) <= LARGEST_GROWTH * rms_error(model, run) else None

@@ -13,6 +13,7 @@ import numpy as np
 
 from rtloop.design.identification.axis_recording import UnsuitableData
 from rtloop.design.identification.dynamics.dynamics_fit import (
+    LARGEST_RELATIVE_STD,
     Candidate,
     DynamicsFit,
     Mode,
@@ -50,8 +51,6 @@ SPARE_POLES = 4
 """Poles tried beyond the requested order, where another mode must be found first; they are pruned afterwards."""
 INITIAL_NOISE_ORDER = 4
 """Order of A_n before there is a model: a long one would model undiscovered lightly damped modes as noise."""
-LARGEST_RELATIVE_STD = 0.1
-"""Largest standard deviation, relative to the frequency, of a mode that counts as identified."""
 
 
 def identify_recorded_dynamics(

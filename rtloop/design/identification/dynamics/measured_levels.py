@@ -5,11 +5,13 @@
 The input of D(s) comes from a model of the hysteresis, which errs by a constant at each level. A fit takes such errors
 for noise and colours its noise model with them, which moves the fast real poles by a standard deviation, or it takes
 them for modes. The position at rest measures the levels to within the noise of a mean. Two levels leave no e_l: only a
-recording with three or more is corrected, and only where the position settles at each to within its noise.
+recording with three or more is corrected. Where the position does not settle at each to within its noise, the levels
+are fitted together with the modes.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from itertools import pairwise
 from typing import NamedTuple
@@ -17,7 +19,15 @@ from typing import NamedTuple
 import numpy as np
 
 from rtloop.design.identification.axis_recording import noise_std
-from rtloop.design.identification.dynamics.prediction_error import Excitation
+from rtloop.design.identification.dynamics.identify_delay import delay_input
+from rtloop.design.identification.dynamics.innovations import Innovations
+from rtloop.design.identification.dynamics.prediction_error import (
+    LEAST_IMPROVEMENT,
+    MOST_LEVELS,
+    Excitation,
+    has_stable_continuous_form,
+    minimise_with_levels,
+)
 from rtloop.foundation.arrays import Real
 
 SHORTEST_TAIL = 50
@@ -58,6 +68,33 @@ def correct_levels(run: Excitation) -> CorrectedLevels:
     measured = np.array([(tail.mean() - offset_um) / gain for tail in tails])
     corrected = measured - measured[0] + levels[0]
     return CorrectedLevels(replace(run, input=np.repeat(corrected, durations)), float(np.abs(corrected - levels).max()))
+
+
+def fit_levels(run: Excitation, models: Sequence[Innovations], delay_ticks: int) -> CorrectedLevels:
+    """Return the recording with the levels of its input after the second one as the position shows them.
+
+    The levels are fitted together with each of `models`, from its modes on, behind `delay_ticks` samples of delay; they
+    are taken from the fit of fewest poles that predicts as well as the best one. The recording is unchanged, with a
+    correction of 0, if its input holds fewer than three levels or more than MOST_LEVELS, and if no fit has modes that
+    decay and a continuous form.
+    """
+    changes = np.flatnonzero(np.diff(run.input)) + 1
+    if not 2 <= changes.size <= MOST_LEVELS:
+        return CorrectedLevels(run, 0.0)
+    ticks, delayed_run = np.arange(run.input.size), delay_input(run, delay_ticks)
+    fits: list[tuple[int, float, Real]] = []
+    for model in models:
+        steps = (ticks - delay_ticks >= changes[1:, None]).astype(float)
+        fitted, sizes = minimise_with_levels(model, delayed_run, steps, noise=True)
+        errors = fitted.errors(delayed_run.input + sizes @ steps, run.position_um)
+        if errors is not None and has_stable_continuous_form(fitted):
+            fits.append((model.order, float(np.sqrt(np.mean(errors**2))), sizes))
+    if not fits:
+        return CorrectedLevels(run, 0.0)
+    limit_um = (1 + LEAST_IMPROVEMENT) * min(rms_um for _, rms_um, _ in fits)
+    _, _, sizes = min((fit for fit in fits if fit[1] <= limit_um), key=lambda fit: fit[0])
+    corrections = sizes @ (ticks >= changes[1:, None])
+    return CorrectedLevels(replace(run, input=run.input + corrections), float(np.abs(corrections).max()))
 
 
 def _is_settled(tail: Real, noise_um: float) -> bool:

@@ -137,20 +137,31 @@ def minimise_errors(
     `noise` fits the noise gains too; they stay otherwise. The search ends after MOST_EVALUATIONS evaluations, converged
     or not.
     """
+    return minimise_with_levels(model, run, np.zeros((0, run.input.size)), noise=noise, selection=selection)[0]
+
+
+def minimise_with_levels(
+    model: Innovations, run: Excitation, steps: Real, *, noise: bool, selection: SampleSelection = ALL_SAMPLES
+) -> tuple[Innovations, Real]:
+    """Return the model of `minimise_errors`, and the sizes (levels,) of unit steps (levels, samples) that are added to
+    the input.
+    """
+    count = model.pack(noise=noise).size
 
     def errors(values: Real) -> Real:
         """Return the prediction errors in µm (samples,); HUGE_ERROR for a model that does not decay or predicts
         unstably.
         """
-        trial = model.unpack(values, noise=noise)
-        if np.any(trial.rates.real >= 0) or (solution := trial.errors(run.input, run.position_um)) is None:
+        trial, u = model.unpack(values[:count], noise=noise), run.input + values[count:] @ steps
+        if np.any(trial.rates.real >= 0) or (solution := trial.errors(u, run.position_um)) is None:
             return np.full(run.input.size, HUGE_ERROR)
         return np.clip(np.nan_to_num(solution, nan=HUGE_ERROR), -HUGE_ERROR, HUGE_ERROR)
 
     def jacobian(values: Real) -> Real:
         """Return the derivatives of the errors by the unknowns, (samples, unknowns), limited to ±HUGE_SLOPE."""
-        trial = model.unpack(values, noise=noise)
-        solution = trial.sensitivities(run.input, errors(values), noise=noise).T
+        trial, u = model.unpack(values[:count], noise=noise), run.input + values[count:] @ steps
+        by_model = trial.sensitivities(u, errors(values), noise=noise)
+        solution = np.vstack([by_model, -_step_responses(trial, steps)]).T
         return np.clip(np.nan_to_num(solution, nan=HUGE_SLOPE), -HUGE_SLOPE, HUGE_SLOPE)
 
     settings: dict[str, Any] = {
@@ -163,9 +174,20 @@ def minimise_errors(
     with np.errstate(over="ignore", invalid="ignore"):
         selected_jacobian: Any = lambda values: jacobian(values)[selection]
         solution = least_squares(
-            lambda values: errors(values)[selection], model.pack(noise=noise), selected_jacobian, **settings
+            lambda values: errors(values)[selection],
+            np.append(model.pack(noise=noise), np.zeros(len(steps))),
+            selected_jacobian,
+            **settings,
         )
-    return model.unpack(solution.x, noise=noise)
+    return model.unpack(solution.x[:count], noise=noise), solution.x[count:]
+
+
+def _step_responses(model: Innovations, steps: Real) -> Real:
+    """Return the effect of steps (levels, samples) of the input on the position, whitened as the prediction errors
+    are, in the same shape.
+    """
+    columns = [model.simulate_output(step) - model.offset for step in steps]
+    return model.whiten(np.array(columns).reshape(steps.shape), model.predictor_poles())
 
 
 def has_stable_continuous_form(model: Innovations) -> bool:
@@ -212,8 +234,7 @@ def _held_out_levels(model: Innovations, run: Excitation, errors: Real, start: i
     changes = np.flatnonzero(np.diff(run.input[start - 1 :]))
     changes = changes if changes.size <= MOST_LEVELS else changes[:1]
     steps = (np.arange(errors.size - start) >= changes[:, None]).astype(float)
-    columns = np.array([model.simulate_output(step) - model.offset for step in steps])
-    responses = model.whiten(columns, model.predictor_poles()).T
+    responses = _step_responses(model, steps).T
     sizes, *_ = np.linalg.lstsq(responses, errors[start:], rcond=1e-12)
     return steps, responses, np.asarray(sizes, np.float64)
 
