@@ -12,7 +12,7 @@ from click.testing import CliRunner
 from rich.console import Console
 
 from rtloop.cli import main
-from rtloop.configuration.cautions import cautions
+from rtloop.configuration.cautions import cautions, option_cautions
 from rtloop.configuration.file import load, parse
 from rtloop.configuration.prepare import prepare
 from rtloop.drivers.base import Channel
@@ -246,3 +246,16 @@ def test_limits_that_the_input_cannot_read_are_not_shown(low_v: float, high_v: f
     judgement = AxisJudgement(axis, replace(check, law=None, on_model=None), {}, None, None, None)
     print_axis(out, judgement, Channel("adc0", low_v, high_v))
     assert f"the loop trips beyond ±60 µm{message}\n" in out.file.getvalue()
+
+
+@pytest.mark.parametrize(("duration_s", "is_named"), [(0.4, True), (0.5, True), (0.6, False), (None, False)])
+def test_a_run_that_ends_before_its_first_step_says_so(duration_s: float | None, is_named: bool) -> None:
+    steps = '[axis.reference]\nkind = "steps"\nlevels = [10.0, 0.0]\ndwell_s = 0.5\n'
+    text = TEXT.partition("[axis.reference]")[0] + steps
+    prepared = prepare(parse(text, "stage", Path(), "stage"), duration_s=duration_s, paced=False)
+    lines = [line for line in option_cautions(prepared) if "first step" in line]
+    expected = (
+        f"axis.reference.dwell_s: the first step comes after 0.5 s, and this run ends after {duration_s} s: it has no "
+        "step. Use --duration with at least 1"
+    )
+    assert lines == [expected] * is_named

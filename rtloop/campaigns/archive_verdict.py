@@ -32,6 +32,7 @@ CRASHED = "crashed its worker"
 NEWER_FORMAT = "is newer than this version reads"
 """Part of the reader's message about a recording of a later format."""
 NO_END = "the recording has no recorded end: the file is cut off"
+NO_TICK = "the recording has no tick"
 MAX_REASONS = 3
 """Largest number of faults that a reason lists."""
 
@@ -160,7 +161,8 @@ def _judge_report(report: ReplayReport, missing: Sequence[str], is_cut_off: bool
         return _row(DAMAGED, _reasons([*faults, *(["all ticks are identical"] if report.identical else [])]))
     if report.identical:
         return _row(IDENTICAL, _reasons(missing))
-    return _row(NOT_VERIFIED, _reasons([*missing, *(entry["why"] for entry in report.not_verified)]))
+    empty = [] if report.ticks or report.not_verified else [NO_TICK]
+    return _row(NOT_VERIFIED, _reasons([*missing, *empty, *(entry["why"] for entry in report.not_verified)]))
 
 
 def _summarise(paths: list[Path]) -> Row:
@@ -175,6 +177,8 @@ def _summarise(paths: list[Path]) -> Row:
     faults = [problem for problem in summary.problems if problem not in missing]
     if summary.result is None:
         faults.append(NO_END)
+    if not summary.ticks_logged:
+        faults.append(NO_TICK)
     return _row(DAMAGED, _reasons(faults), **figures) if faults else _row(READABLE, _reasons(missing), **figures)
 
 

@@ -16,6 +16,7 @@ from rtloop.campaigns.rig_experiments import Experiment
 from rtloop.campaigns.samples import Sampling
 from rtloop.campaigns.uncertain import UncertainOptions
 from rtloop.configuration.file import Configuration, describe, load
+from rtloop.configuration.simulated import middle_um, sensor_ends_um
 from rtloop.configuration.text_files import parse_toml, read_text
 from rtloop.design.synthesis.specification_file import load_specification
 from rtloop.design.verification.judgement import required_limits
@@ -136,9 +137,12 @@ def load_campaign(path: Path, rigs: int | None = None, configuration: Path | Non
     names = [axis.name for axis in loaded.axes]
     if options.axis and options.axis not in names:
         raise ConfigError(str(path), [f"axis: {options.axis!r} is unknown; allowed: {', '.join(names)}"])
+    axis = next(axis for axis in loaded.axes if options.axis in ("", axis.name))
+    middle = middle_um(axis, sensor_ends_um(loaded, axis))
+    experiments = tuple(experiment.about(middle) for experiment in options.experiment)
     return Campaign(
         f"{path.stem}-{loaded.name}",
-        options,
+        options.model_copy(update={"experiment": experiments}),
         loaded.text,
         loaded.name,
         loaded.folder,

@@ -234,6 +234,9 @@ class CaseRunner:
             experiment.measure(Motion(np.zeros(ticks), np.zeros((ticks, POINTS)), rate_hz))
         except (ConfigError, ValueError) as error:
             return f"experiment.{experiment.label}: {_refusal_text(error)}; the loop runs at {self.rate_hz:g} Hz"
+        if beyond := self._builder.beyond_reach(experiment):
+            remedy = "Use other levels, another offset_um or hold_um, or a smaller amplitude_um"
+            return f"experiment.{experiment.label}: {beyond}. {remedy}"
         return ""
 
 

@@ -10,6 +10,8 @@ from rtloop.campaigns.rig_experiments import Experiment
 from rtloop.configuration.file import parse
 from rtloop.configuration.prepare import prepare
 from rtloop.errors import output_errors
+from rtloop.recording.errors import RecordingError
+from rtloop.recording.file.reader import Reader
 from rtloop.supervision.supervisor import Processes, Supervisor
 
 
@@ -37,9 +39,11 @@ def record_values(runner: CaseRunner, values: Mapping[str, object], name: str, f
 
 
 def _record(runner: CaseRunner, values: Mapping[str, object], experiment: Experiment, path: Path) -> Path:
-    """Run and record one experiment of a rig to `path`, unless this file exists; return the path."""
+    """Run and record one experiment of a rig to `path`, unless a recording with ticks exists there; return the path."""
     if path.exists():
-        return path
+        if has_ticks(path):
+            return path
+        path.unlink()
     source = f"{runner.campaign.name}, {path.stem}"
     text = runner.configuration_text(values, experiment, source)
     configuration = parse(text, path.stem, runner.campaign.folder, source)
@@ -47,3 +51,12 @@ def _record(runner: CaseRunner, values: Mapping[str, object], experiment: Experi
     with Processes() as processes:
         Supervisor(processes, prepared, path).run()
     return path
+
+
+def has_ticks(path: Path) -> bool:
+    """Whether a file is a recording with at least one tick; False for a file that cannot be read."""
+    try:
+        with Reader(path) as reader:
+            return bool(reader.tick_chunks)
+    except RecordingError:
+        return False

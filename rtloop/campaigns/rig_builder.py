@@ -15,9 +15,11 @@ from typing import Any, NamedTuple, cast
 from rtloop.campaigns.campaign_file import Campaign
 from rtloop.campaigns.keys import is_rig_key, option_value, replace_values
 from rtloop.campaigns.rig_experiments import Experiment
+from rtloop.configuration.cautions import reference_cautions
 from rtloop.configuration.file import Configuration, parse
 from rtloop.configuration.laws import Library
 from rtloop.configuration.prepare import prepare
+from rtloop.configuration.reference_options import ReferenceOptions, StepsOptions
 from rtloop.configuration.references import TableOfSamples, generator_values
 from rtloop.configuration.text_files import parse_toml
 from rtloop.design.toml_text import write_section
@@ -93,10 +95,19 @@ class RigBuilder:
         `values` are by key; a value None is left out. Raises ValueError for a key for which the tables have no place.
         """
         tables = self._add_disturbance(replace_values(self._tables, _present(values)), experiment)
-        for axis in tables["axis"]:
-            if axis["name"] == self.axis:
-                axis["reference"] = experiment.reference.model_dump(mode="json", exclude_unset=True)
-        return write_section("", tables, [heading])
+        return write_section("", self._play(tables, experiment.reference), [heading])
+
+    def beyond_reach(self, experiment: Experiment) -> str:
+        """Return in words what the reference of an experiment exceeds on the nominal rig; "" if it is within reach.
+
+        The level 0 before the first step does not count: an actuator that a drive of one sign moves is there only once.
+        """
+        reference = experiment.reference
+        if isinstance(reference, StepsOptions):
+            reference = reference.model_copy(update={"levels": reference.levels[1:]})
+        loop = self._build_loop(self._play(self._tables, reference))
+        axis = next(axis for axis in loop.configuration.axes if axis.name == self.axis)
+        return "; ".join(reference_cautions(loop.configuration, loop.plan, axis))
 
     def fingerprint(self, values: Mapping[str, object]) -> bytes:
         """Return bytes that are equal for two sets of values with equal plans and, in every experiment, equal rigs.
@@ -122,6 +133,12 @@ class RigBuilder:
             fault = f"driver.kind: {configuration.driver_kind!r}; a campaign needs the simulated rig, kind = 'sim'"
             raise ConfigError(name, [fault])
         return Loop(configuration, replace(prepare(configuration, paced=False).plan, mode=Mode.CLOSED_LOOP))
+
+    def _play(self, tables: dict[str, Any], reference: ReferenceOptions) -> dict[str, Any]:
+        """Return tables whose axis plays a reference; `tables` stay as they are."""
+        played = reference.model_dump(mode="json", exclude_unset=True)
+        axes = [{**axis, "reference": played} if axis["name"] == self.axis else axis for axis in tables["axis"]]
+        return {**tables, "axis": axes}
 
     def _add_disturbance(self, tables: dict[str, Any], experiment: Experiment) -> dict[str, Any]:
         """Return tables whose driver has the disturbance of an experiment on the axis that it moves.

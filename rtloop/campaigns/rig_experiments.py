@@ -20,6 +20,8 @@ POINTS = 8
 """Places in each period, the tick included, at which the position is judged."""
 SETTLING_BAND = 0.05
 """Part of a disturbance that may be left when it counts as settled."""
+APPROACH_S = 0.5
+"""Time in which a loop comes to rest in the middle of a stage of one sign."""
 NAME = r"[A-Za-z][A-Za-z0-9_-]*"
 
 
@@ -52,6 +54,10 @@ class ExperimentOptions(Options):
     def label(self) -> str:
         """Name of the experiment: `name`, or its kind without one."""
         return self.name or str(getattr(self, "kind", ""))
+
+    def about(self, middle_um: float) -> Self:
+        """Return the experiment about `middle_um`, where it leaves its middle open; levels of steps stay."""
+        return self
 
     @property
     def duration_s(self) -> float:
@@ -142,12 +148,15 @@ class StepsExperiment(ExperimentOptions):
 
 
 class WaveExperiment(ExperimentOptions):
-    """A sine, or as a scan a triangle, about 0; figures leave out the first `settle_periods`."""
+    """A sine, or as a scan a triangle, about `offset_um`; figures leave out the first `settle_periods`."""
 
     kind: Literal["sine", "scan"]
     """Selects a sine, or with "scan" a triangle, judged by the error's root mean square and peak."""
     amplitude_um: float = Field(gt=0)
     """Half the distance from peak to peak."""
+    offset_um: float | None = None
+    """Middle of the wave, which begins at its end next to 0; by default 0, for a drive of one sign the middle of the
+    positions that it reaches."""
     frequency_hz: float = Field(gt=0)
     """Frequency of the wave; half of the loop's rate or more is refused."""
     periods: float = Field(default=5.0, gt=0, le=1e5)
@@ -162,6 +171,10 @@ class WaveExperiment(ExperimentOptions):
             raise ValueError(f"settle_periods: {self.settle_periods:g}; allowed: less than periods = {self.periods:g}")
         return self
 
+    def about(self, middle_um: float) -> Self:
+        """Return the wave with `offset_um` = `middle_um`, unless it is given."""
+        return self if self.offset_um is not None else self.model_copy(update={"offset_um": middle_um})
+
     @property
     def duration_s(self) -> float:
         """Duration of all periods of the wave."""
@@ -169,9 +182,12 @@ class WaveExperiment(ExperimentOptions):
 
     @property
     def reference(self) -> ReferenceOptions:
-        """A sine or a triangle about 0."""
-        kind = "sine" if self.kind == "sine" else "triangle"
-        return WaveOptions(kind=kind, amplitude=self.amplitude_um, frequency_hz=self.frequency_hz)
+        """A sine or a triangle: about 0 from 0 on, else from the end next to 0."""
+        kind, offset_um = "sine" if self.kind == "sine" else "triangle", self.offset_um or 0.0
+        wave = WaveOptions(kind=kind, amplitude=self.amplitude_um, frequency_hz=self.frequency_hz)
+        if not offset_um:
+            return wave
+        return wave.model_copy(update={"offset": offset_um, "phase_deg": math.copysign(90.0, -offset_um)})
 
     @property
     def figures(self) -> tuple[str, ...]:
@@ -208,10 +224,12 @@ class DisturbanceExperiment(ExperimentOptions):
     """Amplitude of a sinusoidal disturbance."""
     sine_hz: float = Field(default=1.0, gt=0)
     """Frequency of the sinusoidal disturbance; half of the loop's rate or more is refused."""
-    hold_um: float = 0.0
-    """Constant reference during the experiment."""
+    hold_um: float | None = None
+    """Constant reference during the experiment; by default 0, for a drive of one sign the middle of the positions that
+    it reaches."""
     start_s: float = Field(default=0.1, ge=0, le=100)
-    """Time from the start of the experiment to the disturbance, in which the loop comes to rest."""
+    """Time from the start of the experiment to the disturbance, in which the loop comes to rest; by default 0.5 s where
+    a drive of one sign moves `hold_um` to the middle."""
     lasts_s: float = Field(default=0.2, gt=0, le=1000)
     """Time from the beginning of the disturbance to the end of the experiment, over which figures count."""
 
@@ -222,6 +240,15 @@ class DisturbanceExperiment(ExperimentOptions):
             raise ValueError("step_um and sine_um are 0; allowed: at least one other than 0")
         return self
 
+    def about(self, middle_um: float) -> Self:
+        """Return the experiment with `hold_um` = `middle_um`, unless it is given; a loop that has to go there gets
+        APPROACH_S before the disturbance, unless `start_s` is given.
+        """
+        if self.hold_um is not None:
+            return self
+        waits = {"start_s": APPROACH_S} if middle_um and "start_s" not in self.model_fields_set else {}
+        return self.model_copy(update={"hold_um": middle_um, **waits})
+
     @property
     def duration_s(self) -> float:
         """Time before the disturbance, and the time that it lasts."""
@@ -230,7 +257,7 @@ class DisturbanceExperiment(ExperimentOptions):
     @property
     def reference(self) -> ReferenceOptions:
         """A constant level, `hold_um`."""
-        return HoldOptions(kind="hold", value=self.hold_um)
+        return HoldOptions(kind="hold", value=self.hold_um or 0.0)
 
     @property
     def disturbance(self) -> dict[str, float]:

@@ -215,6 +215,8 @@ def _print_summary(summary: CampaignSummary, folder: Path) -> None:
     """Print yield, figures, causes of failures, variances, worst rigs with the folder of their recordings, and rigs
     that crashed or cannot run.
     """
+    from rtloop.campaigns.recorded_case import has_ticks
+
     out, estimate = console(), summary.yield_of_rigs
     out.print(
         f"{escape(summary.name)}: {estimate.passed:,} of {count_text(estimate.rigs, 'rig')} pass, yield "
@@ -243,8 +245,12 @@ def _print_summary(summary: CampaignSummary, folder: Path) -> None:
             for rig in summary.worst_rigs
         ]
         out.print(table("worst rig", "figure / limit", *(key.rpartition(".")[2] for key in keys), rows=rows))
-        if list((folder / "worst").glob("*.mcap")):
+        recordings = sorted((folder / "worst").glob("*.mcap"))
+        empty = [path.name for path in recordings if not has_ticks(path)]
+        if len(recordings) > len(empty):
             out.print(f"recordings: {escape(folder / 'worst')}")
+        for name in empty:
+            out.print(f"[red]{escape(name)}[/] has no tick; `rtloop campaign run` records it again")
     for rig in summary.crashed:
         out.print(f"[red]rig {rig}[/]: the worker process died each time that this rig ran; the rig counts as failed")
     for rig, text in summary.refused[:5]:

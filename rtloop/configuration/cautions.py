@@ -16,6 +16,7 @@ from rtloop.configuration.axis import AxisOptions
 from rtloop.configuration.checks import AxisCheck
 from rtloop.configuration.file import Configuration
 from rtloop.configuration.prepare import Prepared, build_driver
+from rtloop.configuration.reference_options import StepsOptions
 from rtloop.configuration.references import extent, references_in_plan, volts
 from rtloop.configuration.rig import driver_delay_ticks
 from rtloop.configuration.simulated import (
@@ -25,6 +26,7 @@ from rtloop.configuration.simulated import (
     drive_ends_um,
     sensor_ends_um,
 )
+from rtloop.engine.plan import Plan
 from rtloop.hysteresis.reach import can_hold, reachable_range
 from rtloop.kernel.reference import Generator
 from rtloop.signals import Mode
@@ -49,8 +51,9 @@ def option_cautions(prepared: Prepared) -> list[str]:
     configuration = prepared.configuration
     warnings = [f"loop.{line}" for line in _pacing(configuration)] + list(_service(configuration))
     warnings += build_driver(configuration).cautions()
+    warnings += _first_step(prepared)
     for axis, check in zip(configuration.axes, prepared.checks, strict=True):
-        lines = (*_references(prepared, axis), *_reach(configuration, axis))
+        lines = (*reference_cautions(configuration, prepared.plan, axis), *_reach(configuration, axis))
         warnings += [f"axis.{axis.name}.{line}" for line in lines]
         comparison = compare_with_rig(configuration, axis, check)
         warnings += [*_delay(configuration, axis, check), *comparison.contradictions]
@@ -138,12 +141,30 @@ def rig_problem(axis: AxisOptions, check: AxisCheck, comparison: RigComparison) 
     return None if problem is None else f"axis.{axis.name}: on the simulated rig, {problem}"
 
 
-def _references(prepared: Prepared, axis: AxisOptions) -> Iterator[str]:
+def _first_step(prepared: Prepared) -> Iterator[str]:
+    """Yield a warning for a run that ends before the first of its references steps; none where a reference is no series
+    of steps.
+    """
+    configuration, ticks = prepared.configuration, prepared.plan.ticks
+    references = [axis.reference for axis in configuration.axes]
+    steps = [reference for reference in references if isinstance(reference, StepsOptions)]
+    if ticks is None or len(steps) < len(references) or configuration.schedule:
+        return
+    rate_hz = configuration.loop.rate_hz
+    first_s = min(round(reference.dwell_s * rate_hz) for reference in steps) / rate_hz
+    if ticks / rate_hz <= first_s and any(len(set(reference.levels)) > 1 for reference in steps):
+        yield (
+            f"axis.reference.dwell_s: the first step comes after {first_s:g} s, and this run ends after "
+            f"{ticks / rate_hz:g} s: it has no step. Use --duration with at least {2 * first_s:g}"
+        )
+
+
+def reference_cautions(configuration: Configuration, plan: Plan, axis: AxisOptions) -> Iterator[str]:
     """Yield lines for each reference of the axis, its own and the schedule's, that is beyond the axis's limits.
 
     Each reference is judged in the mode in which it begins.
     """
-    limits, plan = axis.limits, prepared.plan
+    limits = axis.limits
     for label, mode, values in references_in_plan(plan, plan.axes.index(axis.name)):
         first, count = (int(values[1]), int(values[2])) if values[0] == Generator.TABLE else (0, 0)
         command_um = plan.table[first + count : first + 2 * count] if values[0] == Generator.TABLE and values[5] else []
@@ -152,7 +173,7 @@ def _references(prepared: Prepared, axis: AxisOptions) -> Iterator[str]:
             allowed = f"{limits.lowest_v:g} V … {limits.drive_v:g} V"
             yield f"{label}: {volts(lowest, highest)}, beyond the drive's limits, {allowed}"
         if mode in (Mode.FEEDFORWARD, Mode.CLOSED_LOOP):
-            ends_um = sensor_ends_um(prepared.configuration, axis)
+            ends_um = sensor_ends_um(configuration, axis)
             yield from (f"{label}: {line}" for line in _unreachable(axis, lowest, highest, ends_um))
         if (largest_um := float(np.max(np.abs(command_um), initial=0.0))) > limits.command_um:
             yield f"{label}: adds {largest_um:g} µm to the command, beyond limits.command_um = {limits.command_um:g}"

@@ -15,6 +15,7 @@ from rtloop.configuration.file import Configuration
 from rtloop.configuration.rig import driver_delay_ticks, plant_dynamics, plant_plays, simulated_plant
 from rtloop.hysteresis.play_model import PlayModel
 from rtloop.hysteresis.plays import loading_curve
+from rtloop.hysteresis.reach import reachable_range
 from rtloop.linear.transfer import Transfer
 
 LARGEST_STROKE_RATIO = 3.0
@@ -110,6 +111,19 @@ def sensor_reach_um(configuration: Configuration, axis: AxisOptions) -> float:
     """
     low_um, high_um = sensor_ends_um(configuration, axis)
     return max(min(-low_um, high_um), 0.0) if axis.limits.lowest_v < 0.0 else max(-low_um, high_um)
+
+
+def middle_um(axis: AxisOptions, sensor_ends_um: tuple[float, float]) -> float:
+    """Return the position in µm about which an axis moves by default, three digits: 0 for a drive of both signs, else
+    the middle of the positions that it can take in any order, within the position interlock and `sensor_ends_um`.
+    """
+    limits = axis.limits
+    if limits.lowest_v < 0:
+        return 0.0
+    reach_um = min(limits.command_um, axis.interlocks.position_um)
+    reached = reachable_range(axis.feedforward.actuator(), 0.0, limits.drive_v, reach_um)
+    low_um, high_um = max(reached.low_um, sensor_ends_um[0]), min(reached.high_um, sensor_ends_um[1])
+    return float(f"{(low_um + high_um) / 2:.3g}")
 
 
 def _stroke_ratio(axis: AxisOptions, rig_plays: PlayModel) -> float | None:
