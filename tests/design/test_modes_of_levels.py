@@ -5,6 +5,8 @@ The recordings are made by scipy alone: a resonance of 310 Hz that rings until t
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 from scipy.signal import cont2discrete, lfilter
@@ -20,13 +22,13 @@ OMEGA = 2 * np.pi * 310
 
 def response(u: Real, numerator: list[float], denominator: list[float]) -> Real:
     """Return the response (samples,) to a held input, from rest."""
-    b, a, _ = cont2discrete((numerator, denominator), PERIOD_S)
-    return lfilter(np.ravel(b), a, u)
+    discrete: Any = cont2discrete((numerator, denominator), PERIOD_S)
+    return np.asarray(lfilter(np.ravel(discrete[0]), discrete[1], u), float)
 
 
 def identify(errors_um: tuple[float, float], slow_hz: float, slow_share: float, noise_um: float) -> DynamicsFit:
     """Identify a second of a step to 40 and to 22 µm, whose levels miss `errors_um`, from a resonance and a real pole
-    at `slow_hz` that has `slow_share` of the gain. A second error of -22 µm is one of no second step.
+    at `slow_hz` that has `slow_share` of the gain.
     """
     k, rate = np.arange(SAMPLES), 2 * np.pi * slow_hz
     levels_um = 40.0 * (k >= 1000) - 18.0 * (k >= 5500)
