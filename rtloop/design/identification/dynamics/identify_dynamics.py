@@ -256,7 +256,7 @@ def _build_fit(
         covariance = covariance * tests.cross_ratio**2
     if prune and model.rates.size > 1:
         for mode in np.flatnonzero(uncertain_rates(model, covariance, noise=True)):
-            smaller = _without_mode(model, mode, run)
+            smaller = _without_mode(model, int(mode), run)
             if smaller is not None:
                 fit = _build_fit(smaller, run, candidates, delay_ticks, prune=True)
                 left_out_hz = float(abs(model.rates[mode])) / (2 * np.pi)
