@@ -1,7 +1,7 @@
 """Runs beside 20 busy loops: the host is to blame for each trip, and dead supervisors are noticed as before.
 
 `make soak NAME=busy`. One line a run: in virtual time, paced, as an idle service, and with a supervisor that is killed
-or stopped. It ends with exit code 1 if a run in virtual time trips, if another trip does not name the host's stall with
+or stopped; these four kinds run at the same time. It ends with exit code 1 if a run in virtual time trips, if another trip does not name the host's stall with
 its length, or if a lost supervisor leads to no trip within the heartbeat's timeout.
 """
 
@@ -17,6 +17,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -169,18 +170,23 @@ def main() -> None:
         "idle": (others, lambda folder, _: stand_idle(folder, seconds)),
         "lost": (max(others, 2), lambda folder, number: lose_supervisor(folder, signals[number % 2])),
     }
-    failures = 0
-    with busy_host(options.loops):
-        for kind, (count, measure) in kinds.items():
-            for number in range(count):
-                with tempfile.TemporaryDirectory() as name:
-                    begin_s = time.monotonic()
-                    try:
-                        verdict = measure(Path(name), number)
-                    except (TimeoutError, subprocess.TimeoutExpired) as error:
-                        verdict = f"FAILS: no end: {error}"
-                failures += verdict.startswith("FAILS")
-                print(f"{kind} {number + 1}/{count} {time.monotonic() - begin_s:.0f} s {verdict}", flush=True)
+
+    def run_kind(kind: str) -> int:
+        """Run one kind, and return how many runs of it fail."""
+        (count, measure), failures = kinds[kind], 0
+        for number in range(count):
+            with tempfile.TemporaryDirectory() as name:
+                begin_s = time.monotonic()
+                try:
+                    verdict = measure(Path(name), number)
+                except (TimeoutError, subprocess.TimeoutExpired) as error:
+                    verdict = f"FAILS: no end: {error}"
+            failures += verdict.startswith("FAILS")
+            print(f"{kind} {number + 1}/{count} {time.monotonic() - begin_s:.0f} s {verdict}", flush=True)
+        return failures
+
+    with busy_host(options.loops), ThreadPoolExecutor(len(kinds)) as kinds_at_once:
+        failures = sum(kinds_at_once.map(run_kind, kinds))
     print(f"{failures} of {sum(count for count, _ in kinds.values())} runs fail")
     sys.exit(failures > 0)
 

@@ -54,7 +54,9 @@ def _tmpfs(folder: str, size: str = "16k") -> str:
 SURROUNDINGS: dict[str, Surrounding] = {
     "planted": Surrounding(prepare=plant),
     "planted, python -m": Surrounding(
-        prepare=lambda place, markers: plant(place, markers, ("rtloop",)), program=("python", "-m", "rtloop"), same_text=False
+        prepare=lambda place, markers: plant(place, markers, ("rtloop",)),
+        program=("python", "-m", "rtloop"),
+        same_text=False,
     ),
     "planted, PATH=.": Surrounding({"PATH": f".:{os.environ['PATH']}"}, prepare=plant),
     "matplotlibrc at home": Surrounding(
