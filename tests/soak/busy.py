@@ -1,8 +1,9 @@
 """Runs beside 20 busy loops: the host is to blame for each trip, and dead supervisors are noticed as before.
 
 `make soak NAME=busy`. One line a run: in virtual time, paced, as an idle service, and with a supervisor that is killed
-or stopped; these four kinds run at the same time. It ends with exit code 1 if a run in virtual time trips, if another trip does not name the host's stall with
-its length, or if a lost supervisor leads to no trip within the heartbeat's timeout.
+or stopped; these four kinds run at the same time. It ends with exit code 1 if a run in virtual time trips, if another
+trip does not name the host's stall with its length, or if a lost supervisor leads to no trip within the heartbeat's
+timeout.
 """
 
 from __future__ import annotations
