@@ -33,6 +33,7 @@ SNAPSHOT_SECONDS = 1.0
 REHEARSED_TICKS = 100
 REHEARSED_LAWS = ("prandtl_ishlinskii", "transfer")
 UNLIMITED = np.iinfo(np.int64).max
+CLOSED_LOOP = int(Mode.CLOSED_LOOP)
 
 
 def law_at_rest(plan: Plan) -> LawMemory:
@@ -48,7 +49,7 @@ def law_at_rest(plan: Plan) -> LawMemory:
 @python_entry("int64(intp, int64)")
 def _set_initial_mode(law_address, mode):
     """Set the mode of the LAW record at an address before its first tick. Returns 0."""
-    set_mode(carray(address_pointer(law_address), 1, LAW)[0], mode, True)
+    set_mode(carray(address_pointer(law_address), 1, LAW)[0], mode, mode != CLOSED_LOOP)
     return 0
 
 

@@ -132,7 +132,7 @@ def _apply_command(loop, command):
         mode = np.int64(command.values[0])
         if mode != OFF:
             _change_units(loop, mode, command.values[2] != 0.0)
-        set_mode(law, mode, loop.tick == 0)
+        set_mode(law, mode, loop.tick == 0 and mode != CLOSED_LOOP)
     elif command.kind == SET_REFERENCE:
         _set_reference(loop, command)
     elif command.kind == RESET_TRIP:

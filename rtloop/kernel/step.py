@@ -105,7 +105,8 @@ def all_coefficients_fit(law):
 def set_mode(law, mode, at_rest):
     """Change the mode and clear failures of laws.
 
-    The next tick enters the mode without a jump of the drive, except if `at_rest` says that no tick has run yet.
+    The next tick enters the mode without a jump of the drive, except if `at_rest`: the mode then begins at once, as
+    RAW and FEEDFORWARD do before the first tick.
     A mode other than OFF, unless `at_rest`, restarts the pre-filter with the next reference: its history may be volts.
     A latched trip is not cleared, and sets mode OFF again in the next tick.
     """

@@ -33,9 +33,9 @@ class Recording(RecordedSignals):
         >>> rtloop.load("run.mcap").to_pandas(["x_position_um"], start_s=0.1, end_s=0.1002).round(2)
                   tick  deadline_ns  x_position_um
         time_s
-        0.1000  1000.0  100000000.0          19.98
-        0.1001  1001.0  100100000.0          20.01
-        0.1002  1002.0  100200000.0          20.01
+        0.1000  1000.0  100000000.0          19.81
+        0.1001  1001.0  100100000.0          19.82
+        0.1002  1002.0  100200000.0          19.81
         """
         return frames.to_pandas(self, Selection(tuple(signals), start_s, end_s, every))
 
@@ -62,6 +62,6 @@ def load(path: RecordingPaths) -> Recording:
     >>> run
     <Recording run.mcap: axes x, 10000 Hz, 23 signals>
     >>> round(float(run["x_position_um"].max()), 1), run.units["x_position_um"], len(run)
-    (20.5, 'µm', 7000)
+    (20.1, 'µm', 7000)
     """
     return Recording(find_files(path))

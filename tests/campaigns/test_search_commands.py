@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 import rtloop
-from tests.campaigns.campaign_files import write_campaign
+from tests.campaigns.campaign_files import STEPS, write_campaign
 from tests.command_line import answer, run
 
 KEY = "driver.plant.sensor.offset_um"
@@ -21,8 +21,13 @@ PAPER_ERROR_PERCENT = 0.2
 
 @pytest.fixture(scope="module")
 def campaign(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return the path of a campaign with an uncertain offset of the sensor, and 5 % as limit of the static error."""
-    return write_campaign(tmp_path_factory.mktemp("offset"), uncertain=f'"{KEY}" = {{ uniform = [0.0, 1.0] }}')
+    """Return the path of a campaign with an uncertain offset of the sensor, and 5 % as limit of the static error.
+
+    The loop enters with the offset as its error, which has decayed when a level ends.
+    """
+    steps = STEPS.replace("dwell_s = 0.03", "dwell_s = 0.5")
+    uncertain = f'"{KEY}" = {{ uniform = [0.0, 1.0] }}'
+    return write_campaign(tmp_path_factory.mktemp("offset"), uncertain=uncertain, experiments=steps)
 
 
 def test_the_boundary_is_the_offset_that_costs_the_allowed_error(campaign: Path):

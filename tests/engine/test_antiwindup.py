@@ -11,16 +11,16 @@ import pytest
 from tests.engine.harness import AXIS, CONTROLLER, EXACT, IDEAL, MATCHED, TUSTIN, LoopBench, text
 from tests.engine.oracle import closed_loop
 
-STEP = '[axis.reference]\nkind = "hold"\nvalue = 40.0\n'
+STEP = '[axis.reference]\nkind = "steps"\nlevels = [0.0, 40.0]\ndwell_s = 0.4\nrepeat = false\n'
 LIMITS = "[axis.limits]\ncommand_um = {}\n"
 COMMAND_LIMITED, DRIVE_LIMITED = 2, 4
-TICKS = 3000
+TICKS, REST = 3000, 4000
 
 
 def simulate_step(lines: str, command_um: float) -> tuple[np.ndarray, np.ndarray]:
     """Return the true position (µm) and the flags of each tick of a 40 µm step, with a limit of the command."""
     bench = LoopBench(text(IDEAL, AXIS, EXACT, CONTROLLER, lines, LIMITS.format(command_um), STEP))
-    rows = bench.run(TICKS)
+    rows = bench.run(REST + TICKS)[REST:]
     return bench.column(rows, "x_true_position_um"), bench.column(rows, "flags").astype(int)
 
 
@@ -53,9 +53,9 @@ def test_a_limited_step_recovers(method, lines, command_um, flag):
 @pytest.mark.parametrize(("method", "lines"), [("matched", MATCHED), ("tustin", TUSTIN)])
 def test_a_reference_out_of_reach_is_left_at_once(method, lines):
     """The reference is 60 µm, beyond the limit, for 0.2 s, then 0: a controller that winds up returns much later."""
-    steps = '[axis.reference]\nkind = "steps"\nlevels = [60.0, 0.0]\ndwell_s = 0.2\nrepeat = false\n'
+    steps = '[axis.reference]\nkind = "steps"\nlevels = [0.0, 60.0, 0.0]\ndwell_s = 0.2\nrepeat = false\n'
     bench = LoopBench(text(IDEAL, AXIS, EXACT, CONTROLLER, lines, LIMITS.format(42.0), steps))
-    rows = bench.run(6000)
+    rows = bench.run(8000)[2000:]
     reference = np.where(np.arange(6000) < 2000, 60.0, 0.0)
     return_um = bench.column(rows, "x_true_position_um")[2000:]
     wound_up = closed_loop(reference, method, limit_um=42.0).position_um[2000:]

@@ -79,6 +79,12 @@ def make_invertible(text: str) -> str:
     return text.replace("[driver.coupling]", INVERTIBLE)
 
 
+def step_to(level_um: float, rest_ticks: int) -> str:
+    """Return a reference that steps from 0 to a level, after `rest_ticks` ticks, and stays there."""
+    dwell_s = rest_ticks * PERIOD_S
+    return f'kind = "steps"\nlevels = [0.0, {level_um}]\ndwell_s = {dwell_s}\nrepeat = false'
+
+
 def run(text: str, ticks: int, folder: Path = Path()) -> tuple[LoopBench, np.ndarray]:
     """Run a configuration; return its bench and its records (ticks, columns)."""
     bench = LoopBench(prepare_text(text, folder).plan)
@@ -173,10 +179,10 @@ def test_cross_talk_is_what_the_decoupling_takes_away():
 
     The rest is the dead band of the first threshold, 0.095 V · 2.55 µm/V, which this inverse leaves in y.
     """
-    text = set_references(EXAMPLE.replace("[driver.coupling]", NOMINAL), 'kind = "hold"\nvalue = 20.0', 'kind = "hold"')
+    text = set_references(EXAMPLE.replace("[driver.coupling]", NOMINAL), step_to(20.0, 500), 'kind = "hold"')
     cross_talk = {}
     for name, configuration in (("decoupled", text), ("single", two_single_loops(text))):
-        bench, rows = run(configuration, 2000)
+        bench, rows = run(configuration, 2500)
         assert abs(bench.column(rows, "x_true_position_um")[-1] - 20.0) < 0.1
         cross_talk[name] = np.max(np.abs(bench.column(rows, "y_true_position_um"))) / 20.0
     assert cross_talk["decoupled"] < 1.1 * 0.095 * 2.55 / 20.0, cross_talk
@@ -225,8 +231,8 @@ def test_it_is_verified_as_it_runs():
     assert report["axes"][0]["together"] == prepare_text(EXAMPLE).checks[0].together.margins.as_dict()
     rows = {row["name"]: row for row in report["axes"][0]["rows"]}
     assert all(row["continuous"] is None for row in rows.values())
-    bench, ticks = run(set_references(make_invertible(EXAMPLE), 'kind = "hold"\nvalue = 10.0', 'kind = "hold"'), 600)
-    position_um = bench.column(ticks, "x_true_position_um")
+    bench, ticks = run(set_references(make_invertible(EXAMPLE), step_to(10.0, 500), 'kind = "hold"'), 1100)
+    position_um = bench.column(ticks, "x_true_position_um")[500:]
     assert rows["peak_command"]["running"] == pytest.approx(bench.column(ticks, "x_command_um").max() / 10.0, rel=0.01)
     outside = np.flatnonzero(np.abs(position_um / position_um[-1] - 1) > 0.05)
     assert rows["settling_ms"]["running"] == pytest.approx((outside[-1] + 1) * 0.1, abs=0.15)

@@ -1,8 +1,8 @@
 """Run another law on a recording: on the recorded inputs, or in closed loop with a simulated rig.
 
-Both start from rest, with the recorded references and commands. On the recorded inputs, the outputs of the law have no
-effect on the inputs; with the rig, the loop is closed. Law and rig ignore missing ticks: they continue with the next
-recorded tick.
+Both start from rest, as a run does, with the recorded references and commands. On the recorded inputs, the outputs of
+the law have no effect on the inputs; with the rig, the loop is closed. Law and rig ignore missing ticks: they continue
+with the next recorded tick.
 """
 
 from __future__ import annotations
@@ -30,10 +30,14 @@ from rtloop.signals import Mode
 
 
 class LawWithCoefficients(NamedTuple):
-    """Laws that a loop knows, and the coefficients of its axes."""
+    """Laws that a loop knows, and the coefficients of its axes.
+
+    `enters` is False for the law of a recording that began in closed loop without an entry, as those of version 0.2.0.
+    """
 
     laws: tuple[LawReference, ...]
     coefficients: Records
+    enters: bool = True
 
 
 def recorded_law(recording: Recording, trust: TrustedLaws = NO_TRUST) -> LawWithCoefficients:
@@ -50,7 +54,8 @@ def recorded_law(recording: Recording, trust: TrustedLaws = NO_TRUST) -> LawWith
             f"{recording.paths[0]}: no snapshot of the law in this recording, so the law's coefficients are unknown; "
             "use another recording"
         )
-    return LawWithCoefficients(laws, snapshot_law(first, recording, laws).coefficients)
+    memory = snapshot_law(first, recording, laws)
+    return LawWithCoefficients(laws, memory.coefficients, bool(memory.axes["entering"].any()))
 
 
 def compare_law(
@@ -135,5 +140,5 @@ def _law_at_rest(recording: Recording, law: LawWithCoefficients, mode: Mode) -> 
     """Memory of the laws `law` at rest, in `mode`, with the extra inputs and outputs of the recording."""
     extras = header_extras(recording.header)
     memory = LawMemory.create_at_rest(law_layout(law.laws), bind_functions(law.laws), law.coefficients, extras)
-    set_mode(memory.law, int(mode), True)
+    set_mode(memory.law, int(mode), not law.enters or mode != Mode.CLOSED_LOOP)
     return memory
