@@ -11,7 +11,7 @@ command needs to show in x is in the plant already: `delay_ticks` counts what co
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple
 
@@ -26,6 +26,9 @@ from rtloop.linear.realisation import System, imaginary_axis_points, realise
 from rtloop.linear.sampled import SampledController
 from rtloop.linear.transfer import Transfer
 
+REFERENCE_NOT_LINEAR = "not linear in the reference"
+"""Fault of a law for which no step can be computed, in messages."""
+
 
 class Injection(NamedTuple):
     """Effect of a signal added to the command: `b` (n,) on the loop's states, `between` on the positions of a period.
@@ -37,6 +40,16 @@ class Injection(NamedTuple):
     between: Real
 
 
+class LawReference(NamedTuple):
+    """Effect of the reference past the error, by the law's own use of it: `b` (n,) on the loop's states, `between` on
+    the positions of a period, `command` on the command.
+    """
+
+    b: Real
+    between: Real
+    command: float
+
+
 @dataclass(frozen=True, eq=False)
 class Loop:
     """C and D as state spaces; `period_s` is None in continuous time. `static_gain` is L at 0 Hz, ±inf if it
@@ -44,7 +57,8 @@ class Loop:
 
     `roots` (k,), in rad/s, are zeros and poles of C and D, near which `frequencies` is dense. `between` is D's position
     within a period, from its states and its input; None in continuous time, and where only the samples are known.
-    `reference` is the pre-filter.
+    `reference` is the pre-filter. `law_reference` is None for a law that uses the error alone. If `reference_fault` is
+    not "", the law is not linear in the reference, for this reason: the response to the reference is not known.
     """
 
     controller: System
@@ -54,6 +68,8 @@ class Loop:
     period_s: float | None = None
     between: IntersampleOutput | None = None
     reference: ReferencePath = UNFILTERED
+    law_reference: LawReference | None = None
+    reference_fault: str = ""
 
     def open(self, hz: npt.ArrayLike) -> Complex:
         """Return L = C·D at frequencies (k,) in Hz, complex (k,): controller C and plant D, in discrete time D with its
@@ -89,7 +105,17 @@ class Loop:
 
     @cached_property
     def matrices(self) -> tuple[Real, Real, Real, Real]:
-        """A (n, n), b (n,), C (2, n), d (2,) from the error's reference to position x and command v.
+        """A (n, n), b (n,), C (2, n), d (2,) from the law's reference (behind the pre-filter) to position x and command
+        v.
+        """
+        a, b, c, d = self.error_matrices
+        if self.law_reference is None:
+            return a, b, c, d
+        return a, b + self.law_reference.b, c, d + np.array([0.0, self.law_reference.command])
+
+    @cached_property
+    def error_matrices(self) -> tuple[Real, Real, Real, Real]:
+        """`matrices` from a signal added to the error alone, such as a negative disturbance of the reading.
 
         The controller's states come first, then the plant's.
         """
@@ -101,12 +127,18 @@ class Loop:
 
     @cached_property
     def positions(self) -> IntersampleOutput:
-        """Positions at the POINTS instants of a period, the sample first, from the closed loop's states and the error's
+        """Positions at the POINTS instants of a period, the sample first, from the closed loop's states and the law's
         reference.
 
         If `between` is None, these are the position at the sample alone: (1, n) and (1,).
         """
-        _, _, c, d = self.matrices
+        rows, direct = self._error_positions
+        return IntersampleOutput(rows, direct if self.law_reference is None else direct + self.law_reference.between)
+
+    @property
+    def _error_positions(self) -> IntersampleOutput:
+        """`positions` from a signal added to the error alone."""
+        _, _, c, d = self.error_matrices
         if self.between is None:
             return IntersampleOutput(c[:1], d[:1])
         _, _, cc, dc = self.controller
@@ -215,7 +247,19 @@ def discrete_loop(
     images = np.concatenate([controller.zeros, controller.poles])
     roots = np.concatenate([_rates(images, period_s), plant.poles])
     static_gain = controller.dc_gain * plant.dc_gain
-    return Loop(controller.system, sampled, static_gain, roots, period_s, between, reference)
+    loop = Loop(controller.system, sampled, static_gain, roots, period_s, between, reference)
+    if isinstance(controller, DiscreteController):
+        return loop
+    loop = replace(loop, reference_fault=controller.reference_fault)
+    if controller.with_reference is None:
+        return loop
+    a, b, c, d = controller.with_reference
+    column, direct = b[:, 1], float(d[0, 1])
+    return replace(
+        loop,
+        controller=System(a, b[:, 0], c[0], float(d[0, 0])),
+        law_reference=LawReference(np.concatenate([column, direct * sampled.b]), direct * between.direct, direct),
+    )
 
 
 def sampled_plant(plant: Transfer, period_s: float, delay_ticks: int = 0) -> System:

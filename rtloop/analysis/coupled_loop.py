@@ -19,7 +19,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from rtloop.analysis.closed_loop import Injection, Loop
+from rtloop.analysis.closed_loop import Injection, LawReference, Loop
 from rtloop.analysis.held_plant import HeldPlant, IntersampleOutput, hold_plant
 from rtloop.analysis.margins import find_maximum
 from rtloop.analysis.reference import UNFILTERED, ReferencePath
@@ -100,10 +100,8 @@ class BrokenLoop(Loop):
         return np.abs(self.command.response(self._points(hz))) * self.sensitivity(hz)
 
     @cached_property
-    def matrices(self) -> tuple[Real, Real, Real, Real]:
-        """A (n, n), b (n,), C (2, n), d (2,) from the reference of the axis's error (without pre-filter) to position,
-        command.
-        """
+    def error_matrices(self) -> tuple[Real, Real, Real, Real]:
+        """A (n, n), b (n,), C (2, n), d (2,) from a signal added to the axis's error to position, command."""
         a, b, c, _ = self.plant
         command_row, direct = self.command.c, self.command.d
         return a - np.outer(b, c), b, np.vstack([c, command_row - direct * c]), np.array([0.0, direct])
@@ -136,7 +134,12 @@ class CoupledLoop:
         """Close the loop at the period of `controller`. Raises ValueError like `CoupledPlant.hold_plants`."""
         self.period_s = controller.period_s
         self._held, self._coupling = plant.hold_plants(controller.period_s), plant.coupling
-        self._controller = controller.system
+        self._controller, self._reference_columns = controller.system, None
+        self._reference_fault = controller.reference_fault
+        if controller.with_reference is not None:
+            a, b, c, d = controller.with_reference
+            m = controller.count
+            self._controller, self._reference_columns = CoupledSystem(a, b[:, :m], c, d[:, :m]), (b[:, m:], d[:, m:])
         self._plant = block_diagonal_system([plant_of_axis.system for plant_of_axis in self._held]).transform(
             plant.coupling
         )
@@ -164,8 +167,18 @@ class CoupledLoop:
         injection = Injection(np.concatenate([bp[:, number], np.zeros(ac.shape[0])]), self._held[number].between.direct)
         between = self._intersample_rows(number, closed_axes)
         return BrokenLoop(
-            UNIT_SYSTEM, plant, float(static), rates, self.period_s, between, reference, command, injection
-        )
+            UNIT_SYSTEM, plant, float(static), rates, self.period_s, between, reference,
+            self._law_reference(number), self._reference_fault, command, injection,
+        )  # fmt: skip
+
+    def _law_reference(self, number: int) -> LawReference | None:
+        """Return the effect of the reference of axis `number` past its error; None for a law that uses errors alone."""
+        if self._reference_columns is None:
+            return None
+        columns, direct = (part[:, number] for part in self._reference_columns)
+        moved_um = float(self._coupling[number] @ direct)
+        states = np.concatenate([self._plant.b @ direct, columns])
+        return LawReference(states, moved_um * self._held[number].between.direct, float(direct[number]))
 
     def _intersample_rows(self, number: int, closed_axes: Real) -> IntersampleOutput:
         """Return positions of axis `number` within a period, from all states (plants, then controller) and its error.

@@ -69,9 +69,10 @@ def step_metrics(loop: Loop, times_s: Sequence[float]) -> StepMetrics:
     """Return the figures of a unit step of the reference, between ticks as well as at them, with the position at
     `times_s`.
 
-    All are NaN for an unstable loop, settling time and overshoot also if the final position is further than 5 % from 1.
+    All are NaN for an unstable loop and for a law that is not linear in its reference, settling time and overshoot also
+    if the final position is further than 5 % from 1.
     """
-    if not loop.is_stable:
+    if not loop.is_stable or loop.reference_fault:
         return StepMetrics(math.nan, math.nan, math.nan, math.nan, tuple(math.nan for _ in times_s))
     response = step_response(loop)
     final, command = loop.final_values

@@ -111,9 +111,9 @@ def _margins(axis: AxisOptions, check: AxisCheck) -> Iterator[str]:
 def tracking_problem(check: AxisCheck) -> str | None:
     """Return a text if a stable loop does not follow its reference at rest, to the fraction SETTLING_BAND of a step.
 
-    None if the loop follows, is unstable or is not known.
+    None if the loop follows, is unstable or is not known, and for a law that is not linear in its reference.
     """
-    if check.on_model is None or not check.on_model.is_stable:
+    if check.on_model is None or not check.on_model.is_stable or check.on_model.reference_fault:
         return None
     final_um, _ = check.on_model.final_values
     if abs(1 - final_um) <= SETTLING_BAND:

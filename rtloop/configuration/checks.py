@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from rtloop.analysis.closed_loop import Loop, continuous_loop, discrete_loop
+from rtloop.analysis.closed_loop import REFERENCE_NOT_LINEAR, Loop, continuous_loop, discrete_loop
 from rtloop.analysis.comparison import ControllerComparison, compare_controllers
 from rtloop.analysis.coupled_loop import CoupledLoop, CoupledPlant, SimultaneousMargins, coupling_matrix
 from rtloop.analysis.loop_analysis import LoopAnalysis, analyse_loop
@@ -227,7 +227,8 @@ def promised_loop(axis: AxisOptions, rate_hz: float, delay: int, plant: Transfer
     if axis.model is None or law is None or law.count > 1:
         return None
     try:
-        return discrete_loop(linear_part(law), plant or axis.model.transfer(), delay, axis.prefilter.path())
+        linear = linear_part(law, axis.limits.command_um)
+        return discrete_loop(linear, plant or axis.model.transfer(), delay, axis.prefilter.path())
     except ValueError:
         return None
 
@@ -244,7 +245,7 @@ def _check_axis(configuration: Configuration, axes: Sequence[AxisOptions], findi
     law = make_controller(axis, 1.0 / configuration.loop.rate_hz, [_delayed_model(axis, delay)])
     if law is None:
         return [AxisCheck(axis.name)]
-    linear = _linear_part(law, key, findings, isinstance(law, TransferController))
+    linear = _linear_part(law, key, axes, findings, isinstance(law, TransferController))
     if linear is None and isinstance(law, TransferController):
         return [AxisCheck(axis.name, delay_ticks=delay, reference=axis.prefilter.path())]
     check = AxisCheck(axis.name, law, linear, delay_ticks=delay, reference=axis.prefilter.path())
@@ -261,10 +262,17 @@ def _check_axis(configuration: Configuration, axes: Sequence[AxisOptions], findi
     return [replace(check, plant=plant)]
 
 
-def _linear_part(law: Controller, key: str, findings: Findings, is_required: bool) -> Any:
-    """Return the law linearised at rest; None where it is not linear: a fault if `is_required`, else a warning."""
+def _linear_part(law: Controller, key: str, axes: Sequence[AxisOptions], findings: Findings, is_required: bool) -> Any:
+    """Return the law linearised at rest; None where it is not linear: a fault if `is_required`, else a warning.
+
+    A law that is not linear for references within the limits of `axes` gives a warning, too.
+    """
     try:
-        return linear_part(law)
+        linear = linear_part(law, max(axis.limits.command_um for axis in axes))
+        if not isinstance(linear, DiscreteController) and linear.reference_fault:
+            findings.warnings.append(f"{key}: the law is {REFERENCE_NOT_LINEAR}: {linear.reference_fault}; settling, "
+                                     "overshoot, static error and peak command are not computed")  # fmt: skip
+        return linear
     except ValueError as error:
         if is_required:
             findings.faults.append(f"{key}: {error}")
@@ -309,7 +317,7 @@ def _check_shared(configuration: Configuration, axes: Sequence[AxisOptions], fin
     if not isinstance(law, CoupledController):
         raise TypeError(f"{key}: {law!r} controls one axis only, but the axes here are {', '.join(names)}")
     plant, loop = _coupled_plant(axes, delays, findings), None
-    linear = _linear_part(law, key, findings, type(law).shipped)
+    linear = _linear_part(law, key, axes, findings, type(law).shipped)
     if linear is not None and plant is not None:
         with findings.collect_faults(f"{key}: "):
             loop = CoupledLoop(linear, plant)

@@ -29,6 +29,7 @@ from rtloop.configuration.prepare import Prepared
 from rtloop.foundation.arrays import Complex, Real
 from rtloop.laws.contract import build_record
 from rtloop.laws.shipped.transfer import TransferController
+from rtloop.linear.discretise import DiscreteController
 from rtloop.linear.options import TransferOptions
 
 Matrices = tuple[Real, Real, Real, Real | float]
@@ -48,7 +49,8 @@ WIDTHS = np.tan(np.linspace(-1.5, 1.5, 60))
 class LoopNumbers(NamedTuple):
     """All numbers of a loop as it will run: controller (A, b, c, d) per tick, model in s, delay, reference path.
 
-    `sensor_hz` is the bandwidth of a sensor in the loop, None without one.
+    `sensor_hz` is the bandwidth of a sensor in the loop, None without one. `with_reference` is the controller from
+    errors and references, None for a law that uses errors alone.
     """
 
     controller: Matrices
@@ -57,6 +59,7 @@ class LoopNumbers(NamedTuple):
     prefilter: PrefilterOptions
     period_s: float
     sensor_hz: float | None = None
+    with_reference: Matrices | None = None
 
 
 class AxisPaths(NamedTuple):
@@ -98,12 +101,15 @@ def _coupled_faults(prepared: Prepared, check: AxisCheck, shared: SharedLoop) ->
     """Return the sentences of `axis_faults` for an axis that shares its controller; [] without disagreement or loop."""
     if shared.linear is None or check.on_model is None:
         return []
-    a, b, c, d = shared.linear.system
+    linear = shared.linear
+    a, b, c, d = linear.system
     options = {axis.name: axis for axis in prepared.configuration.axes}
     delays = {entry.name: entry.delay_ticks for entry in prepared.checks}
     models = {name: options[name].model for name in shared.axes}
     axes = [
-        LoopNumbers((a, b, c, d), model, delays[name], options[name].prefilter, shared.linear.period_s)
+        LoopNumbers(
+            (a, b, c, d), model, delays[name], options[name].prefilter, linear.period_s, None, linear.with_reference
+        )
         for name, model in models.items()
         if model is not None
     ]
@@ -137,9 +143,9 @@ def axis_faults(
     """
     if check.together is not None or check.linear is None or model is None:
         return []
-    numbers = LoopNumbers(
-        controller_matrices(check, record), model, delay_ticks, prefilter, check.linear.period_s, sensor_hz
-    )  # fmt: skip
+    linear, matrices = check.linear, controller_matrices(check, record)
+    with_reference = None if isinstance(linear, DiscreteController) else linear.with_reference
+    numbers = LoopNumbers(matrices, model, delay_ticks, prefilter, linear.period_s, sensor_hz, with_reference)
     return _axis_sentences(check.name, disagreements(loop, second_opinion(numbers)))
 
 
@@ -172,7 +178,8 @@ def second_opinion(numbers: LoopNumbers) -> Opinion:
     """Return closed-loop poles, margins and step of a loop as python-control computes them."""
     controller, plant = _state_space(*numbers.controller, numbers.period_s), _sampled_plant(numbers)
     open_loop = library.series(controller, plant)
-    return _opinion(AxisPaths(open_loop, library.feedback(open_loop, 1), library.feedback(plant, controller)), numbers)
+    closed = _closed_with_reference(numbers, plant, 0) or library.feedback(open_loop, 1)
+    return _opinion(AxisPaths(open_loop, closed, library.feedback(plant, controller)), numbers)
 
 
 def coupled_opinion(axes: Sequence[LoopNumbers], coupling: Real, place: int) -> Opinion:
@@ -187,7 +194,23 @@ def coupled_opinion(axes: Sequence[LoopNumbers], coupling: Real, place: int) -> 
     plant = library.series(library.ss([], [], [], coupling, period_s), plants)
     closed = library.feedback(library.series(system, plant), library.ss([], [], [], np.eye(count), period_s))
     tracking, added = closed[place, place], library.feedback(plant, system)[place, place]
-    return _opinion(AxisPaths(library.feedback(tracking, 1, 1), tracking, added), axes[place])
+    open_loop = library.feedback(tracking, 1, 1)
+    tracking = _closed_with_reference(axes[place], plant, place) or tracking
+    return _opinion(AxisPaths(open_loop, tracking, added), axes[place])
+
+
+def _closed_with_reference(numbers: LoopNumbers, plant: Any, place: int) -> Any:
+    """Return the closed loop from the reference of axis `place` to its position; None for a law that uses errors alone.
+
+    `plant` is from all commands to all positions.
+    """
+    if numbers.with_reference is None:
+        return None
+    count, period_s = plant.noutputs, numbers.period_s
+    law = library.ss(*numbers.with_reference, period_s)
+    positions = library.ss([], [], [], np.vstack([np.eye(count), np.zeros((count, count))]), period_s)
+    reference = library.ss([], [], [], np.tile(np.eye(count), (2, 1)), period_s)
+    return library.series(reference, library.feedback(library.series(law, plant), positions))[place, place]
 
 
 def _opinion(paths: AxisPaths, numbers: LoopNumbers) -> Opinion:

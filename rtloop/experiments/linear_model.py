@@ -60,10 +60,15 @@ class LinearModel:
         is_shared = axis.controller is not None and len(axis.controller.axes) > 1  # there is no loop of one axis alone
         if not is_shared and (law := make_controller(axis, 1 / rate_hz)) is not None:
             with suppress(ValueError):  # `check` warns of a law that cannot be linearised, which may run all the same
-                self._controller = linear_part(law)
+                self._controller = linear_part(law, axis.limits.command_um)
         if self._controller is not None:
             loop = discrete_loop(self._controller, self.dynamics, self._delay_ticks, self._prefilter)
             self.loop = loop if loop.is_stable else None
+
+    @property
+    def tracking_loop(self) -> Loop | None:
+        """`loop`, but None if its law is not linear in the reference."""
+        return None if self.loop is None or self.loop.reference_fault else self.loop
 
     @property
     def static_gain(self) -> float:
@@ -90,9 +95,9 @@ class LinearModel:
     def tracking(self, hz: npt.ArrayLike) -> Complex | None:
         """Return the complex response (k,) from reference to position, pre-filter included, at frequencies (k,) in Hz.
 
-        None without a stable loop.
+        None without a `tracking_loop`.
         """
-        return None if self.loop is None else self.loop.response_from_reference(hz)[0]
+        return None if self.tracking_loop is None else self.tracking_loop.response_from_reference(hz)[0]
 
     def rejection(self, hz: npt.ArrayLike) -> Complex | None:
         """Return the complex response S·P (k,) from a disturbance to the position, at frequencies (k,) in Hz.
@@ -108,15 +113,17 @@ class LinearModel:
     def closed_response(self, reference: Real) -> tuple[Real, Real] | None:
         """Return position and command, (n,) each, for a reference (n,) at the input of the pre-filter, from rest.
 
-        All are in µm. None without a stable loop.
+        All are in µm. None without a `tracking_loop`.
         """
-        if self.loop is None:
+        if self.tracking_loop is None:
             return None
-        a, b, c, d = self.loop.matrices
-        prefilter = self.loop.reference
+        a, b, c, d = self.tracking_loop.matrices
+        prefilter = self.tracking_loop.reference
         signals = simulate(a, b, c, d, prefilter.error_input(reference))
         if prefilter.has_command_path:
-            signals += simulate(a, self.loop.injection.b, c, np.array([0.0, 1.0]), prefilter.command_input(reference))
+            signals += simulate(
+                a, self.tracking_loop.injection.b, c, np.array([0.0, 1.0]), prefilter.command_input(reference)
+            )
         return signals[0], signals[1]
 
     def disturbance_response(self, disturbance: Real) -> Real | None:
@@ -126,42 +133,45 @@ class LinearModel:
         None without a stable loop.
         """
         displacement = simulate(*sampled_plant(self.dynamics, 1 / self.rate_hz), disturbance)[0]
-        return None if self.loop is None else displacement - simulate(*self.loop.matrices, displacement)[0]
+        return None if self.loop is None else displacement - simulate(*self.loop.error_matrices, displacement)[0]
 
     @cached_property
     def step_peak(self) -> float | None:
-        """Largest |command| in a step of the reference, divided by the step's height; None without a stable loop."""
-        return None if self.loop is None else step_metrics(self.loop, ()).peak_command
+        """Largest |command| in a step of the reference, divided by the step's height.
+
+        None without a `tracking_loop`.
+        """
+        return None if self.tracking_loop is None else step_metrics(self.tracking_loop, ()).peak_command
 
     @cached_property
     def step_reversal(self) -> float | None:
         """Largest command below 0 in a step of the reference up from 0 and in the step back to 0, per height; ≥ 0.
 
         The command of a step up may begin below 0. The command of the step back to 0 passes 0 by as much as the command
-        of the step up passes its final value. None without a stable loop.
+        of the step up passes its final value. None without a `tracking_loop`.
         """
-        if self.loop is None:
+        if self.tracking_loop is None:
             return None
-        command, final = step_response(self.loop).command, self.loop.final_values[1]
+        command, final = step_response(self.tracking_loop).command, self.tracking_loop.final_values[1]
         return float(max(-command.min(), command.max() - final, 0.0))
 
     @cached_property
     def sine_peak(self) -> float | None:
         """Largest amplitude of the command per amplitude of a sine of the reference, over all frequencies.
 
-        None without a stable loop.
+        None without a `tracking_loop`.
         """
-        if self.loop is None:
+        if self.tracking_loop is None:
             return None
-        return float(np.abs(self.loop.response_from_reference(self.loop.frequencies)[1]).max())
+        return float(np.abs(self.tracking_loop.response_from_reference(self.tracking_loop.frequencies)[1]).max())
 
     @cached_property
     def tracking_peak(self) -> float | None:
         """Largest amplitude of the position per amplitude of a sine of the reference, over all frequencies.
 
-        The response contains the pre-filter. None without a stable loop.
+        The response contains the pre-filter. None without a `tracking_loop`.
         """
-        tracking = None if self.loop is None else self.tracking(self.loop.frequencies)
+        tracking = None if self.tracking_loop is None else self.tracking(self.tracking_loop.frequencies)
         return None if tracking is None else float(np.abs(tracking).max())
 
     @cached_property

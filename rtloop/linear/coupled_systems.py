@@ -19,7 +19,10 @@ DC_OFFSET = 1e-9
 
 
 class CoupledSystem(NamedTuple):
-    """State space x⁺ = A x + B u, y = C x + D u (or x' for x⁺): `a` (n, n), `b` (n, m), `c` (m, n), `d` (m, m)."""
+    """State space x⁺ = A x + B u, y = C x + D u (or x' for x⁺): `a` (n, n), `b` (n, m), `c` (m, n), `d` (m, m).
+
+    A controller with its reference has 2 m inputs: the errors, then the references at errors of 0.
+    """
 
     a: Real
     b: Real
@@ -87,10 +90,15 @@ def tustin(system: CoupledSystem, period_s: float, prewarp_hz: float | None = No
 
 @dataclass(frozen=True, eq=False)
 class SampledCoupledSystem:
-    """A linear controller of several axes at one period, from errors to commands."""
+    """A linear controller of several axes at one period, from errors to commands.
+
+    `with_reference` and `reference_fault` are as in SampledController.
+    """
 
     system: CoupledSystem
     period_s: float
+    with_reference: CoupledSystem | None = None
+    reference_fault: str = ""
 
     @property
     def order(self) -> int:

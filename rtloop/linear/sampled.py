@@ -9,6 +9,7 @@ from functools import cached_property
 import numpy as np
 
 from rtloop.foundation.arrays import Complex
+from rtloop.linear.coupled_systems import CoupledSystem
 from rtloop.linear.realisation import System
 from rtloop.linear.zeros import zeros_and_gain
 
@@ -18,10 +19,16 @@ AT_ONE = 1e-9
 
 @dataclass(frozen=True, eq=False)
 class SampledController:
-    """Linear controller x⁺ = A x + b e, v = c·x + d e at one period."""
+    """Linear controller x⁺ = A x + b e, v = c·x + d e at one period.
+
+    `with_reference` has the reference, at an error of 0, as a second input, and its states; None for a law that uses
+    the error alone. `reference_fault` is the reason why the command is not linear in the reference, else "".
+    """
 
     system: System
     period_s: float
+    with_reference: CoupledSystem | None = None
+    reference_fault: str = ""
 
     @property
     def order(self) -> int:

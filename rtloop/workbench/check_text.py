@@ -24,10 +24,10 @@ ROWS = (
     ("phase margin", lambda loop: f"{loop.phase_margin_deg:.2f}°"),
     ("gain margin", lambda loop: f"{loop.gain_margin:.3f}"),
     ("max |S|", lambda loop: f"{loop.max_sensitivity:.3f} at {loop.max_sensitivity_hz:.1f} Hz"),
-    ("static error", lambda loop: f"{loop.static_error_percent:.4f} %"),
+    ("static error", lambda loop: format_figure(loop.static_error_percent, 4, " %")),
     ("settling (5 %)", lambda loop: format_figure(1e3 * loop.settling_time_s, 2, " ms")),
     ("overshoot", lambda loop: format_figure(loop.overshoot_percent, 2, " %")),
-    ("peak command, µm per µm", lambda loop: f"{loop.peak_command:.4f}"),
+    ("peak command, µm per µm", lambda loop: format_figure(loop.peak_command, 4)),
 )
 
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from rtloop.analysis.closed_loop import Loop
+from rtloop.analysis.closed_loop import REFERENCE_NOT_LINEAR, Loop
 from rtloop.analysis.step_response import SETTLING_BAND, step_response
 from rtloop.design.figures import create_figure, label_panel
 
@@ -35,7 +35,7 @@ def draw_loops(loops: Mapping[str, Mapping[str, Loop]]) -> Figure:
         open_panel.axhline(1, color=LINE_COLOUR, linewidth=0.8)
         step_panel.axhspan(1 - SETTLING_BAND, 1 + SETTLING_BAND, color="0.9", label=f"±{100 * SETTLING_BAND:g} %")
         label_panel(open_panel, "frequency / Hz", "|L|", f"axis {axis}: open loop")
-        label_panel(sensitivity_panel, "frequency / Hz", "|S|, error per reference", "sensitivity")
+        label_panel(sensitivity_panel, "frequency / Hz", "|S|", "sensitivity")
         label_panel(step_panel, "time / ms", "x per unit step", "step on the model")
     return figure
 
@@ -49,9 +49,9 @@ def _draw_responses(open_panel: Axes, sensitivity_panel: Axes, loop: Loop, label
 
 
 def _draw_step(panel: Axes, loop: Loop, label: str, color: str) -> None:
-    """Draw the position after a unit step; of an unstable loop only the label."""
-    if not loop.is_stable:
-        panel.plot([], [], color=color, label=f"{label}: unstable")
+    """Draw the position after a unit step; without a figure for the step, only the label."""
+    if not loop.is_stable or loop.reference_fault:
+        panel.plot([], [], color=color, label=f"{label}: {'unstable' if not loop.is_stable else REFERENCE_NOT_LINEAR}")
         return
     response = step_response(loop)
     panel.plot(1e3 * response.time_s, response.position, color=color, label=label)

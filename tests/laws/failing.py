@@ -32,9 +32,11 @@ def text(output: str = "", update: str = "") -> str:
 
 
 ENDLESS_UM = 30.0
-FOR_EVER = "        if told.reference_um > {}:\n            while True:\n                s.seen += 1.0\n"
+FOR_EVER = (
+    "        if told.reference_um > {} and s.seen > 999:\n            while True:\n                s.seen += 1.0\n"
+)
 ENDLESS = HEAD + OUTPUT.format(FOR_EVER.format(ENDLESS_UM)) + UPDATE.format("")
-"""Text of a law whose output never returns once the reference is above ENDLESS_UM."""
+"""Text of a law whose output never returns once the reference is above ENDLESS_UM, after a tenth of a second."""
 FAILING = {
     "divides by zero": (text("return 1.0 / (s.seen - 200.0)"), 200, "raised an exception in output of the controller"),
     "divides a whole number by zero": (

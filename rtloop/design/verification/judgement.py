@@ -150,6 +150,6 @@ def noise_gains(loop: Loop) -> Real:
     """Return the rms of the true position x and of v per rms of white sensor noise, (2,), from the stationary
     covariance of a stable sampled loop.
     """
-    a, b, c, d = loop.matrices
+    a, b, c, d = loop.error_matrices
     covariance = c @ stationary_covariance(a, np.outer(b, b)) @ c.T
     return np.sqrt(np.diag(covariance) + d**2)

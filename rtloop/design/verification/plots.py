@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from rtloop.analysis.closed_loop import Loop
+from rtloop.analysis.closed_loop import REFERENCE_NOT_LINEAR, Loop
 from rtloop.analysis.step_response import step_response
 from rtloop.design.figures import create_figure, finish_figure
 from rtloop.design.synthesis.specification import SpecificationOptions
@@ -95,9 +95,10 @@ def _step(panels: Sequence[Axes], verification: Verification, specification: Spe
     """Draw position and command after a unit step, with their limits."""
     duration_s = 4e-3 * (specification.settling_ms or 5.0)
     for label, loop, color in _loops(verification):
-        if not loop.is_stable:
+        if not loop.is_stable or loop.reference_fault:
+            fault = "unstable" if not loop.is_stable else REFERENCE_NOT_LINEAR
             for panel in panels:
-                panel.plot([], [], color=color, label=f"{label}: unstable")
+                panel.plot([], [], color=color, label=f"{label}: {fault}")
             continue
         response = step_response(loop, duration_s)
         style: dict[str, Any] = (
@@ -118,7 +119,7 @@ def _step(panels: Sequence[Axes], verification: Verification, specification: Spe
 
 PICTURES = {
     "bode": (_bode, "|L|", "phase / °", "frequency / Hz"),
-    "sensitivity": (_sensitivity, "|S|, error per reference", "|CS|, command per reference", "frequency / Hz"),
+    "sensitivity": (_sensitivity, "|S|", "|CS|", "frequency / Hz"),
     "step": (_step, "x per unit step", "v per unit step", "time / ms"),
 }
 """Drawing function of each picture, with the labels of its two panels and of their common axis."""
