@@ -18,6 +18,9 @@ def python_command(module: str, *arguments: object) -> list[str]:
     return [sys.executable, "-P", "-m", module, *map(str, arguments)]
 
 
+THREADS = ("OMP_NUM_THREADS", "NUMEXPR_NUM_THREADS", "NUMEXPR_MAX_THREADS")
+
+
 def child_environment(changes: Mapping[str, str] | None = None) -> dict[str, str]:
     """Return this process's environment without `harmful_variables`, with SAFE_PATH and `changes`."""
     harmful = harmful_variables()
@@ -26,7 +29,8 @@ def child_environment(changes: Mapping[str, str] | None = None) -> dict[str, str
 
 def harmful_variables() -> list[str]:
     """Return the names of the environment's variables that would change compiled code, or make a child end or lose its
-    texts and assertions.
+    texts and assertions; among them numbers of threads that are no numbers, at which libraries raise ValueError.
     """
-    harmful = ("PYTHONOPTIMIZE", "PYTHONWARNINGS")
+    harmful = {"PYTHONOPTIMIZE", "PYTHONWARNINGS"}
+    harmful |= {name for name in THREADS if not os.environ.get(name, "1").isdecimal()}
     return sorted(name for name in os.environ if name.startswith("NUMBA_") or name in harmful)

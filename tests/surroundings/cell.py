@@ -73,7 +73,10 @@ class Bench:
         texts = [(logs / name).read_text(errors="replace") for name in ("out", "err")]
         texts = [re.sub(r"[\d.]+ s, [\d.]+ recordings/s", "TIME", text) for text in texts]
         texts = [text.replace(str(place), "PLACE").replace(str(logs), "LOGS") for text in texts]
-        files = {_name(path, place): path.read_bytes() for path in _files(place) if path not in before}
+        upwards = re.compile(rb"(\.\./)+")  # a path to the stock, longer from a folder further down
+        files = {
+            _name(path, place): upwards.sub(b"../", path.read_bytes()) for path in _files(place) if path not in before
+        }
         return Ending(code, *texts, files, sorted(path.name for path in markers.iterdir()))
 
 

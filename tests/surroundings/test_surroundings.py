@@ -130,6 +130,13 @@ def test_a_law_is_compiled_whatever_the_folder_says_of_numba(bench: Bench) -> No
     assert (result.markers, result.code) == ([], 0), result.stderr
 
 
+def test_a_number_of_threads_that_is_none_breaks_no_driver(bench: Bench) -> None:
+    clean, garbage = (
+        ending(bench, "drivers", SURROUNDINGS[name]) for name in ("NO_COLOR=1", "OMP_NUM_THREADS=garbage")
+    )
+    assert (garbage.stdout, garbage.stderr) == (clean.stdout, clean.stderr)
+
+
 def test_processes_start_in_development_mode(bench: Bench) -> None:
     result = ending(bench, "archive replay {stock}/short.mcap --jobs 1", SURROUNDINGS["PYTHONDEVMODE=1"])
     assert "Traceback" not in result.stderr
