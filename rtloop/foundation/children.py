@@ -11,14 +11,12 @@ from collections.abc import Mapping
 
 SAFE_PATH = {"PYTHONSAFEPATH": "1"}
 """Variable with which Python looks for no module in the current folder, for children that multiprocessing starts."""
+THREADS = ("OMP_NUM_THREADS", "NUMEXPR_NUM_THREADS", "NUMEXPR_MAX_THREADS")
 
 
 def python_command(module: str, *arguments: object) -> list[str]:
     """Return the command line `python -P -m MODULE ARGUMENTS`: the child looks for no module in its current folder."""
     return [sys.executable, "-P", "-m", module, *map(str, arguments)]
-
-
-THREADS = ("OMP_NUM_THREADS", "NUMEXPR_NUM_THREADS", "NUMEXPR_MAX_THREADS")
 
 
 def child_environment(changes: Mapping[str, str] | None = None) -> dict[str, str]:
