@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-from contextlib import suppress
-
 import numpy as np
 import numpy.typing as npt
 
 from rtloop.foundation.arrays import Complex, Real
 from rtloop.linear.realisation import System
 
-LEAST_RATIO = 1e3
-POINTS = 25
-NOWHERE = 1e-12
-"""Zeros beyond the largest pole divided by this are at infinity."""
+LEAST_RATIO, POINTS, LEAST_DISTANCE = 1e3, 25, 0.02
+"""Least response beside the direct gain, number of points tried, and their least distance from a pole, of the point."""
+NOWHERE, SAME_GAIN = 1e-12, 1e-6
+"""Zeros beyond the largest pole divided by the first are at infinity; gains that agree to the second are the same."""
 
 
 def zeros_and_gain(system: System) -> tuple[Complex, float]:
@@ -57,25 +55,36 @@ def factored_response(zeros: Complex, poles: Complex, gain: float, complex_point
 def _zeros_around(system: System) -> tuple[Complex, float] | None:
     """Return zeros and gain of a system from its response at the real point x₀ where this is largest.
 
-    None if no response is above LEAST_RATIO times the direct gain. With N = (A − x₀ I)⁻¹, the zeros are x₀ + 1/w for
-    the eigenvalues w of N + N b c N/G(x₀); one without a reciprocal is at infinity.
+    None if no response, at a point away from all poles, is above LEAST_RATIO times the direct gain. With
+    N = (A − x₀ I)⁻¹, the zeros are x₀ + 1/w for the eigenvalues w of N + N b c N/G(x₀); one without a reciprocal is at
+    infinity. The gain makes the response at x₀ exact, or is d if the least known zero, the farthest, can do so.
     """
     a, b, c, d = system
-    poles = np.linalg.eigvals(a)
-    largest, chosen = LEAST_RATIO * abs(d), None
-    sizes = np.abs(poles[poles != 0])
-    for point in [0.0, *(np.geomspace(sizes.min(), sizes.max(), POINTS) if sizes.size else ())]:
-        shifted = a - point * np.eye(b.size)
-        with suppress(np.linalg.LinAlgError):
-            value = d - c @ np.linalg.solve(shifted, b)
-            if largest < abs(value) < np.inf:
-                largest, chosen = abs(value), (point, value, np.linalg.inv(shifted))
-    if chosen is None:
+    if not b.size:
         return None
-    point, value, inverse = chosen
+    poles = np.linalg.eigvals(a)
+    sizes = np.abs(poles[poles != 0])
+    points = np.append(0.0, np.geomspace(sizes.min(), 2 * sizes.max(), POINTS) if sizes.size else [])
+    distances = np.abs(points[:, None] - poles).min(axis=1) - LEAST_DISTANCE * points
+    responses = {float(point): _response(system, point) for point in points[distances > 0]}
+    point, value = max(responses.items(), key=lambda item: abs(item[1]), default=(0.0, 0.0))
+    if abs(value) <= LEAST_RATIO * abs(d):
+        return None
+    inverse = np.linalg.inv(a - point * np.eye(b.size))
     reciprocals = np.linalg.eigvals(inverse + np.outer(inverse @ b, c @ inverse) / value)
     zeros = point + 1 / reciprocals[np.abs(reciprocals) * sizes.max(initial=0.0) > NOWHERE].astype(complex)
-    return zeros, float(value / factored_response(zeros, poles, 1.0, point).real)
+    gain = value / factored_response(zeros, poles, 1.0, point).real
+    if zeros.size == poles.size and abs(gain / d - 1) < SAME_GAIN:
+        farthest = np.abs(zeros - point) >= (1 - 1e-9) * np.abs(zeros - point).max()
+        zeros[farthest] = point + (zeros[farthest] - point) * (gain / d) ** (1 / farthest.sum())
+        gain = d
+    return zeros, float(gain)
+
+
+def _response(system: System, point: float) -> float:
+    """Return the response of a system at a real point."""
+    a, b, c, d = system
+    return float(d - c @ np.linalg.solve(a - point * np.eye(b.size), b))
 
 
 def _reflection(vector: Real) -> tuple[Real, float]:

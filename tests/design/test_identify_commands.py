@@ -346,13 +346,13 @@ def test_one_command_makes_a_configuration_that_runs_as_promised(folder: Path, s
     stepping = out.with_name("stepping.toml")
     reference = tomllib.loads(text)["axis"][0]["reference"]
     assert (reference["kind"], reference["levels"]) == ("steps", [10.0, 0.0])
-    stepping.write_text(text.replace("levels = [10.0, 0.0]", "levels = [20.0, 0.0]"))
+    stepping.write_text(text.replace("levels = [10.0, 0.0]", "levels = [0.0, 20.0]"))
     stepping.write_text(re.sub(r"dwell_s = [0-9.]+", "dwell_s = 0.5", stepping.read_text()))
     code, summary, _ = run(stepping, "--duration", "1", "--unpaced", "--out", folder)
     assert code == 0
     assert summary["trips"] == []
     recording = rtloop.load(summary["recording"])
-    position = recording["x_true_position_um"][:5000] / 20
+    position = recording["x_true_position_um"][5000:] / 20
     for time_s, promised in zip(running.step_times_s, running.step_position, strict=True):
         assert position[round(time_s * 10_000)] == pytest.approx(promised, abs=0.05)
     outside_band = np.flatnonzero(np.abs(position / np.mean(position[-500:]) - 1) > 0.05)

@@ -32,7 +32,8 @@ from tests.service.test_run import ROOT, start
 NOT_THERE = 66
 TRIPPING = ("position_um = 60.0", "position_um = 0.001")
 FAILING = ("    def read(self):\n", '    def read(self):\n        raise OSError("cable [off]\\n\\x1b[31m")\n')
-FAILING_SECOND = (FAILING[0], f"{FAILING[0]}        if self.drive_v:\n            raise OSError('cable [off]')\n")
+FAILING_LATER = (FAILING[0], f"{FAILING[0]}        if self.drive_v:\n            raise OSError('cable [off]')\n")
+"""The first tick enters the closed loop and leaves the drive at 0; the read after the second one fails."""
 
 
 def command_exit_codes(path: Path) -> dict[str, int]:
@@ -80,10 +81,10 @@ def test_a_recording_of_hardly_any_ticks(tmp_path: Path, ticks: int, text: str, 
 
 @pytest.mark.parametrize(
     ("change", "ticks", "clock"),
-    [(None, 1, []), (FAILING, 1, ["--unpaced"]), (FAILING_SECOND, 2, [])],
+    [(None, 1, []), (FAILING, 1, ["--unpaced"]), (FAILING_LATER, 3, [])],
     ids=["one tick", "fails at once, unpaced", "fails then"],
 )
-def test_a_run_of_a_tick_or_two(tmp_path: Path, change: tuple[str, str] | None, ticks: int, clock: list[str]) -> None:
+def test_a_run_of_a_few_ticks(tmp_path: Path, change: tuple[str, str] | None, ticks: int, clock: list[str]) -> None:
     """The driver's error, with driver and tick, is on the screen, in the summary and in the recording."""
     config, environment = install(tmp_path, DRIVER.replace(*change) if change else DRIVER)
     command = [sys.executable, "-m", "rtloop", "run", str(config), "--out", str(tmp_path), *clock]
