@@ -240,3 +240,15 @@ def test_a_copy_of_a_recording_is_no_independent_evidence() -> None:
     assert [kept_run.name for kept_run in runs] == [run.name, "other"]
     assert sentences == [f"copy: not used, because it is a copy of {run.name}, with the same ticks"]
     assert distinct([replace(run, name="copy")], [run])[0] == []
+
+
+@pytest.mark.parametrize(("largest_um", "is_clipped"), [(2.0, False), (1.2, True)])
+def test_a_coarse_sensor_is_not_taken_for_a_clipped_one(largest_um: float, is_clipped: bool) -> None:
+    """At the top of a sine, a sensor with steps of 0.5 µm stays at 2 µm while the drive moves by 6 % of its span."""
+    drive_v = np.sin(2 * np.pi * np.arange(8000) / 4000)
+    position_um = np.minimum(0.5 * np.round(4 * drive_v), largest_um)
+    if is_clipped:
+        with pytest.raises(UnsuitableData, match=r"saturated: the recorded position stays at 1\.2 µm"):
+            require_usable("coarse", drive_v, position_um, None)
+    else:
+        require_usable("coarse", drive_v, position_um, None)

@@ -6,6 +6,7 @@ import hashlib
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -271,7 +272,8 @@ def _first_clipped_tick(drive: Real, adc: Real) -> int | None:
 
     A plateau is PLATEAU_TICKS or more at the maximum of `adc`, or if none there counts, at its minimum. It counts if
     the drive moves meanwhile by more than PLATEAU_DRIVE of its span or `adc` jumps at one of the plateau's ends
-    (PLATEAU_JUMP); a plateau at the start of the recording does not count.
+    (PLATEAU_JUMP); a plateau at the start of the recording does not count. A coarse sensor has plateaus between the
+    extremes: the drive must move more than during these.
     """
     changes = np.abs(np.diff(adc))
     usual_change = max(float(np.median(changes)), float(changes[changes > 0].min(initial=np.inf)))
@@ -284,9 +286,16 @@ def _first_clipped_tick(drive: Real, adc: Real) -> int | None:
             change_before, change_after = changes[start - 1], changes[end - 1] if end < adc.size else 0.0
             if max(change_before, change_after) > PLATEAU_JUMP * usual_change:
                 return int(start)
-            if np.ptp(drive[start:end]) > PLATEAU_DRIVE * np.ptp(drive):
+            if np.ptp(drive[start:end]) > max(PLATEAU_DRIVE * np.ptp(drive), _motion_between_extremes(drive, adc)):
                 return int(start)
     return None
+
+
+def _motion_between_extremes(drive: Real, adc: Real) -> float:
+    """Return the largest motion of the drive while `adc` stays at one value between its extremes."""
+    edges = np.flatnonzero(np.diff(adc, prepend=np.nan, append=np.nan))
+    inside = [(a, b) for a, b in pairwise(edges) if b - a >= PLATEAU_TICKS and adc.min() < adc[a] < adc.max()]
+    return max((float(np.ptp(drive[start:end])) for start, end in inside), default=0.0)
 
 
 def _require_untripped(path: Path, flags: Real) -> None:
