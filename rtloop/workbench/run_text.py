@@ -17,9 +17,9 @@ if TYPE_CHECKING:
     from rtloop.recording.views.summary import Summary
 
 SPECIFIED_STEP = (
-    "MISSED: the worst recorded step is beyond the limit. The limit is for a step of the linear loop from rest at 0 "
-    "µm. Between other levels, hysteresis adds to the error. Without an integrator, the static error grows with the "
-    "position, not with the height of the step."
+    "MISSED: the worst recorded step is beyond the limit. Unlike the step of the linear loop that `rtloop check` "
+    "judges, a recorded one has the sensor's noise, hysteresis that the inverse leaves, limits of command and drive, "
+    "and the end of its level: what has not settled by then counts. `rtloop design verify` simulates such steps."
 )
 """Difference between a recorded step and the step that a specification limits."""
 

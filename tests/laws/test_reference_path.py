@@ -161,6 +161,17 @@ def test_a_law_that_is_not_linear_in_its_reference_has_margins_and_no_step(kind:
         assert line.split()[-1] == "–"
 
 
+def test_an_unknown_step_is_not_judged(tmp_path: Path) -> None:
+    (tmp_path / "lab.py").write_text(NOT_LINEAR["square"])
+    (tmp_path / "spec.toml").write_text("[specification]\novershoot_percent = 90.0\nsettling_ms = 900.0\n")
+    path = tmp_path / "lab.toml"
+    text = on_stage("lab", 'file = "lab.py"\nki_per_s = 15.0\nkp = 0.004')
+    path.write_text(text.replace('name = "x"\n', 'name = "x"\nspecification = "spec.toml"\n'))
+    axis = answer("check", path)["axes"][0]
+    assert (axis["meets"], axis["missed"]) == (False, [])
+    assert "spec.toml: not judged: axis.x.controller: the law is not linear" in run("check", path).stdout
+
+
 @pytest.mark.parametrize("kind", [*LINEAR, "integral-resonant"])
 def test_python_control_computes_the_same_step(kind: str, tmp_path: Path) -> None:
     text = (ROOT / "deploy" / "laws" / "integral-resonant.toml").read_text()

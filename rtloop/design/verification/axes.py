@@ -116,6 +116,8 @@ def _add_contradictions(
     """
     axis = next(axis for axis in configuration.axes if axis.name == check.name)
     (lines, on_rig), rig_verification = compare_with_rig(configuration, axis, check), None
+    if fault := verification.running.reference_fault:
+        lines = [*lines, f"axis.{axis.name}.controller: the law is not linear in the reference: {fault}"]
     if on_rig is not None and on_rig.plant is not None:
         sensor = design.sensor.model_copy(update={"bandwidth_hz": None})  # the rig's plant has its sensor's lag
         rig_design = design.model_copy(update={"sensor": sensor})

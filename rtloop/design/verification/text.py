@@ -78,7 +78,7 @@ def robustness(verification: Verification) -> list[tuple[str, ...]]:
     on_paper = verification.continuous is not None
     limit_kinds = ("continuous", "running", "running_missed")[0 if on_paper else 1 :]
     headings = ("C(s), until unstable", "C(z), until unstable", "C(z), until a requirement met now fails")
-    rows = [("may move by", *headings[-len(limit_kinds) :])]
+    rows = [("linear loop may move by", *headings[-len(limit_kinds) :])]
     rows += [
         (SHIFT_NAMES[name], *(format_range(ranges[kind]) for kind in limit_kinds))
         for name, ranges in verification.robustness.ranges.items()

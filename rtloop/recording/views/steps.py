@@ -62,13 +62,16 @@ def measure_steps(
     The level reached is the mean position over the last fifth of a step. Settling is to ±5 % of the step's height about
     that level. If the level is further than this from the reference, the settling time is infinite and the overshoot
     NaN; likewise if the position moves by less than SMALLEST_TRAVEL of the height, and then the static error is at
-    least the fraction not travelled. Steps of less than SMALLEST_DWELL_TICKS are left out. None if no step remains, or
-    with more than MAX_STEPS changes of the reference.
+    least the fraction not travelled. Steps of less than SMALLEST_DWELL_TICKS are left out, and a last step that the end
+    of the recording cuts off: it is shorter than all others. None if no step remains, or with more than MAX_STEPS
+    changes of the reference.
     """
     starts = np.flatnonzero(np.diff(reference_um) != 0) + 1
     if starts.size == 0 or starts.size > MAX_STEPS:
         return None
     ends = np.append(starts[1:], reference_um.size)
+    if starts.size > 1 and ends[-1] - starts[-1] < np.diff(starts).min():
+        starts, ends = starts[:-1], ends[:-1]
     rows = []
     for start, end in zip(starts, ends, strict=True):
         if end - start >= SMALLEST_DWELL_TICKS:
