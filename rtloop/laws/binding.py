@@ -56,10 +56,10 @@ def _bind_law(reference: LawReference) -> npt.NDArray[np.void]:
 
 def _let_ticks_call(functions: Sequence[Callable[..., object]]) -> None:
     """Let compiled functions call these Python functions, which are compiled with the checks of `jit_strict`."""
-    from rtloop.foundation.native.compiler import numba
+    from rtloop.foundation.native.compiler import register_jitable
 
     for function in functions:
-        numba.extending.register_jitable(error_model="python", boundscheck=True)(function)
+        register_jitable(error_model="python", boundscheck=True)(function)
 
 
 def function_signatures(law: type[Law], law_records: LawRecords) -> dict[str, Signature]:
@@ -129,9 +129,9 @@ def _compiler_message(error: Exception) -> str:
     A missing operation reads "no operation NAME for (TYPES)". Any other exception than numba's is returned as its type
     and text, of any length.
     """
-    from rtloop.foundation.native.compiler import numba
+    from rtloop.foundation.native.compiler import NumbaError
 
-    if not isinstance(error, numba.core.errors.NumbaError):
+    if not isinstance(error, NumbaError):
         return f"{type(error).__name__}: {error}"
     lines = [line.strip() for line in str(error).splitlines()]
     message_lines = [

@@ -62,7 +62,7 @@ def _zeros_around(system: System) -> tuple[Complex, float] | None:
     a, b, c, d = system
     if not b.size:
         return None
-    poles = np.linalg.eigvals(a)
+    poles = np.linalg.eigvals(a).astype(complex)
     sizes = np.abs(poles[poles != 0])
     points = np.append(0.0, np.geomspace(sizes.min(), 2 * sizes.max(), POINTS) if sizes.size else [])
     distances = np.abs(points[:, None] - poles).min(axis=1) - LEAST_DISTANCE * points
@@ -72,7 +72,8 @@ def _zeros_around(system: System) -> tuple[Complex, float] | None:
         return None
     inverse = np.linalg.inv(a - point * np.eye(b.size))
     reciprocals = np.linalg.eigvals(inverse + np.outer(inverse @ b, c @ inverse) / value)
-    zeros = point + 1 / reciprocals[np.abs(reciprocals) * sizes.max(initial=0.0) > NOWHERE].astype(complex)
+    finite = np.abs(reciprocals) * sizes.max(initial=0.0) > NOWHERE
+    zeros = (point + 1 / reciprocals[finite]).astype(complex)
     gain = value / factored_response(zeros, poles, 1.0, point).real
     if zeros.size == poles.size and abs(gain / d - 1) < SAME_GAIN:
         farthest = np.abs(zeros - point) >= (1 - 1e-9) * np.abs(zeros - point).max()

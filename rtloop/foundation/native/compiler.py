@@ -16,13 +16,18 @@ with numba_by_default():
     from llvmlite import ir
     from numba import config
     from numba.core import caching, cgutils, types
+    from numba.core.errors import NumbaError
     from numba.core.registry import cpu_target
     from numba.core.sigutils import normalize_signature
     from numba.core.typing.templates import Signature, make_intrinsic_template
+    from numba.extending import register_jitable
 
     from rtloop.foundation.native.numba_cache_file import CheckedCacheFile
 
-__all__ = ["cgutils", "ir", "kernel_type", "make_intrinsic_template", "numba", "parse_signature", "types"]
+__all__ = [
+    "NumbaError", "cgutils", "ir", "kernel_type", "make_intrinsic_template", "numba", "parse_signature",
+    "register_jitable", "types",
+]  # fmt: skip
 
 
 def _load_arrays_without_blas() -> None:
