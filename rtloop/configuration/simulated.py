@@ -15,7 +15,7 @@ from rtloop.configuration.file import Configuration
 from rtloop.configuration.rig import driver_delay_ticks, plant_dynamics, plant_plays, simulated_plant
 from rtloop.hysteresis.play_model import PlayModel
 from rtloop.hysteresis.plays import loading_curve
-from rtloop.hysteresis.reach import reachable_range
+from rtloop.hysteresis.reach import PositionRange, reachable_range
 from rtloop.linear.transfer import Transfer
 
 LARGEST_STROKE_RATIO = 3.0
@@ -113,17 +113,28 @@ def sensor_reach_um(configuration: Configuration, axis: AxisOptions) -> float:
     return max(min(-low_um, high_um), 0.0) if axis.limits.lowest_v < 0.0 else max(-low_um, high_um)
 
 
+def one_sided_range(axis: AxisOptions, sensor_ends_um: tuple[float, float]) -> PositionRange:
+    """Return the slow commands in µm that can follow each other in any order, for a drive of one sign.
+
+    They are within the limits of command and drive, and trip neither the position interlock nor the sensor's.
+    """
+    actuator, limits = axis.feedforward.actuator(), axis.limits
+    static_gain = abs(axis.model.transfer().dc_gain) if axis.model else 1.0
+    low_end_um, high_end_um = (end_um / static_gain for end_um in sensor_ends_um)
+    sensor_um = max(high_end_um if actuator.weights.sum() >= 0 else -low_end_um, 0.0)
+    largest_um = min(limits.command_um, axis.interlocks.position_um / static_gain, sensor_um)
+    low_um, high_um = reachable_range(actuator, limits.lowest_v, limits.drive_v, largest_um)
+    low_um = max(low_um, low_end_um)
+    return PositionRange(low_um, max(min(high_um, high_end_um), low_um))
+
+
 def middle_um(axis: AxisOptions, sensor_ends_um: tuple[float, float]) -> float:
     """Return the position in µm about which an axis moves by default, three digits: 0 for a drive of both signs, else
-    the middle of the positions that it can take in any order, within the position interlock and `sensor_ends_um`.
+    the middle of `one_sided_range`.
     """
-    limits = axis.limits
-    if limits.lowest_v < 0:
+    if axis.limits.lowest_v < 0:
         return 0.0
-    reach_um = min(limits.command_um, axis.interlocks.position_um)
-    reached = reachable_range(axis.feedforward.actuator(), 0.0, limits.drive_v, reach_um)
-    low_um, high_um = max(reached.low_um, sensor_ends_um[0]), min(reached.high_um, sensor_ends_um[1])
-    return float(f"{(low_um + high_um) / 2:.3g}")
+    return float(f"{sum(one_sided_range(axis, sensor_ends_um)) / 2:.3g}")
 
 
 def _stroke_ratio(axis: AxisOptions, rig_plays: PlayModel) -> float | None:

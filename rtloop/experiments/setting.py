@@ -11,11 +11,11 @@ import numpy as np
 
 from rtloop.configuration.axis import AxisOptions
 from rtloop.configuration.schedule import ModeName
+from rtloop.configuration.simulated import middle_um, one_sided_range
 from rtloop.design.synthesis.specification import SpecificationOptions
 from rtloop.experiments.linear_model import LinearModel, linear_model
 from rtloop.experiments.timeline import ABOUT_ZERO, Middle, Timeline, hold
 from rtloop.hysteresis.plays import loading_curve, model_output
-from rtloop.hysteresis.reach import PositionRange, reachable_range
 
 REST_S = 0.1
 
@@ -139,23 +139,12 @@ class Setting:
         return self.axis.limits.lowest_v == 0.0
 
     @cached_property
-    def _one_sided_range(self) -> PositionRange:
-        """Lowest and highest of the slow commands in µm that can follow each other in any order.
-
-        The drive has one sign. Both ends are within the limits, the interlocks and the sensor's range.
-        """
-        actuator, gain = self.axis.feedforward.actuator(), abs(self.model.static_gain) if self.model else 1.0
-        low_um, high_um = reachable_range(actuator, *self.drive_range_v, self.axis.limits.command_um)
-        low_end_um, high_end_um = (end_um / gain for end_um in self.sensor_ends_um)
-        return PositionRange(max(low_um, low_end_um), max(min(high_um, high_end_um), low_um))
-
-    @cached_property
     def middle(self) -> Middle:
         """Middle about which experiments move: 0 or, for a drive of one sign, the middle of the reachable range."""
         if not self.is_one_sided:
             return ABOUT_ZERO
-        middle_um = float(f"{sum(self._one_sided_range) / 2:.3g}")
-        return Middle(middle_um, float(model_output(self.axis.feedforward.actuator().inverse(), [middle_um])[0]))
+        middle = middle_um(self.axis, self.sensor_ends_um)
+        return Middle(middle, float(model_output(self.axis.feedforward.actuator().inverse(), [middle])[0]))
 
     @property
     def reach_v(self) -> float:
@@ -175,7 +164,7 @@ class Setting:
         """
         limits = self.axis.limits
         if self.is_one_sided:
-            low_um, high_um = self._one_sided_range
+            low_um, high_um = one_sided_range(self.axis, self.sensor_ends_um)
             commands_text = f"only commands of {low_um:.4g} … {high_um:.4g} µm can follow each other in any order"
             reason = f"limits.drive_min_v = 0 ({commands_text})"
             return Bound(min(high_um - self.middle.um, self.middle.um - low_um), reason)

@@ -21,6 +21,7 @@ import time
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
+from rtloop import connect
 from tests.surroundings.cell import CLEAN, Bench, Ending, faults
 from tests.surroundings.commands import (
     COMMANDS,
@@ -92,6 +93,16 @@ class _service:
         self._process.wait()
 
 
+def _let_run(socket: Path) -> None:
+    """Let the service run in closed loop at 0 µm, with a change that can be undone, whatever a client did before."""
+    with connect(socket) as service:
+        service.arm()
+        service.start()
+        service.mode("closed_loop")
+        service.setpoint("x", 0.0)
+        service.tune("x", "controller", gain=0.016)
+
+
 class Table:
     """Cells of the table, run by several threads; clients of the one service run one after the other."""
 
@@ -136,6 +147,8 @@ class Table:
 
     def _cell(self, command: Command, surrounding: Surrounding) -> Ending:
         self._number += 1
+        if command.shared:
+            _let_run(self._bench.socket)
         number = self._number
         try:
             return self._bench.run(number, command, surrounding)

@@ -153,7 +153,7 @@ def faults(ending: Ending, clean: tuple[Ending, Ending], surrounding: Surroundin
     for name, data in clean[0].files.items():
         if name not in ending.files:
             found.append(f"{name} is missing")
-        elif clean[1].files.get(name) == data != ending.files[name]:
+        elif clean[1].files.get(name) == data != ending.files[name] and not surrounding.other_digits:
             found.append(f"{name} differs")
         elif data and not ending.files[name]:
             found.append(f"{name} is empty")
@@ -164,4 +164,4 @@ def faults(ending: Ending, clean: tuple[Ending, Ending], surrounding: Surroundin
 
 
 def _is_cache(name: str) -> bool:
-    return name.startswith((".cache", ".config", "home", "tmp", "relative", "run/"))
+    return name.startswith((".cache", ".config", "home", "tmp", "relative", "run/", "none/"))
