@@ -8,7 +8,7 @@ from scipy.signal import lfilter
 
 from rtloop.design.identification.axis_recording import UnsuitableData
 from rtloop.design.identification.dynamics.dynamics_fit import estimate_modes
-from rtloop.design.identification.dynamics.identify_delay import Candidate, simplest_candidates
+from rtloop.design.identification.dynamics.identify_delay import Candidate, simplest_candidate
 from rtloop.design.identification.dynamics.identify_dynamics import identify_dynamics
 from rtloop.design.identification.dynamics.innovations import Innovations
 from rtloop.design.identification.dynamics.prediction_error import Excitation
@@ -78,24 +78,30 @@ def test_a_fast_lag_does_not_stand_in_for_a_sample_of_delay() -> None:
     assert abs(lag.frequency_hz - 4000.0) < 4 * lag.frequency_std_hz
 
 
-def candidate(ticks: int, poles: int, rms_um: float, independent: bool = True) -> Candidate:
-    """Return a candidate of `poles` real poles behind `ticks` samples of delay."""
-    numbers = np.zeros(poles, dtype=complex)
-    return Candidate(ticks, Innovations(PERIOD_S, numbers - 1.0, numbers, numbers), rms_um, independent)
+FIVE_POLES, THREE_POLES = Candidate(0, 5, 0.03, 0.03, True), Candidate(3, 3, 0.031, 0.03, True)
 
 
 @pytest.mark.parametrize(
-    ("candidates", "delays"),
+    ("candidates", "delay_ticks"),
     [
-        ([candidate(0, 4, 0.0297, independent=False), candidate(3, 3, 0.0302)], [3]),
-        ([candidate(0, 4, 0.0297, independent=False)], [0]),
-        ([candidate(0, 4, 0.0300), candidate(1, 3, 0.0302), candidate(2, 3, 0.0301)], [1, 2]),
-        ([candidate(0, 3, 0.0300), candidate(1, 2, 0.0310)], [0]),
+        ([FIVE_POLES, THREE_POLES], 3),
+        ([FIVE_POLES, THREE_POLES._replace(refitted_rms_um=0.0304)], 0),
+        ([FIVE_POLES, THREE_POLES._replace(rms_um=0.0302, refitted_rms_um=0.0304)], 3),
+        ([FIVE_POLES._replace(rms_um=0.02, is_independent=False), THREE_POLES], 3),
+        ([FIVE_POLES._replace(is_independent=False)], 0),
+        ([THREE_POLES, THREE_POLES._replace(ticks=4, refitted_rms_um=0.030014)], 4),
+        ([THREE_POLES, THREE_POLES._replace(ticks=4, refitted_rms_um=0.030016)], 3),
     ],
 )
-def test_fewest_poles_win_among_equally_good_predictions(candidates: list[Candidate], delays: list[int]) -> None:
+def test_fewest_poles_win_among_equally_good_predictions(candidates: list[Candidate], delay_ticks: int) -> None:
     """A candidate whose errors follow from the input counts only where there is no other."""
-    assert [simplest.ticks for simplest in simplest_candidates(candidates)] == delays
+    assert simplest_candidate(candidates, 10_000).ticks == delay_ticks
+
+
+def test_poles_and_zeros_do_not_stand_in_for_three_samples() -> None:
+    """Five poles without delay predict the held-out half better by chance, and the whole recording equally well."""
+    fit = identify_dynamics(excitation(562.443, 0.00839, 3, up_and_down_drive(1.1), 1963.0))
+    assert (fit.model.order, fit.delay_ticks) == (3, 3)
 
 
 @pytest.mark.parametrize("criterion", ["aic", "held-out"])

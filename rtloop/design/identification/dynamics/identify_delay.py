@@ -4,8 +4,8 @@
 
 A delay that is left out of a model comes back as real poles near the sampling rate, and a whole sample of it moves the
 modes. So models are fitted behind each delay that a long ARX model leaves possible, to the first part of the recording.
-Models whose errors follow from the input count only where all do. Models that predict the rest as well as the best one
-are compared by their number of poles, then by Akaike's criterion over the whole recording.
+Models whose errors follow from the input count only where all do. Models that predict the rest, or after a refit the
+whole recording, as well as the best one are compared by their number of poles, then by their error after the refit.
 """
 
 from __future__ import annotations
@@ -25,6 +25,7 @@ from rtloop.design.identification.dynamics.prediction_error import (
     judged_rms,
     refine,
     rms_error,
+    with_held_out_levels,
 )
 from rtloop.design.identification.dynamics.residuals import residual_tests
 from rtloop.foundation.arrays import Real
@@ -35,6 +36,10 @@ LEAST_SHARE = 0.25
 SIGNIFICANT_GROWTH = 30.0
 """Growth of the squared error without the first input coefficients, in variances, above which they are significant."""
 
+LARGEST_DOUBT = 10.0
+"""Difference of Akaike's criterion beyond which the data do not support a model; Burnham & Anderson 2002, section 2.6.
+"""
+
 
 def delay_input(run: Excitation, ticks: int) -> Excitation:
     """Return the recording with its input `ticks` samples later, 0 before."""
@@ -42,20 +47,22 @@ def delay_input(run: Excitation, ticks: int) -> Excitation:
 
 
 class Candidate(NamedTuple):
-    """A model behind `ticks` samples of delay.
+    """A model of `order` poles behind `ticks` samples of delay.
 
-    `rms_um` is its rms prediction error in the samples that it was not fitted to; `is_independent` says whether its
-    errors in the samples that it was fitted to are independent of the past input.
+    `rms_um` is its rms prediction error in the samples that it was not fitted to, `refitted_rms_um` that of all samples
+    after a fit to them; `is_independent` says whether its errors in the samples that it was fitted to are independent
+    of the past input.
     """
 
     ticks: int
-    model: Innovations
+    order: int
     rms_um: float
+    refitted_rms_um: float
     is_independent: bool
 
 
 def identify_delay(run: Excitation, orders: Sequence[int]) -> int:
-    """Return the delay, 0 to MOST_TICKS samples, judged on the held-out samples or, without any, on all.
+    """Return the delay, 0 to MOST_TICKS samples, judged on the held-out samples and on all.
 
     `orders` are the numbers of poles to try. If no model can be fitted, the longest delay that ARX allows is returned.
     Raises ArithmeticError if the predictor of a refitted model is unstable.
@@ -69,48 +76,49 @@ def identify_delay(run: Excitation, orders: Sequence[int]) -> int:
         for ticks in delays
         for model in fit_models_at_gap(fitted_part(delay_input(run, ticks), start), orders)
     ]
-    if not candidates:
-        return delays[-1]
-    return min(
-        simplest_candidates(candidates),
-        key=lambda candidate: _refitted_rms_um(candidate.model, delay_input(run, candidate.ticks)),
-    ).ticks
+    return simplest_candidate(candidates, run.input.size).ticks if candidates else delays[-1]
 
 
-def simplest_candidates(candidates: Sequence[Candidate]) -> list[Candidate]:
-    """Return the candidates of fewest poles among all that predict as well as the best one, within LEAST_IMPROVEMENT.
+def simplest_candidate(candidates: Sequence[Candidate], samples: int) -> Candidate:
+    """Return the candidate of fewest poles among all that predict as well as the best one, within LEAST_IMPROVEMENT:
+    the held-out samples, or all `samples` after a refit.
 
-    A candidate whose errors depend on the input counts only if all do.
+    Among several, the longest delay counts whose Akaike's criterion after the refit is within LARGEST_DOUBT of the
+    least: zeros beyond the band seem to make a sample less. A candidate whose errors depend on the input counts only if
+    all do.
     """
     eligible = [candidate for candidate in candidates if candidate.is_independent] or candidates
     limit_um = min(candidate.rms_um for candidate in eligible) * (1 + LEAST_IMPROVEMENT)
-    predictive = [candidate for candidate in eligible if candidate.rms_um <= limit_um]
-    fewest_poles = min(candidate.model.order for candidate in predictive)
-    return [candidate for candidate in predictive if candidate.model.order == fewest_poles]
+    refitted_limit_um = min(candidate.refitted_rms_um for candidate in eligible) * (1 + LEAST_IMPROVEMENT)
+    predictive = [
+        candidate for candidate in eligible
+        if candidate.rms_um <= limit_um or candidate.refitted_rms_um <= refitted_limit_um
+    ]  # fmt: skip
+    fewest_poles = min(candidate.order for candidate in predictive)
+    simplest = [candidate for candidate in predictive if candidate.order == fewest_poles]
+    doubtful_um = min(candidate.refitted_rms_um for candidate in simplest) * np.exp(LARGEST_DOUBT / (2 * samples))
+    return max(
+        (candidate for candidate in simplest if candidate.refitted_rms_um <= doubtful_um),
+        key=lambda candidate: candidate.ticks,
+    )
 
 
 def _judge_candidate(ticks: int, model: Innovations, run: Excitation, start: int | None) -> Candidate:
     """Return the candidate for a model that was fitted to the samples before `start` (None: to all, which judge it).
 
-    The input of `run` is delayed by `ticks` already. A model with an unstable predictor has an infinite error and
-    counts as not independent.
+    The input of `run` is delayed by `ticks` already. A model with an unstable predictor has infinite errors and counts
+    as not independent. Raises ArithmeticError if the predictor of the refitted model is unstable.
     """
     errors = model.errors(run.input, run.position_um)
     if errors is None:
-        return Candidate(ticks, model, np.inf, False)
+        return Candidate(ticks, model.order, np.inf, np.inf, False)
     tests = residual_tests(run.input[:start], errors[:start], model.pack(noise=True).size)
-    return Candidate(ticks, model, judged_rms(model, run, errors, start or 0), tests.is_independent)
-
-
-def _refitted_rms_um(model: Innovations, run: Excitation) -> float:
-    """Return the rms one-step-ahead error in µm after a fit of the model to the whole recording; infinite if a mode of
-    the fitted model does not decay or has no continuous form.
-
-    For models with equally many unknowns it ranks as Akaike's criterion does. Raises ArithmeticError if the predictor
-    of the fitted model is unstable.
-    """
-    fitted = refine(model, run)
-    return np.inf if fitted is None else rms_error(fitted, run)
+    levelled = run if start is None else with_held_out_levels(model, run, start)
+    refitted = refine(model, levelled)
+    refitted_rms_um = np.inf if refitted is None else rms_error(refitted, levelled)
+    return Candidate(
+        ticks, model.order, judged_rms(model, run, errors, start or 0), refitted_rms_um, tests.is_independent
+    )
 
 
 def fitted_part(run: Excitation, start: int | None) -> Excitation:

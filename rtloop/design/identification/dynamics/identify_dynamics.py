@@ -245,8 +245,8 @@ def _build_fit(
 
     `candidates` are all models compared. The input of `run` is delayed by `delay_ticks` already. Errors that follow
     from the input beyond LARGEST_CROSS_RATIO of the bound widen the deviations by that ratio. `prune` leaves out modes
-    whose pole the recording does not tell from a zero (`uncertain_rates`), one by one. Raises ArithmeticError for an
-    unstable predictor.
+    whose pole the recording does not tell from a zero (`uncertain_rates`), one by one, unless the errors would then
+    follow from the input. Raises ArithmeticError for an unstable predictor.
     """
     errors = prediction_errors(model, run)
     output_error_um = run.position_um - model.simulate_output(run.input)
@@ -259,6 +259,8 @@ def _build_fit(
             smaller = _without_mode(model, int(mode), run)
             if smaller is not None:
                 fit = _build_fit(smaller, run, candidates, delay_ticks, prune=True)
+                if tests.is_independent and not fit.tests.is_independent:
+                    continue
                 left_out_hz = float(abs(model.rates[mode])) / (2 * np.pi)
                 return replace(fit, left_out_hz=(left_out_hz, *fit.left_out_hz))
     return DynamicsFit(
