@@ -8,13 +8,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rtloop.design.identification.axis_recording import AxisRecording, read_axis_recording
-from rtloop.design.identification.dynamics.dynamics_fit import DynamicsFit
+from rtloop.design.identification.dynamics.dynamics_fit import LARGEST_RELATIVE_STD, DynamicsFit
 from rtloop.design.identification.dynamics.excitation import LoopExcitation
 from rtloop.design.identification.dynamics.identify_delay import delay_input
 from rtloop.design.identification.dynamics.identify_dynamics import Criterion
 from rtloop.design.identification.dynamics.identify_in_loop import identify_recorded_dynamics
 from rtloop.design.identification.dynamics.prediction_error import Excitation
 from rtloop.design.identification.dynamics.recorded_loop import RecordedLoop, State, find_closed_loop
+from rtloop.design.identification.dynamics.visible_band import visible_hz
 from rtloop.design.identification.frequency_response import FrequencyResponse, compare_responses, recording_response
 from rtloop.design.identification.model_sections import (
     dynamics_provenance,
@@ -76,6 +77,18 @@ class DynamicsResult(IdentifiedModel):
         return self.fit.delay_ticks
 
     @property
+    def visible_hz(self) -> float:
+        """Frequency (Hz) up to which the recording shows the dynamics: beyond it, the driven motion is below the errors
+        of the model, and no mode is certain.
+        """
+        certain_hz = (
+            mode.frequency_hz
+            for mode in self.fit.modes
+            if mode.frequency_std_hz <= LARGEST_RELATIVE_STD * mode.frequency_hz
+        )
+        return max(visible_hz(self.fit.model, delay_input(self.excitation, self.delay_ticks)), *certain_hz, 0.0)
+
+    @property
     def section(self) -> str:
         """The dynamics as [axis.model]; before it, with an `actuator`, its plays as [axis.feedforward], with weights
         times the static gain.
@@ -109,7 +122,8 @@ class DynamicsResult(IdentifiedModel):
             | {"loop": loop and {"from_tick": loop.start, "to_tick": loop.end, "outside": loop.names}}
             | {"begins_in_motion": loop is None and isinstance(self.excitation, LoopExcitation)}
             | {key: value for key, value in dataclass_fields(fit).items() if key not in ("model", "free_motion_um")}
-            | {"order": self.order, "tests": dataclass_fields(fit.tests) | tests}
+            | {"order": self.order, "visible_hz": self.visible_hz, "nyquist_hz": 0.5 / self.excitation.period_s}
+            | {"tests": dataclass_fields(fit.tests) | tests}
             | {"frequency_response": self.comparison, "output": self.output, "plot": self.picture}
         )
 

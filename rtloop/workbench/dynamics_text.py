@@ -48,6 +48,11 @@ def print_dynamics(out: Console, report: Mapping[str, Any]) -> None:
         'of orders, "error" is the error in the part of the recording that was held out of the fit, or in the whole '
         'recording if no part was; "validation" is the error on the other recordings, – without any'
     )
+    if report["visible_hz"] < report["nyquist_hz"]:
+        out.print(
+            f"the recording shows the dynamics up to {report['visible_hz']:.0f} Hz: beyond it, the driven motion is "
+            "below the errors of the model, and a resonance would stay unseen"
+        )
     if report["begins_in_motion"]:
         out.print(
             "the input before the recording is unknown: the motion that it left was estimated and left out of the fit"
