@@ -54,6 +54,10 @@ PROVOKED = [
         ((LIMITS, f"{LIMITS}\ndrive_min_v = -2.0"),),
         "reference: -20 … 20 µm; the drive's limits, -2 V … 10 V, allow only -",
     ),
+    (
+        (("drive_v = 10.0", "drive_v = 8.0"), ("levels = [20.0, 0.0, -20.0, 0.0]", "levels = [0.0, 42.0]")),
+        "reference: 0 … 42 µm; the drive's limits, -8 V … 8 V, allow only -32.33 … 32.33 µm",
+    ),
     (((RATE, "rate_hz = 1000000\n"),), "loop.rate_hz: 1e+06 Hz; the highest rate that a measured machine kept"),
     (((RATE, f"{RATE}cpu = 9999\n"),), "loop.cpu: 9999; this machine has processors 0 to "),
     (

@@ -6,6 +6,7 @@ adds the accuracy of C(z) and the margins of the loop.
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Iterator
 
@@ -206,19 +207,22 @@ def _unreachable(axis: AxisOptions, lowest_um: float, highest_um: float, ends_um
 def _beyond_drive(axis: AxisOptions, lowest_um: float, highest_um: float) -> Iterator[str]:
     """Yield one line if the drive's limits do not allow a reference from `lowest_um` to `highest_um`, else none.
 
-    The feedforward's model goes from rest to the end on the side where the drive reaches farther, then, with the
+    The feedforward's model goes from rest to the end on the side where the drive reaches farther, else to the farther
+    end, then, with the
     hysteresis of that motion, to the other end. The line states the positions that the limits allow.
     """
     limits, actuator = axis.limits, axis.feedforward.actuator()
     ends_v = limits.lowest_v, limits.drive_v
     down_um, up_um = drive_ends_um(axis)
-    positions_um = sorted((lowest_um, highest_um), key=lambda end_um: end_um * (down_um + up_um), reverse=True)
+    is_even = math.isclose(-down_um, up_um)
+    sides = (lambda end_um: abs(end_um)) if is_even else (lambda end_um: end_um * (down_um + up_um))
+    positions_um = sorted((lowest_um, highest_um), key=sides, reverse=True)
     if can_hold(actuator, positions_um, *ends_v):
         return
     is_virgin = lowest_um == highest_um
     low_um, high_um = (down_um, up_um) if is_virgin else reachable_range(actuator, *ends_v, abs(positions_um[0]))
     is_upward = down_um + up_um > 0
-    if not is_virgin and down_um != -up_um:  # the farther end itself does not limit the other direction
+    if not is_virgin and not is_even:  # the farther end itself does not limit the other direction
         low_um, high_um = (low_um, up_um) if is_upward else (down_um, high_um)
     is_within_ends = down_um <= lowest_um <= highest_um <= up_um
     memory = f" after a motion to {positions_um[0]:g} µm, because of the hysteresis" if is_within_ends else ""
