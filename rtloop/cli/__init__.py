@@ -54,7 +54,8 @@ GARBAGE_AFTER = 100_000
 """New objects before garbage is looked for. A start makes hundreds of thousands and hardly any garbage: looking at
 every 700 took a fifth of it."""
 # matrices here have tens of rows: a library's threads wait for each other longer than they compute, on the loop's cores
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+if not os.environ.get("OPENBLAS_NUM_THREADS", "").isdigit():
+    os.environ["OPENBLAS_NUM_THREADS"] = "1"
 # pydantic would read the metadata of all installed packages, in each process, for plug-ins that no option needs
 os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")
 

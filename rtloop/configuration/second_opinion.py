@@ -14,7 +14,6 @@ from collections.abc import Callable, Sequence
 from itertools import zip_longest
 from typing import Any, NamedTuple
 
-import control
 import numpy as np
 import numpy.typing as npt
 from scipy.optimize import brentq, minimize_scalar
@@ -27,10 +26,14 @@ from rtloop.configuration.axis import PrefilterOptions
 from rtloop.configuration.checks import AxisCheck, SharedLoop
 from rtloop.configuration.prepare import Prepared
 from rtloop.foundation.arrays import Complex, Real
+from rtloop.foundation.trusted import standing_elsewhere
 from rtloop.laws.contract import build_record
 from rtloop.laws.shipped.transfer import TransferController
 from rtloop.linear.discretise import DiscreteController
 from rtloop.linear.options import TransferOptions
+
+with standing_elsewhere():
+    import control
 
 Matrices = tuple[Real, Real, Real, Real | float]
 """Matrices A, B, C and D of a state space."""

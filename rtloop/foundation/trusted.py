@@ -374,3 +374,21 @@ def _foreign_owner_text(status: os.stat_result) -> str:
     """Return the reason of `UntrustedPath` for a file or link whose owner is neither this user nor root."""
     link = "a link that " if stat.S_ISLNK(status.st_mode) else ""
     return f"{link}belongs to user {status.st_uid}, not to this user or root"
+
+
+@contextmanager
+def standing_elsewhere() -> Iterator[None]:
+    """Make the root the current folder during the block, on Linux, for imports that read settings of the current one.
+
+    matplotlib does, and so does python-control, which imports it. The current folder may have been deleted.
+    """
+    if not HAS_OWNERS:
+        yield
+        return
+    here = os.open(".", os.O_PATH)
+    try:
+        os.chdir("/")
+        yield
+    finally:
+        os.fchdir(here)
+        close_descriptor(here)

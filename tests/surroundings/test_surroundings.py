@@ -70,9 +70,28 @@ def test_no_file_of_the_current_folder_runs_or_decides(bench: Bench, words: str)
         assert result.files == clean.files
 
 
+@pytest.mark.parametrize(
+    "first", ["rtloop.configuration.second_opinion", "rtloop.design.interchange", "rtloop.recording.views.picture"]
+)
+def test_whatever_imports_matplotlib_first_leaves_a_matplotlibrc_alone(tmp_path: Path, first: str) -> None:
+    (tmp_path / "matplotlibrc").write_text("lines.linewidth: 20\n")
+    code = (
+        f"import {first}; from rtloop.recording.views.picture import load_matplotlib; "
+        "print(load_matplotlib().rcParams['lines.linewidth'])"
+    )
+    assert subprocess.check_output([sys.executable, "-c", code], cwd=tmp_path, text=True).strip() == "1.5"
+
+
 def test_python_m_rtloop_leaves_the_current_folder_before_it_imports(bench: Bench) -> None:
     result = ending(bench, "laws", SURROUNDINGS["planted, python -m"])
     assert (result.markers, result.code) == ([], 0), result.stderr
+
+
+def test_a_number_of_threads_that_is_none_is_one_as_by_default() -> None:
+    code = "import os, rtloop.cli; print(os.environ['OPENBLAS_NUM_THREADS'])"
+    for value, expected in (("garbage", "1"), ("", "1"), ("2", "2")):
+        environment = {**os.environ, "OPENBLAS_NUM_THREADS": value}
+        assert subprocess.check_output([sys.executable, "-c", code], env=environment, text=True).strip() == expected
 
 
 def test_the_planted_files_would_run(tmp_path: Path) -> None:

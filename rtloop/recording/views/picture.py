@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 import io
-import os
-from collections.abc import Iterator
-from contextlib import contextmanager
 from types import ModuleType
 from typing import TYPE_CHECKING
 
 from rtloop.errors import MissingExtra
-from rtloop.foundation.trusted import HAS_OWNERS, close_descriptor
+from rtloop.foundation.trusted import standing_elsewhere
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -24,28 +21,13 @@ def load_matplotlib() -> ModuleType:
     Raises MissingExtra without matplotlib.
     """
     try:
-        with _standing_elsewhere():
+        with standing_elsewhere():
             import matplotlib
         import matplotlib.backends.backend_agg
         import matplotlib.figure
     except ImportError:
         raise MissingExtra("a picture needs matplotlib: pip install 'rtloop[plot]'") from None
     return matplotlib
-
-
-@contextmanager
-def _standing_elsewhere() -> Iterator[None]:
-    """Make the root the current folder during the block, on Linux; the folder may have been deleted."""
-    if not HAS_OWNERS:
-        yield
-        return
-    here = os.open(".", os.O_PATH)
-    try:
-        os.chdir("/")
-        yield
-    finally:
-        os.fchdir(here)
-        close_descriptor(here)
 
 
 def create_picture(width_inch: float, height_inch: float) -> Figure:
