@@ -51,7 +51,6 @@ ALLOWED = {
     ("panel/web/application.py", "FileResponse"): PACKAGE_FILE,
     ("panel/web/server.py", "webbrowser.open"): "an address, no file",
     ("interchange/export.py", "archive.open"): "a member of an archive that is open",
-    ("recording/views/picture.py", "os.open"): "the current folder, to return to; nothing is read of it",
     ("recording/file/mcap/chunkfile.py", "os.open"): "a folder, to be synchronised; nothing is read of it",
     ("service/second_opinion.py", "path.read_bytes"): PACKAGE_FILE,
     ("starters/examples.py", "files('rtloop').joinpath('examples', name).read_text"): PACKAGE_FILE,
