@@ -6,7 +6,6 @@ import http.client
 import json
 import socket
 import struct
-import threading
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from pathlib import Path
@@ -14,6 +13,7 @@ from typing import Any
 from urllib.parse import quote
 
 from rtloop.errors import HostRefusal, LoopFault, RtloopError, UnavailableError
+from rtloop.foundation import timing
 from rtloop.foundation.trusted import UntrustedPath, trusted_owners
 from rtloop.supervision.paths import host_refusal
 
@@ -108,7 +108,7 @@ class Cancellation:
 
     def __init__(self) -> None:
         """Begin without a connection, not cancelled."""
-        self._lock = threading.Lock()
+        self._lock = timing.lock()
         self._connection: socket.socket | None = None
         self._is_cancelled = False
 

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
 from typing import TypeVar
+
+from rtloop.foundation import timing
 
 T = TypeVar("T")
 
@@ -18,14 +19,14 @@ def repeat_every(period_s: float, action: Callable[[], object]) -> Iterator[None
     The first pause comes before the first call. A call in progress is not awaited at the end; an exception of `action`
     ends the repetition, and is not raised in the work.
     """
-    end_event = threading.Event()
+    end_event = timing.event()
 
     def work() -> None:
         """Call `action` after each pause of `period_s` until `end_event` is set."""
         while not end_event.wait(period_s):
             action()
 
-    threading.Thread(target=work, daemon=True).start()
+    timing.start_thread(work)
     try:
         yield
     finally:

@@ -10,8 +10,6 @@ from __future__ import annotations
 
 import contextlib
 import logging
-import threading
-import time
 from collections.abc import Callable, Iterator, Mapping
 from typing import TYPE_CHECKING
 
@@ -20,6 +18,7 @@ from rtloop.drivers.can.options import BusOptions
 from rtloop.drivers.errors import DriverError, MissingLibrary
 from rtloop.engine.messages import Origin
 from rtloop.errors import ConfigError, UnavailableError
+from rtloop.foundation import timing
 from rtloop.recording.file.topics.events import OPERATOR
 from rtloop.service.desk import Refusal, Requester, use_requester
 from rtloop.service.service import Service, State
@@ -72,11 +71,7 @@ def can_supervision(service: Service) -> Iterator[None]:
     except DriverError as error:
         raise UnavailableError(f"{section}: {error}") from None
     supervision = CanSupervision(service, options, bus, frames)
-    threads = [
-        threading.Thread(target=work, daemon=True) for work in (supervision.send_frames, supervision.receive_frames)
-    ]
-    for thread in threads:
-        thread.start()
+    threads = [timing.start_thread(work) for work in (supervision.send_frames, supervision.receive_frames)]
     try:
         yield
     finally:
@@ -115,7 +110,7 @@ class CanSupervision:
                 ("TripReset", self._reset_trip),
             )
         }
-        self.end_event = threading.Event()
+        self.end_event = timing.event()
         self.refused_count = 0
         self._logged_s = 0.0
 
@@ -124,10 +119,10 @@ class CanSupervision:
 
         A frame that cannot be sent is lost, and logged as `_log_warning` does.
         """
-        due_s = dict.fromkeys(("Status", "Heartbeat"), time.monotonic())
+        due_s = dict.fromkeys(("Status", "Heartbeat"), timing.monotonic_s())
         beat_count, is_tripped = 0, False
         while not self.end_event.wait(POLL_S):
-            row, now_s = self._newest_record(), time.monotonic()
+            row, now_s = self._newest_record(), timing.monotonic_s()
             causes = 0 if row is None else int(row[signals.FLAGS]) & signals.TRIP_MASK
             tick = 0 if row is None else int(row[signals.TICK]) % 2**32
             if causes and not is_tripped:
@@ -230,7 +225,7 @@ class CanSupervision:
 
     def _log_warning(self, text: str) -> None:
         """Log `text` as a warning that begins with the bus's label; drop it within LOG_PERIOD_S after the last one."""
-        now_s = time.monotonic()
+        now_s = timing.monotonic_s()
         if now_s - self._logged_s >= LOG_PERIOD_S:
             self._logged_s = now_s
             log.warning("%s: %s", self._options.label, text)

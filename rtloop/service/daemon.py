@@ -9,13 +9,13 @@ import os
 import signal
 import socket
 import stat
-import threading
 from collections.abc import Iterator
 from pathlib import Path
 
 import uvicorn
 
 from rtloop.errors import UnavailableError
+from rtloop.foundation import timing
 from rtloop.foundation.trusted import UntrustedPath, close_descriptor, open_folder
 from rtloop.service.api.application import application
 from rtloop.service.api.connections import BACKLOG, server_settings
@@ -87,8 +87,7 @@ def _api_server(service: Service) -> Iterator[None]:
     path = socket_path(service.configuration)
     listener = _bind(path, int(service.configuration.service.socket_mode, 8))
     server = uvicorn.Server(server_settings(application(service)))
-    thread = threading.Thread(target=lambda: asyncio.run(server.serve(sockets=[listener])), daemon=True)
-    thread.start()
+    thread = timing.start_thread(lambda: asyncio.run(server.serve(sockets=[listener])))
     try:
         yield
     finally:

@@ -7,8 +7,6 @@ Mode off is never withdrawn: it stays in the queue, and takes effect once the lo
 
 from __future__ import annotations
 
-import threading
-import time
 from collections import OrderedDict
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
@@ -24,6 +22,7 @@ from rtloop.engine.memory import SharedBlock
 from rtloop.engine.messages import ALL_AXES, MESSAGE, Kind, Origin, message
 from rtloop.engine.ring import drain
 from rtloop.errors import RtloopError
+from rtloop.foundation import timing
 from rtloop.recording.capture.requester_names import RequesterNames
 from rtloop.recording.file.topics.events import OPERATOR
 from rtloop.recording.file.topics.recovery_steps import Note
@@ -101,7 +100,7 @@ class Desk:
     def __init__(self, block: SharedBlock, rate_hz: float = 1e6, names: RequesterNames | None = None) -> None:
         """Send to the loop of `block`, whose rate is `rate_hz`; `names`, unless None, receives requesters' names."""
         self._block, self._period_s, self._names = block, 1.0 / rate_hz, names
-        self._lock = threading.Lock()
+        self._lock = timing.lock()
         self._last_identity = 0
         self._changes: OrderedDict[int, str] = OrderedDict()
 
@@ -151,7 +150,7 @@ class Desk:
         acknowledgement in time, withdraws it and raises Refusal, or UnconfirmedCommand if it is not withdrawn.
         """
         timeout_s = ANSWER_TIMEOUT_S + ANSWER_PERIODS * self._period_s
-        ring, deadline = self._block.ring("events"), time.monotonic() + timeout_s
+        ring, deadline = self._block.ring("events"), timing.monotonic_s() + timeout_s
         events: npt.NDArray[np.void] = np.zeros(64, MESSAGE)
         is_late = False
         while True:
@@ -165,13 +164,13 @@ class Desk:
                     return int(event["tick"])
             if is_late:
                 break
-            is_late = time.monotonic() >= deadline
+            is_late = timing.monotonic_s() >= deadline
             if is_late and position is not None and withdraw(self._block, position):
                 raise Refusal(
                     f"{kind.name.lower()}: the loop did not answer within {timeout_s:g} s; the command is withdrawn; "
                     "try again, and see `rtloop doctor` if the loop stands still"
                 )
-            time.sleep(POLL_S)  # After a withdrawal that failed, too: the loop may have answered just now.
+            timing.sleep(POLL_S)  # After a withdrawal that failed, too: the loop may have answered just now.
         if position is None:
             raise UnconfirmedCommand(
                 f"{kind.name.lower()}: the loop did not answer within {timeout_s:g} s; mode off stays in force: the "
@@ -188,5 +187,5 @@ class Desk:
 
         Returns at the monotonic time `deadline` at the latest, without an error.
         """
-        while int(self._block["ticks_head"][0]) <= tick and time.monotonic() < deadline:
-            time.sleep(POLL_S)
+        while int(self._block["ticks_head"][0]) <= tick and timing.monotonic_s() < deadline:
+            timing.sleep(POLL_S)

@@ -5,8 +5,8 @@ from __future__ import annotations
 import logging
 import os
 import queue
-import threading
-import time
+
+from rtloop.foundation import timing
 
 MAX_LINES = 1000
 """Most lines that wait for a slow reader."""
@@ -25,7 +25,7 @@ class Journal(logging.Handler):
         super().__init__()
         self._fd, self._lost_count = fd, 0
         self._lines: queue.Queue[str] = queue.Queue(lines)
-        threading.Thread(target=self._write, daemon=True).start()
+        timing.start_thread(self._write)
 
     def emit(self, record: logging.LogRecord) -> None:
         """Queue a line for the writing thread, without waiting; count it as lost if the queue is full."""
@@ -38,9 +38,9 @@ class Journal(logging.Handler):
 
     def flush(self) -> None:
         """Wait until the queued lines are written, at most FLUSH_S; the others stay queued."""
-        deadline_s = time.monotonic() + FLUSH_S
-        while self._lines.unfinished_tasks and time.monotonic() < deadline_s:
-            time.sleep(0.001)
+        deadline_s = timing.monotonic_s() + FLUSH_S
+        while self._lines.unfinished_tasks and timing.monotonic_s() < deadline_s:
+            timing.sleep(0.001)
 
     def _write(self) -> None:
         """Write queued lines for ever. A note after a line states how many lines were lost since the last note; lines

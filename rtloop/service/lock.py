@@ -10,13 +10,13 @@ from __future__ import annotations
 import hashlib
 import hmac
 import logging
-import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 
 from rtloop.engine.messages import Origin
+from rtloop.foundation import timing
 from rtloop.recording.file.topics.events import OPERATOR
 from rtloop.service.desk import Refusal, Requester, use_requester
 
@@ -39,10 +39,10 @@ class _LockHolder:
 class Lock:
     """A lock that one name holds at a time. Thread-safe; `now_s` is a monotonic clock."""
 
-    def __init__(self, now_s: Callable[[], float] = time.monotonic) -> None:
+    def __init__(self, now_s: Callable[[], float] = timing.monotonic_s) -> None:
         """Begin with a free lock; `now_s` returns a monotonic time in s."""
         self._now_s = now_s
-        self._guard = threading.Lock()
+        self._guard = timing.lock()
         self._holder: _LockHolder | None = None
 
     @property
@@ -54,7 +54,7 @@ class Lock:
             holder = self._current_holder()
             if holder is None:
                 return None
-            until_s = time.time() + self._remaining_s(holder)
+            until_s = timing.unix_s() + self._remaining_s(holder)
             since_s = holder.since_unix_s
             return {"name": holder.name, "since_unix_s": round(since_s, 3), "until_unix_s": round(until_s, 3)}
 
@@ -123,7 +123,7 @@ class Lock:
         """Take or renew the lock and return its holder; `_guard` must be held. Raises as `take`."""
         self._require_available(name)
         if self._holder is None:
-            self._holder = _LockHolder(name, time.time(), 0.0)
+            self._holder = _LockHolder(name, timing.unix_s(), 0.0)
             log.info("%s takes the lock", name)
         self._holder.last_command_s = self._now_s()
         return self._holder

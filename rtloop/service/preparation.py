@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import time
-
 import numpy as np
 import numpy.typing as npt
 
 from rtloop import signals
 from rtloop.configuration.service import DepolariseOptions, ServiceOptions
 from rtloop.engine.messages import Kind
+from rtloop.foundation import timing
 from rtloop.service.changing.live import LiveLaw
 from rtloop.service.desk import Desk, Refusal
 from rtloop.signals import Flag, Mode
@@ -71,12 +70,12 @@ def await_ticks(supervisor: Supervisor, count: int, rate_hz: float, raw_from_tic
     was requested.
     """
     final_tick, limit_s = supervisor.ticks + count, 1.0 + TIMEOUT_FACTOR * count / rate_hz
-    start_s = time.monotonic()
+    start_s = timing.monotonic_s()
     while supervisor.ticks < final_tick:
         _require_progress(supervisor, start_s, limit_s)
         if raw_from_tick is not None and _has_left_raw(supervisor, raw_from_tick):
             raise Refusal("preparing the actuator: ended, because another mode was requested")
-        time.sleep(POLL_S)
+        timing.sleep(POLL_S)
 
 
 def _has_left_raw(supervisor: Supervisor, from_tick: int) -> bool:
@@ -90,10 +89,10 @@ def _await_rest(supervisor: Supervisor) -> None:
 
     Raises Refusal after a trip, and after TIMEOUT_FACTOR + 1 seconds.
     """
-    start_s, limit_s = time.monotonic(), 1.0 + TIMEOUT_FACTOR
+    start_s, limit_s = timing.monotonic_s(), 1.0 + TIMEOUT_FACTOR
     while (row := supervisor.latest()) is None or int(row[signals.FLAGS]) & Flag.RAMPING:
         _require_progress(supervisor, start_s, limit_s)
-        time.sleep(POLL_S)
+        timing.sleep(POLL_S)
 
 
 def _require_progress(supervisor: Supervisor, start_s: float, limit_s: float) -> None:
@@ -101,7 +100,7 @@ def _require_progress(supervisor: Supervisor, start_s: float, limit_s: float) ->
     row = supervisor.latest()
     if row is not None and (causes := signals.trip_causes(row[signals.FLAGS])):
         raise Refusal(f"preparing the actuator: the loop tripped ({', '.join(causes)})")
-    if time.monotonic() > start_s + limit_s:
+    if timing.monotonic_s() > start_s + limit_s:
         raise Refusal(
             f"preparing the actuator: not done after {limit_s:.3g} s, at tick {supervisor.ticks}: the loop stands "
             "still or runs too slowly; see `rtloop doctor`, or lower loop.rate_hz"

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import hashlib
 import logging
-import threading
 from importlib.metadata import version
 from pathlib import Path
 
@@ -17,6 +16,7 @@ import numpy as np
 from rtloop.configuration.prepare import Prepared
 from rtloop.drivers.errors import DriverError
 from rtloop.errors import RtloopError, UnavailableError
+from rtloop.foundation import timing
 from rtloop.foundation.native.cache import CACHE_FOLDER
 from rtloop.foundation.native.cache_files import read, write
 from rtloop.laws.limited.process import LimitedProcess
@@ -42,7 +42,7 @@ class SecondOpinion:
     def __init__(self) -> None:
         """Begin without a comparison: `require` waits until `compute` has ended."""
         self.faults: list[str] = []
-        self._is_known = threading.Event()
+        self._is_known = timing.event()
 
     def compute(self, prepared: Prepared) -> None:
         """Compare the loops of all axes with python-control's, unless an agreement on the same loops is stored.

@@ -11,8 +11,6 @@ The state is not stored: it follows from the newest record, the latched faults a
 from __future__ import annotations
 
 import logging
-import threading
-import time
 from collections.abc import Callable
 from dataclasses import replace
 from enum import StrEnum
@@ -29,6 +27,7 @@ from rtloop.drivers.errors import DriverError
 from rtloop.engine.memory import Word
 from rtloop.engine.messages import MESSAGE, Kind
 from rtloop.errors import ConfigError, LoopFault, RtloopError, UnavailableError
+from rtloop.foundation import timing
 from rtloop.foundation.arrays import Real
 from rtloop.foundation.trusted import open_own
 from rtloop.recording.file.recover import find_leftovers, recover
@@ -115,8 +114,8 @@ class Service:
         self._requested_mode: Mode | None = None
         """Mode that a client requested last, of this loop or before it; the preparation sends nothing after that."""
         self._desk: Desk | None = None
-        self._end_requested, self._reload_requested = threading.Event(), threading.Event()
-        self._reload_lock = threading.Lock()
+        self._end_requested, self._reload_requested = timing.event(), timing.event()
+        self._reload_lock = timing.lock()
         self._deaths_s: list[float] = []
         self._is_stopping = False
         self._offsets_v: dict[int, float] = {}
@@ -349,14 +348,14 @@ class Service:
         log.info("starting %s, which records into %s", self.configuration.name, recordings_folder(self.configuration))
         if self.configuration.service.arm and self.configuration.service.prepares:
             log.warning("the actuator is neither depolarised nor tared, because service.arm is true")
-        recovery = self._start_thread(self._recover_leftovers)
+        recovery = timing.start_thread(self._recover_leftovers)
         try:
             return self._serve()
         finally:  # A file that grew at the start may be unfinished by now; two recoveries must not run at once.
             self.notifier.limit_watchdog(START_TIMEOUT_S)  # The outputs are safe; RECOVERY_TIMEOUT_S limits the time.
             recovery.join(RECOVERY_TIMEOUT_S)
             if not recovery.is_alive():
-                self._start_thread(self._recover_leftovers).join(RECOVERY_TIMEOUT_S)
+                timing.start_thread(self._recover_leftovers).join(RECOVERY_TIMEOUT_S)
 
     def _serve(self) -> int:
         """Run loop after loop until `end` is called; a loop after a failure begins with its outputs off.
@@ -429,7 +428,7 @@ class Service:
                 self.live = LiveLaw(prepared, supervisor.block, self._desk, self._offsets_v)
                 self.supervisor = supervisor
                 if needs_preparation:
-                    self._start_thread(self._prepare_and_start)
+                    timing.start_thread(self._prepare_and_start)
                 return self._watch(supervisor)
             finally:
                 self.supervisor = self._desk = self.live = self._requested_mode = None
@@ -456,7 +455,7 @@ class Service:
             # Requests during a reload become one further reload.
             if self._reload_requested.is_set() and not self._reload_lock.locked():
                 self._reload_requested.clear()
-                self._start_thread(self._apply_reload)
+                timing.start_thread(self._apply_reload)
             self._notify_systemd(supervisor)
             if gap_message := gaps.next_message():
                 log.error("%s", gap_message)
@@ -477,7 +476,7 @@ class Service:
                 else:
                     log.info("%s", state)
                 logged_state = state
-            time.sleep(POLL_S)
+            timing.sleep(POLL_S)
         self._follow_events()
         for note in result.notes:
             log.warning("%s", note)
@@ -500,11 +499,11 @@ class Service:
         if not self._is_ready and supervisor.ticks >= READY_TICKS:
             self._is_ready = True
             self.notifier.send(READY=1)
-            self._start_thread(self._start_builder_later)
-            self._start_thread(lambda: self._judge_loop(supervisor.prepared))
+            timing.start_thread(self._start_builder_later)
+            timing.start_thread(lambda: self._judge_loop(supervisor.prepared))
         if self._reported_ticks == 0 and supervisor.ticks:
             self.notifier.limit_watchdog()
-        if not self.notifier.is_due(min(STATUS_PERIOD_S, (self.notifier.watchdog_s or 10.0) / 4), time.monotonic()):
+        if not self.notifier.is_due(min(STATUS_PERIOD_S, (self.notifier.watchdog_s or 10.0) / 4), timing.monotonic_s()):
             return
         if supervisor.ticks > self._reported_ticks or supervisor.ended or supervisor.block.load(Word.STOP):
             self.notifier.send(WATCHDOG=1)
@@ -528,13 +527,13 @@ class Service:
         if reason not in self.faults:
             self.faults.append(reason)
         log.error("%s", reason)
-        options, now_s = self.configuration.service, time.monotonic()
+        options, now_s = self.configuration.service, timing.monotonic_s()
         self._deaths_s = [moment for moment in self._deaths_s if now_s - moment < options.restart_window_s] + [now_s]
         if len(self._deaths_s) > options.restarts:
             return False
         self._reported_ticks = 0
         self.notifier.limit_watchdog(START_TIMEOUT_S)  # The outputs are parked; the start has its own time limit.
-        time.sleep(RESTART_PAUSE_S)
+        timing.sleep(RESTART_PAUSE_S)
         return True
 
     def _latch_and_wait(self, reason: str) -> None:
@@ -549,12 +548,6 @@ class Service:
         self._reported_ticks = 0
         self.notifier.limit_watchdog(START_TIMEOUT_S)
         self._end_requested.wait(self.recovery.pause_s)
-
-    def _start_thread(self, work: Callable[[], None]) -> threading.Thread:
-        """Start slow work in a separate thread, so that the watch continues. Returns the thread."""
-        thread = threading.Thread(target=work, daemon=True)
-        thread.start()
-        return thread
 
     def _recover_leftovers(self) -> None:
         """Recover the unfinished recordings in the folder of recordings, which services that were killed have left.
@@ -635,7 +628,7 @@ class Service:
 
         An RtloopError or DriverError is logged, not raised; its text names the axes that were changed already.
         """
-        self.notifier.send(RELOADING=1, MONOTONIC_USEC=time.monotonic_ns() // 1000)
+        self.notifier.send(RELOADING=1, MONOTONIC_USEC=round(1e6 * timing.monotonic_s()))
         try:
             self.reload_now()
         except (RtloopError, DriverError) as error:

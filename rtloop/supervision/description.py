@@ -6,7 +6,6 @@ import hashlib
 import os
 import platform
 import sys
-import time
 from collections.abc import Mapping
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -14,6 +13,7 @@ from pathlib import Path
 from rtloop.configuration.prepare import Prepared
 from rtloop.configuration.recording import event_window
 from rtloop.engine.plan import Plan
+from rtloop.foundation import timing
 from rtloop.foundation.native.cache import cpu_identity
 
 FORMAT, FORMAT_EVENT_WINDOW = 1, 2
@@ -32,7 +32,7 @@ def recording_header(prepared: Prepared, realtime: Mapping[str, object]) -> dict
     return {
         "format": FORMAT if around is None else FORMAT_EVENT_WINDOW,
         "name": plan.name,
-        "created_unix_ns": time.time_ns(),
+        "created_unix_ns": round(1e9 * timing.unix_s()),
         "axes": list(plan.axes),
         "observed": list(plan.observed),
         "columns": list(plan.columns),

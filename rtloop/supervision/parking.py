@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -22,6 +21,7 @@ from rtloop.engine.ramp import (
     unusable_drives,
 )
 from rtloop.errors import RtloopError, UnavailableError, one_line_error
+from rtloop.foundation import timing
 from rtloop.foundation.native.uncompiled import allow_uncompiled
 from rtloop.foundation.trusted import close_descriptor
 from rtloop.supervision.hardware import Hardware, UnusableNote, configured_hardware, read_note
@@ -209,18 +209,18 @@ def _await_end(
         ramp_s = float(np.max(np.abs(drives_v - safe_v))) / slew_v_per_s
         ramp_s = ramp_s if ramp_s <= LONGEST_RAMP_S else LONGEST_RAMP_S  # Also for a drive that is NaN.
     beat_ns = block.load(Word.HEARTBEAT_NS)
-    kill_time_s = time.monotonic() + heartbeat_timeout_s + ramp_s + MARGIN_S
+    kill_time_s = timing.monotonic_s() + heartbeat_timeout_s + ramp_s + MARGIN_S
     while (pid := block.driver_pid()) is not None:
         if block.load(Word.HEARTBEAT_NS) != beat_ns:
             raise UnavailableError(f"process {pid} drives the outputs and its service is alive; use `rtloop ctl stop`")
-        if time.monotonic() > kill_time_s + KILL_S:
+        if timing.monotonic_s() > kill_time_s + KILL_S:
             raise DriverError(
                 f"process {pid} drives the outputs and cannot be killed; the outputs may still carry voltage; check "
                 "the amplifier"
             )
-        if time.monotonic() > kill_time_s:
+        if timing.monotonic_s() > kill_time_s:
             block.kill_driver()
-        time.sleep(POLL_S)
+        timing.sleep(POLL_S)
 
 
 def park(driver: Driver, slew_v_per_s: float, noted_v: npt.NDArray[np.float64] | None = None) -> list[float]:

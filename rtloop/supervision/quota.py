@@ -9,12 +9,12 @@ from __future__ import annotations
 
 import os
 import re
-import time
 from collections.abc import Iterable
 from pathlib import Path
 from typing import NamedTuple
 
 from rtloop.errors import RtloopError
+from rtloop.foundation import timing
 from rtloop.foundation.trusted import is_own, open_own
 from rtloop.recording.file.event_window import EventWindow
 from rtloop.recording.file.reader import Reader
@@ -168,12 +168,12 @@ class Quota:
 
         Begins no file later than `budget_s` after the call. Files that are no longer in `entries` are forgotten.
         """
-        until_s = time.monotonic() + budget_s
+        until_s = timing.monotonic_s() + budget_s
         self._contents = {entry: self._contents[entry] for entry in entries if entry in self._contents}
         self._unusable &= set(entries)
         for entry in entries:
             is_new = entry not in self._contents and entry not in self._unusable and entry.name.endswith(".mcap")
-            if is_new and time.monotonic() < until_s:
+            if is_new and timing.monotonic_s() < until_s:
                 if (contents := self._read_contents(entry)) is None:
                     self._unusable.add(entry)
                 else:

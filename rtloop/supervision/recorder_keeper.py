@@ -7,14 +7,13 @@ file.
 from __future__ import annotations
 
 import json
-import threading
-import time
 from pathlib import Path
 from typing import Any
 
 from rtloop.configuration.recording import RecordingOptions
 from rtloop.engine.memory import ProcessState, SharedBlock, Word
 from rtloop.errors import OutputError, RtloopError
+from rtloop.foundation import timing
 from rtloop.foundation.trusted import open_without_link
 from rtloop.recording.capture.requester_names import RequesterNames
 from rtloop.recording.file.recover import recover
@@ -52,8 +51,7 @@ class RecorderKeeper:
         self._header: dict[str, object] = {}
         self._watch = StallWatch(STALL_S, LONGEST_STEP_S)
         self._has_orders = False
-        self._finishing = threading.Event()
-        self._thread = threading.Thread(target=self._run, daemon=True)
+        self._finishing = timing.event()
         self.recording = False
         """Whether the first recorder has opened its file."""
         self.failure: RtloopError | None = None
@@ -94,7 +92,7 @@ class RecorderKeeper:
         if self._options.keep_gib is not None:
             min_free_bytes = round(self._options.min_free_mib * 2**20)
             self.quota = Quota(self._path.parent, header["name"], round(self._options.keep_gib * 2**30), min_free_bytes)
-        self._thread.start()
+        timing.start_thread(self._run)
 
     def finish(self) -> None:
         """Tell the thread to let the recorder finish and to repair its files; returns at once, and `totals` follows."""
@@ -130,9 +128,9 @@ class RecorderKeeper:
 
     def _enforce_quota_when_due(self) -> None:
         """Enforce the quota, if there is one, every QUOTA_S, and send its removals to the recorder."""
-        if self.quota is not None and time.monotonic() - self._quota_time_s >= QUOTA_S:
+        if self.quota is not None and timing.monotonic_s() - self._quota_time_s >= QUOTA_S:
             self._unsent_removals += self._enforce_quota(self.quota)
-            self._quota_time_s = time.monotonic()
+            self._quota_time_s = timing.monotonic_s()
             self._send_removals()
 
     def _enforce_quota(self, quota: Quota, *budget_s: float) -> list[Removal]:
@@ -166,7 +164,7 @@ class RecorderKeeper:
         """
         self._send_orders()
         while self.state == ProcessState.READY and self.exit_code is None:
-            time.sleep(0.002)
+            timing.sleep(0.002)
         if self.state not in (ProcessState.RUNNING, ProcessState.FINISHED):
             self._child.wait(END_TIMEOUT_S)
             raise OutputError(
@@ -185,7 +183,7 @@ class RecorderKeeper:
             return
         cursor = self._block.load(Word.RECORDER_CURSOR)
         is_behind = int(self._block["ticks_head"][0]) != cursor
-        is_stuck = self._watch.has_stalled(cursor, time.monotonic()) and is_behind
+        is_stuck = self._watch.has_stalled(cursor, timing.monotonic_s()) and is_behind
         loop_ended = ProcessState.has_ended(self._block.load(Word.LOOP_STATE))
         has_died = self.exit_code is not None and not (loop_ended and self.exit_code >= 0)
         if (has_died or is_stuck) and self.replacements < MAX_REPLACEMENTS:
@@ -203,10 +201,10 @@ class RecorderKeeper:
 
         A recorder that does not end within END_TIMEOUT_S is killed. Repairs and removals are added to `notes`.
         """
-        deadline = time.monotonic() + END_TIMEOUT_S
-        while not self._has_orders and time.monotonic() < deadline and self.exit_code is None:
+        deadline = timing.monotonic_s() + END_TIMEOUT_S
+        while not self._has_orders and timing.monotonic_s() < deadline and self.exit_code is None:
             self._replace_if_dead()
-            time.sleep(POLL_S)
+            timing.sleep(POLL_S)
         if self._child.wait(END_TIMEOUT_S) is None:
             self.notes.append(
                 f"the recorder did not end within {END_TIMEOUT_S:g} s and was killed; the recording may lack its end"

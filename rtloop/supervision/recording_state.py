@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import time
 from collections.abc import Callable
 from typing import Any, Protocol, TypedDict
 
@@ -11,6 +10,7 @@ import numpy as np
 
 from rtloop.engine.memory import SharedBlock, Word
 from rtloop.errors import LOW_SPACE
+from rtloop.foundation import timing
 from rtloop.values import count_text
 
 REASONS = {
@@ -70,7 +70,7 @@ class GapReporter:
     behind again, which is one gap.
     """
 
-    def __init__(self, block: SharedBlock, now_s: Callable[[], float] = time.monotonic) -> None:
+    def __init__(self, block: SharedBlock, now_s: Callable[[], float] = timing.monotonic_s) -> None:
         """Report gaps of the recording on `block`; `now_s` returns a monotonic time in s."""
         self._block, self._now_s = block, now_s
         self._reasons: set[str] = set()

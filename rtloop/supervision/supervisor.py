@@ -8,11 +8,12 @@ from __future__ import annotations
 import contextlib
 import os
 import pickle
-import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
+from threading import Event
 from typing import Any
 
 import numpy as np
@@ -25,6 +26,7 @@ from rtloop.engine.memory import ProcessState, SharedBlock, Word
 from rtloop.engine.messages import MESSAGE, Kind
 from rtloop.engine.ring import drain
 from rtloop.errors import LoopFault, RtloopError, UnavailableError
+from rtloop.foundation import timing
 from rtloop.foundation.arrays import Real
 from rtloop.foundation.native.cache import stored_file_count
 from rtloop.recording.capture.requester_names import RequesterNames
@@ -176,21 +178,21 @@ class Supervisor:
         `on_progress` is called every PROGRESS_PERIOD_S in a separate thread: a blocked terminal delays nothing. Raises
         RtloopError if the run could not start; a loop that dies later is in the result.
         """
-        end_event = threading.Event()
-        progress_thread = threading.Thread(target=self._report_progress, args=(on_progress, end_event), daemon=True)
+        end_event = timing.event()
+        progress_thread = None
         try:
             self.start()
-            progress_thread.start()
+            progress_thread = timing.start_thread(partial(self._report_progress, on_progress, end_event))
             while (result := self.poll()) is None:
-                time.sleep(POLL_S)
+                timing.sleep(POLL_S)
             return result
         finally:
             end_event.set()
-            if progress_thread.is_alive():
+            if progress_thread is not None:
                 progress_thread.join(PROGRESS_PERIOD_S)
             self.close()
 
-    def _report_progress(self, on_progress: Callable[[Supervisor], None] | None, end_event: threading.Event) -> None:
+    def _report_progress(self, on_progress: Callable[[Supervisor], None] | None, end_event: Event) -> None:
         """Call `on_progress` every PROGRESS_PERIOD_S until `end_event` is set; with None, return at once."""
         while on_progress is not None and not end_event.wait(PROGRESS_PERIOD_S):
             on_progress(self)
@@ -207,17 +209,17 @@ class Supervisor:
         self._loop.send(pickle.dumps(self.prepared.plan))
         self._await_ready()
         self.recorder.start(recording_header(self.prepared, self.realtime))
-        deadline = time.monotonic() + START_TIMEOUT_S
+        deadline = timing.monotonic_s() + START_TIMEOUT_S
         while not self.recorder.recording:
             self._heart.watch()
             if self.recorder.failure is not None:
                 raise self.recorder.failure
-            if time.monotonic() > deadline:
+            if timing.monotonic_s() > deadline:
                 raise UnavailableError(
                     f"the recording was not open within {START_TIMEOUT_S:g} s; its file system may not answer; check "
                     "the disk of recording.folder"
                 )
-            time.sleep(START_POLL_S)
+            timing.sleep(START_POLL_S)
         self.block.store(Word.GO, 1)
         with contextlib.suppress(OSError):  # The figure is for information only.
             self.startup_s = process_age_s()
@@ -242,10 +244,10 @@ class Supervisor:
         The heartbeat ends. Outputs of a loop that is killed here are not parked.
         """
         self.stop()
-        deadline = time.monotonic() + END_TIMEOUT_S
-        while self._loop.exit_code is None and time.monotonic() < deadline:
+        deadline = timing.monotonic_s() + END_TIMEOUT_S
+        while self._loop.exit_code is None and timing.monotonic_s() < deadline:
             self._heart.watch()
-            time.sleep(START_POLL_S)
+            timing.sleep(START_POLL_S)
         self._heart.end()
         self._loop.end()
         self.recorder.close()
@@ -262,7 +264,7 @@ class Supervisor:
             is_running and self.prepared.plan.pacing.paced and self.ticks and not self.block.load(Word.FINISHED_TICKS)
         ):
             return False
-        has_stalled = self._stall.has_stalled(self.ticks, time.monotonic())
+        has_stalled = self._stall.has_stalled(self.ticks, timing.monotonic_s())
         if self._stall.stalled_s == 0.0:
             self._tick_processor_s = self._loop.processor_s
         if not has_stalled:
@@ -282,7 +284,7 @@ class Supervisor:
         Raises RtloopError with the failure that the loop's process reports, LoopFault if a process ended without
         report, UnavailableError after START_TIMEOUT_S in which no function was compiled.
         """
-        deadline, compiled = time.monotonic() + START_TIMEOUT_S, stored_file_count()
+        deadline, compiled = timing.monotonic_s() + START_TIMEOUT_S, stored_file_count()
         while True:
             self._heart.watch()
             self._collect_reports()
@@ -300,15 +302,15 @@ class Supervisor:
                     f"the recorder's process ended with exit code {self.recorder.exit_code} before the run began; its "
                     "error output, if any, says why"
                 )
-            if time.monotonic() > deadline:
+            if timing.monotonic_s() > deadline:
                 before, compiled = compiled, stored_file_count()
                 if compiled == before:
                     raise UnavailableError(
                         f"loop and recorder were not ready within {START_TIMEOUT_S:g} s; the host may be overloaded; "
                         "start again"
                     )
-                deadline = time.monotonic() + START_TIMEOUT_S
-            time.sleep(START_POLL_S)
+                deadline = timing.monotonic_s() + START_TIMEOUT_S
+            timing.sleep(START_POLL_S)
 
     def _raise_failure(self, exit_code: int) -> None:
         """Raise RtloopError with the message and exit code in the report "failed" of the loop's process.

@@ -18,6 +18,7 @@ import pytest
 from rtloop.configuration.recording import RecordingOptions
 from rtloop.engine.memory import ProcessState, Word
 from rtloop.engine.messages import Kind, message
+from rtloop.foundation import timing
 from rtloop.recording.capture.requester_names import RequesterNames
 from rtloop.recording.errors import RecordingError
 from rtloop.recording.file.topics.contents import event_message
@@ -213,7 +214,7 @@ def test_no_file_of_a_run_is_removed_before_all_were_read(tmp_path: Path, monkey
     """A trip in an unread file protects the file before it."""
     files = write_run(tmp_path, "20260101T000001", 5, trip=2 * PART_TICKS + 500)
     seconds = count()
-    monkeypatch.setattr(quota_module, "time", SimpleNamespace(monotonic=lambda: float(next(seconds))))
+    monkeypatch.setattr(timing, "source", timing.Source(monotonic_s=lambda: float(next(seconds))))
     quota = Quota(tmp_path, "test", 1, 0)
     assert quota.enforce(budget_s=2.5) == []  # Time for two files.
     require_files(tmp_path, *files)

@@ -9,14 +9,13 @@ import signal
 import subprocess
 import warnings
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from rtloop.engine.memory import ProcessState, Word
 from rtloop.engine.messages import MESSAGE, Kind, Origin
-from rtloop.recording.capture import recorder as module
+from rtloop.foundation import timing
 from rtloop.recording.capture.recorder import Recorder
 from rtloop.recording.file.reader import Reader
 from rtloop.recording.file.recover import recover
@@ -294,7 +293,7 @@ class StillPolling(Exception):
 @pytest.fixture
 def frozen_clock(monkeypatch: pytest.MonkeyPatch) -> None:
     """Stop the recorder's clock; its pauses last no time."""
-    monkeypatch.setattr(module, "time", SimpleNamespace(monotonic=lambda: 1_000.0, sleep=lambda _: None))
+    monkeypatch.setattr(timing, "source", timing.Source(monotonic_s=lambda: 1_000.0, sleep=lambda _: None))
 
 
 @pytest.mark.usefixtures("frozen_clock")

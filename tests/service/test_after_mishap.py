@@ -14,8 +14,8 @@ from rtloop.configuration.recording import RecordingOptions
 from rtloop.configuration.schedule import ScheduleOptions
 from rtloop.engine.memory import ProcessState, SharedBlock, Sizes, Word
 from rtloop.errors import LoopFault, OutputError, UnavailableError
+from rtloop.foundation import timing
 from rtloop.recording.capture.requester_names import RequesterNames
-from rtloop.service import service as service_module
 from rtloop.service.service import Service, State
 from rtloop.service.status import status
 from rtloop.supervision import parking, recorder_keeper
@@ -28,7 +28,7 @@ SIZES = Sizes(columns=1, axes=1, rate_hz=1000.0, snapshot_bytes=8, table_samples
 
 
 class Clock:
-    """Stand-in for the module `time`: `sleep` advances its clock at once."""
+    """Virtual time: `sleep` advances it at once."""
 
     def __init__(self) -> None:
         self.now_s = 1000.0
@@ -36,11 +36,11 @@ class Clock:
     def monotonic(self) -> float:
         return self.now_s
 
-    def monotonic_ns(self) -> int:
-        return round(1e9 * self.now_s)
-
     def sleep(self, seconds: float) -> None:
         self.now_s += seconds
+
+    def source(self) -> timing.Source:
+        return timing.Source(monotonic_s=self.monotonic, sleep=self.sleep)
 
 
 @pytest.fixture
@@ -53,7 +53,7 @@ def block() -> SharedBlock:
 def test_a_loop_without_its_service_has_the_time_that_its_ramp_takes(block, monkeypatch, drive_v):
     """The loop is killed after the heartbeat timeout of 1 s and a ramp of 10 V at 2 V/s from either end."""
     clock, killed_s = Clock(), list[float]()
-    monkeypatch.setattr(parking, "time", clock)
+    monkeypatch.setattr(timing, "source", clock.source())
     monkeypatch.setattr(SharedBlock, "driver_pid", lambda _: None if killed_s else 4711)
     monkeypatch.setattr(SharedBlock, "kill_driver", lambda _: killed_s.append(clock.now_s))
     block["last_drive_v"][:] = drive_v
@@ -160,7 +160,7 @@ def test_a_recorder_may_finish_before_it_is_seen_running(block, tmp_path, monkey
 def test_a_recorder_is_replaced_only_if_there_is_something_to_record(block, tmp_path, monkeypatch, recorded, replaced):
     """The recorder's cursor stands still for 10 s: at the newest tick the recorder is idle, behind it stuck."""
     clock = Clock()
-    monkeypatch.setattr(recorder_keeper, "time", clock)
+    monkeypatch.setattr(timing, "source", clock.source())
     monkeypatch.setattr(recorder_keeper, "Child", IdleRecorder)
     keeper = make_keeper(block, tmp_path)
     block["ticks_head"][0] = 500
@@ -215,9 +215,8 @@ def dying_loop_service(monkeypatch: pytest.MonkeyPatch, after_s: float, loops: i
     service, clock, outputs_off_flags = Service(DEPLOY / "paper.toml"), Clock(), list[bool]()
     options = service.configuration.service.model_copy(update={"restarts": 2, "restart_window_s": 60.0})
     service.configuration = replace(service.configuration, service=options)
-    monkeypatch.setattr(service_module, "time", clock)
-    ended_thread = SimpleNamespace(join=lambda timeout_s: None, is_alive=lambda: False)
-    monkeypatch.setattr(service, "_start_thread", lambda work: ended_thread)
+    ended_thread: Any = SimpleNamespace(join=lambda timeout_s: None, is_alive=lambda: False)
+    monkeypatch.setattr(timing, "source", replace(clock.source(), start_thread=lambda work: ended_thread))
 
     def run_loop(outputs_off: bool) -> Any:
         outputs_off_flags.append(outputs_off)

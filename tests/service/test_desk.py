@@ -11,6 +11,7 @@ import pytest
 from rtloop.engine.memory import SharedBlock, Sizes
 from rtloop.engine.messages import Kind, message
 from rtloop.engine.ring import claim, publish
+from rtloop.foundation import timing
 from rtloop.service import desk as desk_module
 from rtloop.service.changing.staging import Staging
 from rtloop.service.desk import Desk, Refusal, RefusedByLoop, UnconfirmedCommand
@@ -45,7 +46,7 @@ def test_the_desk_answers_when_the_record_of_the_tick_is_there(block, monkeypatc
             block["ticks_head"][0] += 1
 
     block["ticks_head"][0] = 7
-    monkeypatch.setattr(desk_module, "time", SimpleNamespace(monotonic=lambda: now_s[0], sleep=sleep))
+    monkeypatch.setattr(timing, "source", timing.Source(monotonic_s=lambda: now_s[0], sleep=sleep))
     assert Desk(block).submit(Kind.SET_MODE, values=[float(Mode.OFF)]) == 7
     assert block["ticks_head"][0] == (7 if stall_s else 8)
 
@@ -65,7 +66,7 @@ def test_an_answer_that_comes_while_the_command_is_withdrawn_is_the_answer(block
     def sleep(seconds: float) -> None:
         now_s[0] += seconds
 
-    monkeypatch.setattr(desk_module, "time", SimpleNamespace(monotonic=lambda: now_s[0], sleep=sleep))
+    monkeypatch.setattr(timing, "source", timing.Source(monotonic_s=lambda: now_s[0], sleep=sleep))
     monkeypatch.setattr(desk_module, "withdraw", take_and_answer)
     if kind is Kind.REFUSED:
         with pytest.raises(RefusedByLoop, match="refused at tick 7"):

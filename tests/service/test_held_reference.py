@@ -15,8 +15,8 @@ import pytest
 
 from rtloop.engine.commands import QueueFull
 from rtloop.engine.messages import Kind
+from rtloop.foundation import timing
 from rtloop.kernel.reference import Generator
-from rtloop.service.changing import active_references
 from rtloop.service.changing.references import LiveReferences
 from rtloop.service.changing.staging import Staging
 from rtloop.service.desk import Refusal, UnconfirmedCommand
@@ -178,7 +178,7 @@ def test_a_setpoint_that_is_set_just_now_is_read_from_a_record_that_has_it(
         now_s[0] += duration_s
 
     monkeypatch.setattr(Staging, "newest_record", stale)
-    monkeypatch.setattr(active_references, "time", SimpleNamespace(monotonic=lambda: now_s[0], sleep=sleep))
+    monkeypatch.setattr(timing, "source", timing.Source(monotonic_s=lambda: now_s[0], sleep=sleep))
     with pytest.raises(Refusal, match="the loop stands still after a change of the reference"):
         bench.references.constant_reference_um(0)
 

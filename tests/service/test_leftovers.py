@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 
+from rtloop.foundation import timing
 from rtloop.service.service import Service
 from tests.paper_configuration import TEXT
 from tests.recording.hand_made_loop import make_rows, write_recording
@@ -30,7 +31,7 @@ def test_a_part_that_grew_at_the_start_is_completed_at_the_end(tmp_path: Path, m
     recorder = part.open("rb")
     fcntl.flock(recorder, fcntl.LOCK_EX)
     service = Service(config)
-    start_thread, threads = service._start_thread, list[threading.Thread]()
+    start_thread, threads = timing.start_thread, list[threading.Thread]()
     was_completed: list[bool] = []
 
     def run_loop(_: bool) -> Any:
@@ -40,7 +41,7 @@ def test_a_part_that_grew_at_the_start_is_completed_at_the_end(tmp_path: Path, m
         service.end()
         return SimpleNamespace(exit_code=0, error=None)
 
-    monkeypatch.setattr(service, "_start_thread", lambda work: threads.append(start_thread(work)) or threads[-1])
+    monkeypatch.setattr(timing, "start_thread", lambda work: threads.append(start_thread(work)) or threads[-1])
     monkeypatch.setattr(service, "_run_loop", run_loop)
     assert service.run() == 0
     assert was_completed == [False]

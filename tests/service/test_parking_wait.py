@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from types import SimpleNamespace
-
 import numpy as np
 import pytest
 
 from rtloop.drivers.errors import DriverError
 from rtloop.engine.memory import Word
+from rtloop.foundation import timing
 from rtloop.supervision import parking
 
 HEARTBEAT_TIMEOUT_S, SLEW_V_PER_S = 1.5, 2.0
@@ -40,8 +39,7 @@ class DrivenBlock:
 
 def await_end(block: DrivenBlock, safe_v: list[float], monkeypatch: pytest.MonkeyPatch) -> None:
     """Wait for the end of the block's loop in the block's simulated time."""
-    clock = SimpleNamespace(monotonic=lambda: block.now_s, sleep=block.sleep)
-    monkeypatch.setattr(parking, "time", clock)
+    monkeypatch.setattr(timing, "source", timing.Source(monotonic_s=lambda: block.now_s, sleep=block.sleep))
     parking._await_end(block, HEARTBEAT_TIMEOUT_S, SLEW_V_PER_S, np.array(safe_v))  # type: ignore[arg-type]
 
 

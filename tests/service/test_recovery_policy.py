@@ -17,6 +17,7 @@ from rtloop.configuration.service import RecoverOptions
 from rtloop.engine.memory import SharedBlock, Word
 from rtloop.engine.messages import Kind
 from rtloop.errors import ConfigError
+from rtloop.foundation import timing
 from rtloop.kernel.reference import Generator
 from rtloop.recording.file.topics.recovery_steps import RecoveryStep, StepReason
 from rtloop.service.changing.active_references import NO_TRIP, Trip
@@ -526,5 +527,5 @@ def test_a_record_that_came_while_the_service_stalled_is_found(monkeypatch):
         rows = np.full((1, 10), 7.0)
 
     supervisor: Any = SimpleNamespace(newest=lambda _: rows, ticks=8)
-    monkeypatch.setattr(comeback, "time", SimpleNamespace(monotonic=lambda: now_s[0], sleep=sleep))
+    monkeypatch.setattr(timing, "source", timing.Source(monotonic_s=lambda: now_s[0], sleep=sleep))
     assert comeback._await_record(supervisor, 7)[0] == 7.0

@@ -10,7 +10,6 @@ import threading
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -18,12 +17,11 @@ import pytest
 
 from rtloop.configuration.prepare import prepare
 from rtloop.engine.messages import MESSAGE
-from rtloop.service import desk, preparation, service
-from rtloop.service.changing import active_references
+from rtloop.foundation import timing
+from rtloop.service import service
 from rtloop.service.changing.live import LiveLaw
 from rtloop.service.desk import Desk
-from rtloop.service.recovering import comeback, worker
-from rtloop.service.recovering.recovery import Recovery
+from rtloop.service.recovering import worker
 from rtloop.service.recovering.worker import RecoveryWorker
 from rtloop.service.service import Service
 from rtloop.signals import Mode
@@ -32,8 +30,7 @@ from tests.engine.failing_driver import ScriptedDriver
 from tests.engine.harness import LoopBench
 
 RATE_HZ, WATCH_S = 1000.0, 0.005
-CLOCKED = (desk, preparation, service, active_references, comeback, worker)
-"""Modules of the product that sleep or read the clock."""
+LOCK_POLL_S, EVENT_POLL_S, UNIX_S = 0.0005, 0.005, 1.8e9
 UM_PER_V = 4.0
 CONFIGURATION = f"""
 [loop]
@@ -90,7 +87,7 @@ class Turns:
             self._changed.notify_all()
         for thread in threads:
             if thread is not threading.current_thread():
-                thread.join()
+                threading.Thread.join(thread)
 
     def sleep(self, seconds: float) -> None:
         """Give up the turn for a time, in which other threads have theirs."""
@@ -100,7 +97,7 @@ class Turns:
             self._pass_on()
             self._await_turn(me)
 
-    def start(self, work: Callable[[], None]) -> threading.Thread:
+    def start(self, work: Callable[[], object]) -> threading.Thread:
         """Start a thread whose first turn comes at once; its turns end with `work`."""
 
         def run() -> None:
@@ -116,7 +113,7 @@ class Turns:
                     if self._turn is thread:
                         self._pass_on()
 
-        thread = threading.Thread(target=run, daemon=True)
+        thread = VirtualThread(self, run)
         self._wakes_s[thread] = self.now_s
         thread.start()
         return thread
@@ -135,18 +132,62 @@ class Turns:
             raise EndOfTest
 
 
+class VirtualThread(threading.Thread):
+    """Thread whose end is awaited in virtual time."""
+
+    def __init__(self, turns: Turns, work: Callable[[], None]) -> None:
+        super().__init__(target=work, daemon=True)
+        self._turns = turns
+
+    def join(self, timeout: float | None = None) -> None:
+        end_s = self._turns.now_s + (float("inf") if timeout is None else timeout)
+        while self.is_alive() and self._turns.now_s < end_s:
+            self._turns.sleep(EVENT_POLL_S)
+
+
 class VirtualLock:
     """Lock for which a thread waits in virtual time."""
 
-    def __init__(self, turns: Turns) -> None:
-        self._turns, self._lock = turns, threading.Lock()
+    def __init__(self, turns: Turns, lock: Any) -> None:
+        self._turns, self._lock = turns, lock
 
     def __enter__(self) -> None:
         while not self._lock.acquire(blocking=False):
-            self._turns.sleep(0.0005)
+            self._turns.sleep(LOCK_POLL_S)
 
     def __exit__(self, *_: object) -> None:
         self._lock.release()
+
+    def locked(self) -> bool:
+        return bool(self._lock.locked())
+
+
+class VirtualEvent(threading.Event):
+    """Event for which a thread waits in virtual time."""
+
+    def __init__(self, turns: Turns) -> None:
+        super().__init__()
+        self._turns = turns
+
+    def wait(self, timeout: float | None = None) -> bool:
+        end_s = self._turns.now_s + (float("inf") if timeout is None else timeout)
+        while not self.is_set() and self._turns.now_s < end_s:
+            self._turns.sleep(min(EVENT_POLL_S, end_s - self._turns.now_s))
+        return self.is_set()
+
+
+def virtual_time(turns: Turns) -> timing.Source:
+    """Return the product's source of time in which threads take turns."""
+    make: Any = VirtualLock
+    return timing.Source(
+        monotonic_s=lambda: turns.now_s,
+        unix_s=lambda: UNIX_S + turns.now_s,
+        sleep=turns.sleep,
+        lock=lambda: make(turns, threading.Lock()),
+        reentrant_lock=lambda: make(turns, threading.RLock()),
+        event=lambda: VirtualEvent(turns),
+        start_thread=turns.start,
+    )
 
 
 class SteppedSupervisor:
@@ -171,15 +212,10 @@ class VirtualService:
 
     def __init__(self, folder: Path, monkeypatch: pytest.MonkeyPatch, more: str = RECOVER, base: str = CONFIGURATION):
         self.turns, self.hangs = Turns(self._advance), False
-        clock = SimpleNamespace(
-            sleep=self.turns.sleep, monotonic=lambda: self.turns.now_s, monotonic_ns=lambda: int(self.turns.now_s * 1e9)
-        )
-        for module in CLOCKED:
-            monkeypatch.setattr(module, "time", clock)
+        monkeypatch.setattr(timing, "source", virtual_time(self.turns))
         (folder / "lab.toml").write_text(base + more)
         self.bench: LoopBench | None = None
         self.service = Service(folder / "lab.toml")
-        self.service.recovery = Recovery(self.service, clock.monotonic)
         self.service.second_opinion.require = lambda _: None  # type: ignore[method-assign]
         self.commands_sent = 0
         submit = Desk.submit
@@ -203,7 +239,6 @@ class VirtualService:
         supervisor: Any = SteppedSupervisor(self.bench, prepared)
         self.service._desk = Desk(self.bench.block, RATE_HZ)
         self.service.live = LiveLaw(prepared, self.bench.block, self.service._desk, {})
-        self.service.live._staging.lock = VirtualLock(self.turns)  # type: ignore[assignment]
         self.service.supervisor = supervisor
         self.turns.sleep(0.01)
 

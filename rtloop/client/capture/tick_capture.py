@@ -11,7 +11,6 @@ from __future__ import annotations
 import argparse
 import json
 import sys
-import time
 from itertools import count
 from os.path import lexists
 from pathlib import Path
@@ -19,6 +18,7 @@ from typing import Any, NamedTuple
 
 from rtloop.client import Client
 from rtloop.errors import RtloopError, UnavailableError
+from rtloop.foundation import timing
 from rtloop.foundation.trusted import open_without_link
 from rtloop.recording.cutting.cut import cut, cut_path
 from rtloop.recording.errors import RecordingError
@@ -88,7 +88,7 @@ def capture_ticks(client: Client, file: Path, first: int, end: int, folder: Path
             if attempt > ATTEMPTS:
                 raise
             attempt += 1
-            time.sleep(POLL_S)  # The recorder renames a file when it is complete.
+            timing.sleep(POLL_S)  # The recorder renames a file when it is complete.
 
 
 def _await_written(client: Client, file: Path, end: int) -> None:
@@ -108,12 +108,12 @@ def _await_written(client: Client, file: Path, end: int) -> None:
         if run.file != file or run.written >= end:
             return
         if deadline_s is None:
-            deadline_s = time.monotonic() + max(end - run.tick, 0) / run.rate_hz + GRACE_S
-        if time.monotonic() > deadline_s:
+            deadline_s = timing.monotonic_s() + max(end - run.tick, 0) / run.rate_hz + GRACE_S
+        if timing.monotonic_s() > deadline_s:
             raise UnavailableError(
                 f"{file}: tick {end - 1} is not written yet; the recorder is at tick {run.written}; try again"
             )
-        time.sleep(POLL_S)
+        timing.sleep(POLL_S)
 
 
 def _files_with_ticks(file: Path, first: int, end: int) -> list[Path]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Mapping
 from copy import deepcopy
 from dataclasses import replace
@@ -15,6 +14,7 @@ from rtloop.client.capture.tick_capture import capture_ticks, current_run
 from rtloop.client.capture.trigger import Mode, Settings, Trigger
 from rtloop.client.ticks.reader import MAX_TICKS, Reader
 from rtloop.errors import RtloopError, UnavailableError
+from rtloop.foundation import timing
 from rtloop.recording.load import Recording, load
 
 POLL_S = 0.005
@@ -71,7 +71,7 @@ def _await_trigger(
     _require(condition.source in names, f"trigger source: {condition.source!r}; allowed: {', '.join(names)}")
     reader = Reader(Path(configuration["block"]), lambda: names)
     trigger = Trigger(settings, lambda: deepcopy(condition))
-    deadline_s = time.monotonic() + timeout_s
+    deadline_s = timing.monotonic_s() + timeout_s
     while True:
         stretch = reader.read()
         if stretch is not None and stretch.run > 0:
@@ -82,11 +82,11 @@ def _await_trigger(
             if sweep := sweeps[0] if sweeps else trigger.open_sweep:
                 return sweep.first
         if stretch is None or len(stretch) < MAX_TICKS:  # Else more ticks wait, which came before the deadline.
-            if time.monotonic() > deadline_s:
+            if timing.monotonic_s() > deadline_s:
                 raise RtloopError(
                     f"capture: no trigger within {timeout_s:g} s; use a larger timeout_s, or another trigger"
                 )
-            time.sleep(POLL_S)
+            timing.sleep(POLL_S)
 
 
 def _require(condition: bool, message: str) -> None:

@@ -7,7 +7,6 @@ host they would displace the other rows.
 from __future__ import annotations
 
 import json
-import threading
 from collections import deque
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -17,6 +16,7 @@ import numpy.typing as npt
 
 from rtloop.engine.messages import Kind, Origin
 from rtloop.errors import RtloopError
+from rtloop.foundation import timing
 from rtloop.panel.events.event_text import OFF, RunState, event_text
 from rtloop.panel.events.lateness import LATE_END_KIND, LATE_KIND, LateEpisodes
 from rtloop.panel.service.service import Description, Service
@@ -70,7 +70,7 @@ class Events:
         """Newest gap of each loser of ticks."""
         self._run, self._run_state = -1, RunState({})
         """Run of the newest event, and its references and mode."""
-        self._lock = threading.Lock()
+        self._lock = timing.lock()
         self._pending_rows: deque[tuple[EventRow, int]] = deque(maxlen=MAX_ROWS)
         """Rows whose operator the service has not named yet, with the identity of the command."""
         self.newest = 0

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import logging
-import threading
-import time
 from collections.abc import Sequence
+from threading import Thread
 from typing import Protocol
 
 import numpy as np
@@ -15,6 +14,7 @@ from rtloop.client.ticks.reader import MAX_TICKS, Reader
 from rtloop.client.ticks.tick_stretch import Stretch
 from rtloop.engine.messages import MESSAGE, Kind
 from rtloop.errors import RtloopError
+from rtloop.foundation import timing
 from rtloop.panel.events.events import PANEL, Events
 from rtloop.panel.feed.tick_history import TickHistory, history_ticks
 from rtloop.panel.feed.timing import Timing
@@ -54,7 +54,7 @@ class Feed:
     def __init__(self, service: Service) -> None:
         """Prepare the thread that reads the loop of `service`; `start` starts the thread."""
         self._service = service
-        self.lock = threading.Lock()
+        self.lock = timing.lock()
         self.loop: Description | None = None
         """Description of the loop that is read; None before the first."""
         self.past: TickHistory | None = None
@@ -71,17 +71,18 @@ class Feed:
         self._unrecorded = (-1, 0)
         """Run, and its ticks without a record that the events have."""
         self._newest_tick_s: float | None = None
-        self._end_event = threading.Event()
-        self._thread = threading.Thread(target=self._read_until_ended, name="feed", daemon=True)
+        self._end_event = timing.event()
+        self._thread: Thread | None = None
 
     def start(self) -> None:
         """Start the thread that reads ticks until `stop`."""
-        self._thread.start()
+        self._thread = timing.start_thread(self._read_until_ended)
 
     def stop(self) -> None:
         """Stop the thread and wait for its end."""
         self._end_event.set()
-        self._thread.join()
+        if self._thread is not None:
+            self._thread.join()
 
     @property
     def run(self) -> int:
@@ -99,7 +100,7 @@ class Feed:
     @property
     def age_s(self) -> float | None:
         """Time since the newest tick was read, s; None until the loop adds a tick after the feed's first read."""
-        return None if self._newest_tick_s is None else time.monotonic() - self._newest_tick_s
+        return None if self._newest_tick_s is None else timing.monotonic_s() - self._newest_tick_s
 
     def add_viewer(self, viewer: Follower) -> None:
         """Hand every tick that is read from now on to a viewer; if a loop is read already, call its `begin` at once."""
@@ -145,7 +146,7 @@ class Feed:
         reader = self._reader
         while (stretch := reader.read()) is not None:
             if stretch.run == self._caught_up_run:
-                self._newest_tick_s = time.monotonic()
+                self._newest_tick_s = timing.monotonic_s()
             messages = reader.read_messages()
             if (past := self.past) is None or stretch.run != past.run:
                 loop = self._service.describe()

@@ -16,7 +16,6 @@ import hashlib
 import hmac
 import json
 import struct
-import time
 from collections.abc import Mapping
 from contextlib import suppress
 from urllib.parse import parse_qs
@@ -26,6 +25,7 @@ from starlette.routing import WebSocketRoute
 from starlette.types import Scope
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
+from rtloop.foundation import timing
 from rtloop.panel.feed.feed import Feed
 from rtloop.panel.foxglove import cdr
 from rtloop.panel.foxglove.digest import Digest, SignalDigest
@@ -105,7 +105,12 @@ class _Viewer:
 
     async def serve(self) -> None:
         """Serve the viewer until it disconnects, or takes no message for SEND_TIMEOUT_S."""
-        info = {"op": "serverInfo", "name": self._name, "capabilities": [], "sessionId": str(time.time_ns())}
+        info = {
+            "op": "serverInfo",
+            "name": self._name,
+            "capabilities": [],
+            "sessionId": str(round(1e9 * timing.unix_s())),
+        }
         await self._send_json(info)
         await self._advertise(EVENTS)
         self._feed.add_viewer(self._digest)
@@ -144,7 +149,7 @@ class _Viewer:
             names, generation, digest = await anyio.to_thread.run_sync(self._take_digest)
             if generation and (self._live is None or self._live.id != EVENTS.id + generation):
                 await self._replace_channel(Channel(EVENTS.id + generation, "/live", cdr.LIVE, cdr.live_schema(names)))
-            now_ns = time.time_ns()
+            now_ns = round(1e9 * timing.unix_s())
             if digest is not None and self._live is not None:
                 await self._send(self._live, now_ns, cdr.live_message(now_ns, *digest))
             await self._send_event(now_ns)

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import os
-import threading
-import time
 from collections.abc import Mapping
 from pathlib import Path
 from typing import NamedTuple
 
 from rtloop.errors import RtloopError
+from rtloop.foundation import timing
 from rtloop.foundation.trusted import open_without_link
 from rtloop.recording.cutting.seek import ChunkSeeker
 from rtloop.recording.file.reader import Reader
@@ -46,7 +45,7 @@ class RecordingFolder:
         """Store the folder, which need not exist; no file is read yet."""
         self.folder = folder
         self._summaries: dict[RecordingFile, Mapping[str, object]] = {}
-        self._lock = threading.Lock()
+        self._lock = timing.lock()
 
     def listing(self) -> list[dict[str, object]]:
         """Return a dictionary for each of the newest MAX_LISTED recordings, the newest first.
@@ -59,12 +58,12 @@ class RecordingFolder:
         """
         with self._lock:
             files = sorted(self._recording_files(), key=lambda file: file.modified_ns, reverse=True)[:MAX_LISTED]
-            deadline_s = time.monotonic() + BUDGET_S
+            deadline_s = timing.monotonic_s() + BUDGET_S
             summaries = {}
             for file in files:
                 if file in self._summaries:
                     summaries[file] = self._summaries[file]
-                elif time.monotonic() < deadline_s:
+                elif timing.monotonic_s() < deadline_s:
                     summaries[file] = _summary(self.folder / file.name, file.bytes)
             self._summaries = summaries
             return [

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -10,6 +9,7 @@ from typing import Any
 from rtloop.client import Client
 from rtloop.client.ticks.tick_stretch import column_index
 from rtloop.errors import RtloopError, UnavailableError
+from rtloop.foundation import timing
 from rtloop.signals import Signal
 
 CACHE_S = 1.0
@@ -57,7 +57,7 @@ class Service:
     def describe(self) -> Description:
         """Return the description of the running loop, at most CACHE_S old; raises as `refresh_description`."""
         cached = self._cached
-        if cached is not None and time.monotonic() - cached[0] < CACHE_S:
+        if cached is not None and timing.monotonic_s() - cached[0] < CACHE_S:
             return cached[1]
         return self.refresh_description()
 
@@ -83,5 +83,5 @@ class Service:
         except (KeyError, TypeError):
             reason = "the service has another version of rtloop; start service and panel with the same version"
             raise UnavailableError(f"{self.client.path}: {reason}") from None
-        self._cached = time.monotonic(), description
+        self._cached = timing.monotonic_s(), description
         return description

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import threading
-import time
-
 from rtloop.client import Client
 from rtloop.client.control import UnansweredRequest
 from rtloop.errors import RtloopError
+from rtloop.foundation import timing
 
 RETRY_S = 0.5
 SILENT_S = 3.0
@@ -25,11 +23,10 @@ class StateListener:
         self._status: dict[str, object] = {}
         self._heard_s = float("-inf")
         self._fault, self._remedy = "no answer from the service yet", ""
-        self._thread = threading.Thread(target=self._listen, name="state", daemon=True)
 
     def start(self) -> None:
         """Start the thread, which lives as long as the process."""
-        self._thread.start()
+        timing.start_thread(self._listen)
 
     @property
     def status(self) -> dict[str, object]:
@@ -38,7 +35,7 @@ class StateListener:
         Without a connection, or SILENT_S after the newest one: {state: "unreachable", lock: None, error, remedy (may be
         empty)}.
         """
-        if time.monotonic() - self._heard_s > SILENT_S:
+        if timing.monotonic_s() - self._heard_s > SILENT_S:
             return {"state": UNREACHABLE, "lock": None, "error": self._fault, "remedy": self._remedy}
         return self._status
 
@@ -47,10 +44,10 @@ class StateListener:
         while True:
             try:
                 for status in self._client.watch():
-                    self._status, self._heard_s = status, time.monotonic()
+                    self._status, self._heard_s = status, timing.monotonic_s()
             except RtloopError as error:
                 self._fault, self._remedy = str(error), ""
                 if isinstance(error, UnansweredRequest):
                     self._fault, self._remedy = f"{NO_ANSWER}: {error.reason}", error.remedy
                 self._heard_s = float("-inf")
-            time.sleep(RETRY_S)
+            timing.sleep(RETRY_S)

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Sequence
 from typing import Any
 
 from rtloop.client.ticks.tick_stretch import Stretch
+from rtloop.foundation import timing
 from rtloop.panel.feed.feed import Feed
 from rtloop.panel.feed.tick_history import TickHistory
 from rtloop.panel.protocol.frames import pack_frame
@@ -112,7 +112,7 @@ class Viewer:
 
         Removes the refusals from the queue. A returned kind of message is due again after its period, PERIODS_S.
         """
-        now_s = time.monotonic()
+        now_s = timing.monotonic_s()
         frames, self._refusals = self._refusals, []
         for kind, make_frame in self._frame_makers.items():
             if now_s < self._due_s[kind]:
@@ -178,7 +178,7 @@ class Viewer:
         feed = self._feed
         feed_fields = {"age_s": feed.age_s, "lost": feed.lost_ticks, "run": feed.run, "fault": feed.fault}
         feed_fields |= {"references": feed.events.references}
-        return pack_frame("state", self._state.status | {"unix_s": time.time()} | feed_fields)
+        return pack_frame("state", self._state.status | {"unix_s": timing.unix_s()} | feed_fields)
 
     def _sweep_frame(self) -> bytes | None:
         """Return the scope's binary message "sweep"; None without a scope or a new sweep, and while the client holds

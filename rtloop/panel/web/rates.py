@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import time
 from collections import OrderedDict
 from collections.abc import Callable, Hashable
 from functools import partial
@@ -12,6 +11,7 @@ from sys import byteorder
 
 from starlette.types import Scope
 
+from rtloop.foundation import timing
 from rtloop.foundation.trusted import open_user_file
 
 MAX_CLIENTS = 256
@@ -24,7 +24,7 @@ ESTABLISHED, USER_FIELD = "01", 7
 class RateLimit:
     """A rate limit: on average `per_s` requests a second, and up to `burst` at once."""
 
-    def __init__(self, per_s: float, burst: int, now_s: Callable[[], float] = time.monotonic) -> None:
+    def __init__(self, per_s: float, burst: int, now_s: Callable[[], float] = timing.monotonic_s) -> None:
         """Allow `burst` requests at once; `now_s` returns the time in s."""
         self._per_s, self._burst, self._now_s = per_s, burst, now_s
         self._allowance, self._updated_s = float(burst), now_s()
@@ -47,7 +47,7 @@ class RateLimit:
 class ClientRateLimits:
     """A RateLimit for each client, by any hashable key; only the MAX_CLIENTS with the latest requests are kept."""
 
-    def __init__(self, per_s: float, burst: int, now_s: Callable[[], float] = time.monotonic) -> None:
+    def __init__(self, per_s: float, burst: int, now_s: Callable[[], float] = timing.monotonic_s) -> None:
         """Begin without clients; each gets a RateLimit with these arguments at its first request."""
         self._make_limit = partial(RateLimit, per_s, burst, now_s)
         self._rates: OrderedDict[Hashable, RateLimit] = OrderedDict()

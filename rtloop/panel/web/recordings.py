@@ -8,7 +8,6 @@ from __future__ import annotations
 import os
 import secrets
 import tempfile
-import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import IO, TypeVar
@@ -23,6 +22,7 @@ from starlette.types import Receive, Scope, Send
 
 from rtloop.client.capture.tick_capture import RecordedRun, current_run
 from rtloop.errors import UnavailableError
+from rtloop.foundation import timing
 from rtloop.foundation.trusted import open_own, open_without_link
 from rtloop.panel.recordings.folder import RecordingFolder, shown_name
 from rtloop.panel.recordings.process_runner import ProcessRunner
@@ -85,7 +85,7 @@ class Recordings:
         404 for a file that is not in the folder of recordings.
         """
         path, ticket = await self._recording_path(request), secrets.token_urlsafe(TICKET_BYTES)
-        self._tickets[ticket] = path, time.monotonic() + TICKET_S
+        self._tickets[ticket] = path, timing.monotonic_s() + TICKET_S
         while len(self._tickets) > MAX_TICKETS:
             del self._tickets[next(iter(self._tickets))]
         return JSONResponse({"path": f"/download/{ticket}"})
@@ -94,7 +94,7 @@ class Recordings:
     async def ticket_download(self, request: Request) -> Response:
         """Respond like `download` with the recording of the ticket in the address; 404 for a used or old ticket."""
         path, until_s = self._tickets.pop(request.path_params["ticket"], (Path(), 0.0))
-        if time.monotonic() > until_s:
+        if timing.monotonic_s() > until_s:
             raise RequestRefused(
                 404, f"used before, or older than {TICKET_S:g} s; start the download on the page again"
             )

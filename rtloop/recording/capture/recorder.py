@@ -28,6 +28,7 @@ from typing import Any
 
 from rtloop.engine.memory import ProcessState, SharedBlock, Word
 from rtloop.errors import RtloopError
+from rtloop.foundation import timing
 from rtloop.foundation.heap import keep_freed_memory
 from rtloop.recording.capture.requester_names import RequesterNames
 from rtloop.recording.capture.rings import RingReader
@@ -81,7 +82,7 @@ class Recorder:
         (the supervisor closed it or died), the rings are empty, and either no living process drives the block or
         ABANDONED_S passed without a new slot.
         """
-        last_tick_s = time.monotonic()
+        last_tick_s = timing.monotonic_s()
         while True:
             state = self.block.load(Word.LOOP_STATE)
             is_orphaned = orders.is_closed and self.block.driver_pid() is None
@@ -92,19 +93,19 @@ class Recorder:
             session.write_due()
             self.block.store(Word.RECORDER_STATE, ProcessState.FAILED if session.failure else ProcessState.RUNNING)
             if drained_count:
-                last_tick_s = time.monotonic()
+                last_tick_s = timing.monotonic_s()
             elif ProcessState.has_ended(state):
                 return ProcessState(state).name.lower()
-            elif is_orphaned or (orders.is_closed and time.monotonic() - last_tick_s > ABANDONED_S):
+            elif is_orphaned or (orders.is_closed and timing.monotonic_s() - last_tick_s > ABANDONED_S):
                 return "abandoned"
             if drained_count < session.free_rows:
                 self._pause(pause_s)
 
     def _pause(self, pause_s: float) -> None:
         """Sleep for `pause_s`; if the control loop has ended after the first half, leave out the second half."""
-        time.sleep(pause_s / 2)
+        timing.sleep(pause_s / 2)
         if not ProcessState.has_ended(self.block.load(Word.LOOP_STATE)):
-            time.sleep(pause_s / 2)
+            timing.sleep(pause_s / 2)
 
 
 def _is_supervisor_gone() -> bool:

@@ -6,11 +6,11 @@ the rings. While no file can be written, ticks worth recording wait as long as t
 
 from __future__ import annotations
 
-import time
 from pathlib import Path
 
 from rtloop.engine.memory import SharedBlock
 from rtloop.errors import OutputError
+from rtloop.foundation import timing
 from rtloop.recording.capture.buffer import TickTime
 from rtloop.recording.capture.pending import PendingEntry
 from rtloop.recording.capture.requester_names import RequesterNames
@@ -72,7 +72,7 @@ class SelectiveSession(Session):
 
         A condition that begins a retained span adds an event RETENTION_BEGUN.
         """
-        self._last_write_s = time.monotonic()
+        self._last_write_s = timing.monotonic_s()
         rows = self._buffer.rows[:count].copy()
         for hit in self._segments.find_hits(entries, rows):
             event = recorder_event(RETENTION_BEGUN, *self._buffer.tick_time(hit.first), {"on": hit.condition})

@@ -9,13 +9,13 @@ from __future__ import annotations
 
 import errno
 import math
-import time
 from collections import deque
 from collections.abc import Mapping
 from pathlib import Path
 
 from rtloop.engine.memory import SharedBlock, Word
 from rtloop.errors import OutputError
+from rtloop.foundation import timing
 from rtloop.foundation.arrays import Real
 from rtloop.recording.capture.buffer import TickBuffer, TickSpans, TickTime
 from rtloop.recording.capture.pending import PendingEntry, PendingMessages, snapshot_tick
@@ -74,7 +74,7 @@ class Session:
         self._block, self._path, self._header, self._options = block, path, header, options
         self._laws = [law_label(law["name"], law.get("file", "")) for law in header.get("law", {}).get("laws", ())]
         self._buffer = TickBuffer(header["columns"], header["rate_hz"], self._buffer_chunks)
-        self._last_write_s = time.monotonic()
+        self._last_write_s = timing.monotonic_s()
         self._progress = RecorderProgress(block)
         self._predecessor_end = self._progress.predecessor_position(predecessor_file(path, options.sequence))
         self._progress.store_flushed(self._predecessor_end)
@@ -151,7 +151,7 @@ class Session:
 
         A failed write sets `failure` and does not raise.
         """
-        is_late = self._header["paced"] and time.monotonic() - self._last_write_s >= FLUSH_S
+        is_late = self._header["paced"] and timing.monotonic_s() - self._last_write_s >= FLUSH_S
         if self.free_rows == 0 or is_late:
             self._write_all()
 
@@ -342,7 +342,7 @@ class Session:
         A failed write sets `failure` and does not raise. While no file can be written, rows and snapshots are lost and
         events wait.
         """
-        self._last_write_s = time.monotonic()
+        self._last_write_s = timing.monotonic_s()
         if self.failure is None:
             try:
                 self._write_to_file(self._buffer.rows[:count], entries)

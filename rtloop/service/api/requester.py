@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import threading
 from collections.abc import AsyncIterator, Callable
 from contextlib import AbstractContextManager, asynccontextmanager, nullcontext
 from urllib.parse import parse_qs
@@ -11,6 +10,7 @@ from urllib.parse import parse_qs
 from starlette.requests import HTTPConnection, Request
 
 from rtloop.errors import ConfigError
+from rtloop.foundation import timing
 from rtloop.recording.file.topics.events import OPERATOR, name_problem
 from rtloop.service.api.bodies import Body
 from rtloop.service.api.requests import ApiRequest, Sender
@@ -61,7 +61,7 @@ async def watch_client(request: Request) -> AsyncIterator[None]:
 
     The request's body must have been read.
     """
-    disconnect_event = threading.Event()
+    disconnect_event = timing.event()
     async with call_at_disconnect(request, disconnect_event.set):
         with bind_client(lambda: not disconnect_event.is_set()):
             yield

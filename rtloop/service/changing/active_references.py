@@ -7,8 +7,6 @@ stand in `rtloop.engine.commands`; the events are followed from the first one on
 
 from __future__ import annotations
 
-import threading
-import time
 from typing import NamedTuple
 
 import numpy as np
@@ -18,6 +16,7 @@ from rtloop import signals
 from rtloop.engine.messages import MESSAGE, Kind, Origin
 from rtloop.engine.plan import Plan
 from rtloop.engine.ring import drain
+from rtloop.foundation import timing
 from rtloop.kernel.reference import GENERATOR_PARAMETERS, Generator
 from rtloop.service.changing.staging import Staging
 from rtloop.service.desk import ANSWER_PERIODS, ANSWER_TIMEOUT_S, POLL_S, Refusal
@@ -62,7 +61,7 @@ class ActiveReferences:
         `staging` gives access to the loop's events and its newest record.
         """
         self._staging, self._period_s = staging, 1.0 / plan.pacing.rate_hz
-        self._lock = threading.Lock()
+        self._lock = timing.lock()
         self._cursor = 0
         self._events: npt.NDArray[np.void] = np.zeros(EVENTS_AT_ONCE, MESSAGE)
         self._mode: Mode | None = plan.mode
@@ -124,7 +123,7 @@ class ActiveReferences:
         First waits until the loop has executed the first tick of this reference. Raises Refusal if the loop has not
         done so after ANSWER_TIMEOUT_S and ANSWER_PERIODS periods.
         """
-        deadline_s = time.monotonic() + ANSWER_TIMEOUT_S + ANSWER_PERIODS * self._period_s
+        deadline_s = timing.monotonic_s() + ANSWER_TIMEOUT_S + ANSWER_PERIODS * self._period_s
         while True:
             record = self._staging.newest_record  # Read first: the loop publishes a tick's events before its record.
             self.follow()
@@ -133,9 +132,9 @@ class ActiveReferences:
                 since_tick = self._since_ticks[number]
             if record is not None and record[signals.TICK] >= since_tick:
                 return ActiveReference(kind, in_volts, float(record[signals.axis_column(number, signals.REFERENCE)]))
-            if time.monotonic() > deadline_s:
+            if timing.monotonic_s() > deadline_s:
                 raise Refusal("the loop stands still after a change of the reference; try again when the loop runs")
-            time.sleep(POLL_S)
+            timing.sleep(POLL_S)
 
     def _apply_event(self, event: np.void) -> None:
         """Apply one event, a MESSAGE record, to mode, references and trip; the lock must be held."""

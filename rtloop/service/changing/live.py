@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import threading
 import tomllib
 from collections.abc import Mapping
 from dataclasses import replace
@@ -18,6 +17,7 @@ from rtloop.configuration.prepare import Prepared
 from rtloop.engine.memory import SharedBlock
 from rtloop.engine.messages import Kind
 from rtloop.errors import ConfigError, RtloopError
+from rtloop.foundation import timing
 from rtloop.laws.limited.trial import needs_limited_process, try_limited
 from rtloop.service.changing.building import figures_limited, prepare_limited
 from rtloop.service.changing.change_history import Change, ChangeHistory
@@ -59,7 +59,7 @@ class LiveLaw:
         self.offsets_v = offsets_v
         self._staging = Staging(block, desk)
         self.references = LiveReferences(lambda: self.prepared, self._staging)
-        self._build_lock = threading.Lock()
+        self._build_lock = timing.lock()
         """Held while a law is built and verified; references do not wait for it."""
         self._history = ChangeHistory()
         self._figures: dict[int, tuple[Configuration, Figures]] = {}

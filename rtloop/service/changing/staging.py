@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import threading
-
 import numpy as np
 
 from rtloop.engine.memory import SharedBlock
 from rtloop.engine.messages import Kind
 from rtloop.engine.ring import drain
+from rtloop.foundation import timing
 from rtloop.foundation.arrays import Real
 from rtloop.service.desk import Desk, Refusal, UnconfirmedCommand
 from rtloop.signals import MODE, Mode
@@ -20,7 +19,7 @@ class Staging:
     def __init__(self, block: SharedBlock, desk: Desk) -> None:
         """Use the `block` of a loop and the `desk` that sends to it; nothing is staged yet."""
         self.block, self.desk = block, desk
-        self.lock = threading.Lock()
+        self.lock = timing.lock()
         self._unsettled_tick: int | None = None
 
     def require_settled(self) -> None:

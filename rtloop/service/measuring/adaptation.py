@@ -11,12 +11,12 @@ import json
 import logging
 import os
 import subprocess
-import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 from rtloop.configuration.axis import AdaptOptions
+from rtloop.foundation import timing
 from rtloop.foundation.children import child_environment, python_command
 from rtloop.service.background import repeat_every
 from rtloop.service.service import Service, State
@@ -34,7 +34,7 @@ def run_adaptation(service: Service, socket: Path) -> contextlib.AbstractContext
     `socket` is the path of the service's control socket.
     """
     schedule = RetuneSchedule(service, socket)
-    return repeat_every(LOOK_PERIOD_S, lambda: schedule.retune_due_axes(time.monotonic()))
+    return repeat_every(LOOK_PERIOD_S, lambda: schedule.retune_due_axes(timing.monotonic_s()))
 
 
 def _run_at_low_priority(command: Sequence[str]) -> subprocess.CompletedProcess[str]:

@@ -6,7 +6,6 @@ disconnects ends the measurement. The signals come from the ring that the record
 
 from __future__ import annotations
 
-import time
 from collections import deque
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -25,6 +24,7 @@ from rtloop.configuration.axis import AxisOptions
 from rtloop.configuration.checks import delay_ticks, promised_loop
 from rtloop.configuration.simulated import sensor_ends_um
 from rtloop.errors import ConfigError
+from rtloop.foundation import timing
 from rtloop.foundation.arrays import Real
 from rtloop.service.changing.live import LiveLaw
 from rtloop.service.desk import Refusal
@@ -59,7 +59,7 @@ class MeasurementHistory:
 
     def add(self, measurement: LoopMeasurement) -> None:
         """Add the figures of a measurement, with the present time; beyond MAX_MEASUREMENTS remove the oldest ones."""
-        self._figures.append({"unix_time_s": round(time.time(), 3)} | measurement.figures())
+        self._figures.append({"unix_time_s": round(timing.unix_s(), 3)} | measurement.figures())
 
     @property
     def newest(self) -> dict[str, Any]:

@@ -5,7 +5,6 @@ The records come from the ring that the recorder reads, so they are in the recor
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 
@@ -14,6 +13,7 @@ import numpy as np
 from rtloop import signals
 from rtloop.engine.ring import drain
 from rtloop.errors import RtloopError
+from rtloop.foundation import timing
 from rtloop.foundation.arrays import Real
 from rtloop.service.changing.live import LiveLaw
 from rtloop.service.desk import Refusal, UnconfirmedCommand
@@ -86,7 +86,7 @@ class Player:
         """
         with self._count_own_reference():
             self._live.references.set(self.axis, {"kind": "hold", "value": value_um}, restores=True)
-        time.sleep(REST_S)
+        timing.sleep(REST_S)
 
     @contextmanager
     def _count_own_reference(self) -> Iterator[None]:
@@ -144,10 +144,15 @@ class Player:
         """
         ring = self._supervisor.block.ring("ticks")
         rows = np.empty((count, ring.slots.shape[1]))
-        read_count, deadline_s = 0, time.monotonic() + (first + count - self.next_tick) / self.rate_hz + READ_MARGIN_S
+        read_count, deadline_s = (
+            0,
+            timing.monotonic_s() + (first + count - self.next_tick) / self.rate_hz + READ_MARGIN_S,
+        )
         while read_count < count:
             require_client(self._activity)
-            is_late = time.monotonic() > deadline_s  # Read first: a stalled service looks once more after the deadline.
+            is_late = (
+                timing.monotonic_s() > deadline_s
+            )  # Read first: a stalled service looks once more after the deadline.
             new_count, _, lost = drain(ring, first + read_count, rows[read_count:])
             if lost:
                 raise Refusal(f"{self._activity}: ticks were overwritten before the service read them; try again")
@@ -158,7 +163,7 @@ class Player:
             read_count += new_count
             if is_late and read_count < count:
                 raise Refusal(f"{self._activity}: the loop stands still or runs too slowly; see `rtloop doctor`")
-            time.sleep(POLL_S)
+            timing.sleep(POLL_S)
         return rows
 
     def _require_usable(self, rows: Real) -> None:

@@ -7,7 +7,6 @@ before they were read are counted as unread.
 
 from __future__ import annotations
 
-import threading
 from collections import deque
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
@@ -18,6 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rtloop import signals
+from rtloop.foundation import timing
 from rtloop.foundation.arrays import Real
 from rtloop.recording.capture.rings import RingReader
 from rtloop.service.background import repeat_every
@@ -83,7 +83,7 @@ class Quality:
         self.lateness = np.zeros(len(LATENESS_US) + 1, np.int64)
         self.lateness_sum_us = 0.0
         self.axes: dict[str, AxisSums] = {}
-        self.lock = threading.Lock()
+        self.lock = timing.lock()
         """Held while the sums change, and while they are read together."""
         self._supervisor: Supervisor | None = None
         self._reader: RingReader | None = None

@@ -7,7 +7,6 @@ cosine then takes each reference to the first value of the former one, so slowly
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from contextlib import suppress
 from enum import Enum
@@ -18,6 +17,7 @@ import numpy as np
 from rtloop import signals
 from rtloop.configuration.service import DepolariseOptions
 from rtloop.engine.messages import Kind
+from rtloop.foundation import timing
 from rtloop.foundation.arrays import Real
 from rtloop.kernel.reference import Generator
 from rtloop.service.changing.live import LiveLaw
@@ -156,15 +156,17 @@ def _await_record(supervisor: Supervisor, tick: int) -> Real:
 
     Raises Refusal after RECORD_TIMEOUT_S without this record.
     """
-    deadline_s = time.monotonic() + RECORD_TIMEOUT_S
+    deadline_s = timing.monotonic_s() + RECORD_TIMEOUT_S
     is_late = False
     while not is_late:
-        is_late = time.monotonic() >= deadline_s  # Read first: a stalled service looks once more after the deadline.
+        is_late = (
+            timing.monotonic_s() >= deadline_s
+        )  # Read first: a stalled service looks once more after the deadline.
         rows = supervisor.newest(max(supervisor.ticks - tick, 1))
         match = rows[rows[:, signals.TICK] == tick]
         if len(match):
             return match[0]
-        time.sleep(POLL_S)
+        timing.sleep(POLL_S)
     raise Refusal(
         f"the service found no record of tick {tick} within {RECORD_TIMEOUT_S:g} s; the loop stands still, or the host "
         "is overloaded; see `rtloop doctor`"

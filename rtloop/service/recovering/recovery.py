@@ -10,8 +10,6 @@ Nothing here waits or sends; `worker` does. The state of the service stays `trip
 from __future__ import annotations
 
 import logging
-import threading
-import time
 from collections import deque
 from collections.abc import Callable
 from enum import StrEnum
@@ -20,6 +18,7 @@ from typing import NamedTuple, Protocol
 from rtloop import signals
 from rtloop.configuration.file import Configuration
 from rtloop.configuration.service import RecoverOptions
+from rtloop.foundation import timing
 from rtloop.recording.file.topics.recovery_steps import REASON_TEXTS, RecoveryStep, StepReason
 from rtloop.service.changing.active_references import Trip
 from rtloop.service.changing.live import LiveLaw
@@ -93,10 +92,10 @@ class Return(NamedTuple):
 class Recovery:
     """Recovery of one service. Thread-safe; `now_s` is a monotonic clock."""
 
-    def __init__(self, host: Host, now_s: Callable[[], float] = time.monotonic) -> None:
+    def __init__(self, host: Host, now_s: Callable[[], float] = timing.monotonic_s) -> None:
         """Begin in the state READY for the service `host`; `now_s` returns a monotonic time in s."""
         self._host, self._now_s = host, now_s
-        self._guard = threading.RLock()
+        self._guard = timing.reentrant_lock()
         self._state, self._reason, self._causes = RecoveryState.READY, StepReason.NONE, 0
         self._former: FormerState | None = None
         """State to return to; None unless a recovery is under way."""

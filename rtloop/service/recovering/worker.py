@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import contextlib
 import logging
-import time
 from functools import partial
 
 from rtloop.engine.messages import Kind, Origin
 from rtloop.errors import RtloopError
+from rtloop.foundation import timing
 from rtloop.recording.file.topics.recovery_steps import Note, RecoveryStep, StepReason
 from rtloop.service.background import repeat_every
 from rtloop.service.changing.references import ReferenceReplaced
@@ -90,9 +90,9 @@ class RecoveryWorker:
         except RtloopError as error:
             self._fail(error, loop, serial)
             return
-        deadline_s = time.monotonic() + confirmed.options.confirmation_s
-        while recovery.is_current(serial) and time.monotonic() < deadline_s:
-            time.sleep(PERIOD_S)
+        deadline_s = timing.monotonic_s() + confirmed.options.confirmation_s
+        while recovery.is_current(serial) and timing.monotonic_s() < deadline_s:
+            timing.sleep(PERIOD_S)
         recovery.finish(serial)
 
     def _require_current(self, serial: int) -> None:
