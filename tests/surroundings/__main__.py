@@ -96,6 +96,10 @@ class _service:
 def _let_run(socket: Path) -> None:
     """Let the service run in closed loop at 0 µm, with a change that can be undone, whatever a client did before."""
     with connect(socket) as service:
+        status = service.status
+        if status["state"] == "tripped":
+            print(f"the service tripped: {status['trip']}, {status['trip_reason']}, {status['faults']}", flush=True)
+            service.reset()
         service.arm()
         service.start()
         service.mode("closed_loop")
