@@ -3,32 +3,18 @@
 from __future__ import annotations
 
 import json
-import re
-import shutil
-import signal
-import subprocess
-import sys
-import threading
 from collections.abc import Iterator
-from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import pytest
 from click.testing import CliRunner
-from prometheus_client.parser import text_string_to_metric_families
 
-import rtloop
 from rtloop.cli import main
 from tests.design.measured_loops import RATE_HZ, TrueLoop, compute_margins
-from tests.faults.bench import Bench
-from tests.faults.configuration import ROOT
-from tests.faults.evidence import wait_for
-from tests.service.http import answer
 from tests.stage_text import one_axis, simulated_stage
+from tests.virtual.bench import VirtualBench
 
-DASHBOARD = ROOT / "deploy" / "grafana" / "rtloop.json"
-METRIC = re.compile(r"\brtloop_\w+")
 LOOP = TrueLoop(800.0, 0.02, 1, 100.0, kp=0.01)
 OMEGA = 2 * np.pi * LOOP.hz
 SETPOINT_UM = 5.0
@@ -53,58 +39,24 @@ folder = "FOLDER/recordings"
 
 
 @pytest.fixture(scope="module")
-def bench(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
-    """Yield a service whose loop runs on the rig of LOOP."""
-    folder = tmp_path_factory.mktemp("response")
-    with Bench(folder, board=False, text=CONFIGURATION.replace("FOLDER", str(folder))) as bench:
+def bench(tmp_path_factory: pytest.TempPathFactory) -> Iterator[VirtualBench]:
+    """Yield a service whose loop runs on the rig of LOOP, in virtual time."""
+    with pytest.MonkeyPatch.context() as patch:
+        bench = VirtualBench(tmp_path_factory.mktemp("response"), patch, CONFIGURATION)
         bench.await_state("running")
+        bench.turns.sleep(0.5)
         yield bench
+        bench.end()
 
 
-def reference_um(bench: Bench) -> float:
+def reference_um(bench: VirtualBench) -> float:
     """Return the present reference (µm) of axis x."""
     return bench.status()["axes"]["x"]["reference_um"]
 
 
-def recording_path(bench: Bench) -> Path:
-    """Return the path of the unfinished recording."""
-    return next((bench.folder / "recordings").glob("*.mcap.part"))
-
-
-def await_recording(bench: Bench, tick: int) -> rtloop.Recording:
-    """Wait until the recording holds a tick, and return the recording."""
-    return wait_for(
-        lambda: [file for file in [rtloop.load(recording_path(bench))] if file["tick"][-1] >= tick], "the ticks"
-    )[0]
-
-
-class CommandResult(NamedTuple):
-    """Output, content of the result file, and PNG of `rtloop ctl response`."""
-
-    text: str
-    measurement: dict[str, Any]
-    picture: bytes
-
-
-def run_command(bench: Bench, *arguments: str | Path) -> str:
-    """Run an rtloop command, check that it succeeds, and return its output."""
-    result = CliRunner().invoke(main, [*map(str, arguments)])
-    assert result.exit_code == 0, result.output
-    return result.output
-
-
-@pytest.fixture(scope="module")
-def command_result(bench: Bench) -> CommandResult:
-    """Return the results of `rtloop ctl response` with a plot and a result file."""
-    file, picture = bench.folder / "response.json", bench.folder / "response.png"
-    quick = ("--duration", "1", "--period", "0.25", "--near-hz", "800", "--amplitude-um", "0.6")
-    files = ("--plot", picture, "--out", file)
-    text = run_command(bench, "ctl", "--socket", bench.client.path, "response", "x", *quick, *files)
-    return CommandResult(text, json.loads(file.read_text()), picture.read_bytes())
-
-
-def test_margins_and_motion_are_those_of_the_rig(bench: Bench, command_result: CommandResult) -> None:
-    measurement = command_result.measurement
+def test_margins_and_motion_are_those_of_the_rig(bench: VirtualBench) -> None:
+    start = bench.ticks
+    measurement = bench.client.post("/response", QUICK_REQUEST | {"amplitude_um": 0.6}, 60.0)
     true = compute_margins(LOOP.open, measurement["from_hz"], measurement["to_hz"])
     for name in ("gain_margin", "phase_margin_deg", "modulus_margin"):
         margin = measurement["margins"][name]
@@ -115,108 +67,10 @@ def test_margins_and_motion_are_those_of_the_rig(bench: Bench, command_result: C
     assert measurement["resonance"]["hz"] == pytest.approx(LOOP.hz, rel=0.002)
     assert measurement["model"] is None
     assert reference_um(bench) == SETPOINT_UM
-    position_um = await_recording(bench, bench.status()["tick"])["x_true_position_um"]
-    assert 0.1 < np.abs(position_um[round(0.5 * RATE_HZ) :] - SETPOINT_UM).max() <= 0.6
+    assert 0.1 < np.abs(bench.column("x_true_position_um")[start:] - SETPOINT_UM).max() <= 0.6
 
 
-def test_figures_are_told_and_the_recording_gives_the_same(bench: Bench, command_result: CommandResult) -> None:
-    measurement, status = command_result.measurement, bench.status()["measured"]["x"]
-    assert status["margins"] == measurement["margins"]
-    mode = measurement["resonance"]
-    assert status["resonance_trend"][-1] == [status["unix_time_s"], mode["hz"], mode["hz_std"]]
-    samples = {
-        (sample.name, *sample.labels.values()): sample.value
-        for family in text_string_to_metric_families(bench.client.get("/metrics"))
-        for sample in family.samples
-    }
-    assert samples["rtloop_margin", "x", "gain_margin"] == measurement["margins"]["gain_margin"]["value"]
-    assert samples["rtloop_resonance_std", "x", "hz"] == mode["hz_std"]
-    await_recording(bench, bench.status()["tick"])
-    output = run_command(bench, "identify", "response", recording_path(bench), "--near-hz", "800", "--json")
-    assert json.loads(output) == measurement
-
-
-def test_all_that_the_dashboard_asks_for_is_there(bench: Bench, command_result: CommandResult) -> None:
-    """The service exports `rtloop_trip` only while a trip is in force."""
-    served = {
-        sample.name
-        for family in text_string_to_metric_families(bench.client.get("/metrics"))
-        for sample in family.samples
-    }
-    board = json.loads(DASHBOARD.read_text())
-    used = {name for panel in board["panels"] for target in panel["targets"] for name in METRIC.findall(target["expr"])}
-    assert len(used) > 20
-    assert used - served == {"rtloop_trip"}
-    assert METRIC.findall(board["templating"]["list"][1]["query"]["query"]) == ["rtloop_ticks"]
-    new = {"rtloop_error_square_um2_total", "rtloop_drive_square_v2_total", "rtloop_tick_lateness_seconds_bucket"}
-    assert new <= used
-    assert not [name for name in served - used if name.endswith("_total")]
-
-
-def test_a_loop_that_runs_and_does_not_control_is_told(bench: Bench) -> None:
-    """A drive of 1 V reaches 4.3 µm of the required 5 µm; the noise alone exceeds a tenth of a nanometre."""
-
-    def tune(**limits: float | None) -> None:
-        bench.client.post("/tune", {"axis": "x", "section": "limits", "values": limits})
-
-    def exported_condition() -> str:
-        (family,) = (family for family in text_string_to_metric_families(bench.client.get("/metrics"))
-                     if family.name == "rtloop_condition")  # fmt: skip
-        (condition,) = (sample.labels["condition"] for sample in family.samples if sample.value == 1.0)
-        assert next(bench.client.watch())["condition"] == bench.status()["condition"] == {"x": condition}
-        return condition
-
-    wait_for(lambda: bench.status()["condition"] == {"x": "controlled"}, "a loop that controls")
-    tune(drive_v=1.0)
-    wait_for(lambda: bench.status()["condition"] != {"x": "controlled"}, "another condition")
-    assert exported_condition() == "saturated"
-    tune(drive_v=10.0, settled_within_um=1e-4)
-    wait_for(lambda: bench.status()["condition"] == {"x": "not settled"}, "another condition")
-    assert exported_condition() == "not settled"
-    assert bench.status()["state"] == "running"
-    tune(settled_within_um=None)
-    wait_for(lambda: bench.status()["condition"] == {"x": "controlled"}, "a loop that controls")
-
-
-@pytest.mark.skipif(shutil.which("curl") is None, reason="there is no curl")
-def test_the_metrics_get_to_where_prometheus_looks(bench: Bench, tmp_path: Path) -> None:
-    """The script in deploy/grafana adds the service's name to the metrics, and removes those of an ended service."""
-    script, environment = DASHBOARD.with_name("scrape"), bench.environment
-    subprocess.run([script, "lab", tmp_path], env=environment, check=True)
-    families = [*text_string_to_metric_families((tmp_path / "rtloop-lab.prom").read_text())]
-    assert {sample.labels["service"] for family in families for sample in family.samples} == {"lab"}
-    assert {family.name for family in families} >= {
-        "rtloop_ticks",
-        "rtloop_error_square_um2",
-        "rtloop_tick_lateness_seconds",
-    }
-    elsewhere = environment | {"RUNTIME_DIRECTORY": str(tmp_path)}
-    assert subprocess.run([script, "lab", tmp_path], env=elsewhere, stderr=subprocess.DEVNULL).returncode == 1
-    assert not [*tmp_path.iterdir()]
-
-
-def test_sums_are_those_of_the_recording(bench: Bench) -> None:
-    sums = {
-        sample.name: sample.value
-        for family in text_string_to_metric_families(bench.client.get("/metrics"))
-        for sample in family.samples
-        if sample.name.endswith("_total")
-    }
-    ticks = int(sums["rtloop_ticks_summed_total"])
-    errors = await_recording(bench, ticks)["x_error_um"][:ticks]
-    closed = await_recording(bench, ticks)["mode"][:ticks] == 3
-    assert ticks > RATE_HZ
-    assert sums["rtloop_closed_loop_ticks_total"] == np.count_nonzero(closed)
-    assert sums["rtloop_error_square_um2_total"] == pytest.approx(np.sum(errors[closed] ** 2), rel=1e-9)
-
-
-def test_it_is_shown(command_result: CommandResult) -> None:
-    for word in ("gain margin", "phase margin", "modulus margin", "resonance", "moved by"):
-        assert word in command_result.text
-    assert command_result.picture.startswith(b"\x89PNG")
-
-
-def test_the_gain_at_rest_is_measured_and_told(bench: Bench) -> None:
+def test_the_gain_at_rest_is_measured_and_told(bench: VirtualBench) -> None:
     """The rig's gain at rest is 1: the inverse fits the actuator, and D(0) = 1."""
     request = {"axis": "x", "duration_s": 1.0, "resonance_only": True, "near_hz": 800.0, "gain_um": 4.0}
     gain = bench.client.post("/response", request, 60.0)["gain"]
@@ -228,9 +82,10 @@ def test_the_gain_at_rest_is_measured_and_told(bench: Bench) -> None:
     assert reference_um(bench) == SETPOINT_UM
 
 
-def test_a_resonance_alone_is_measured_as_well(bench: Bench) -> None:
+def test_a_resonance_alone_is_measured_as_well(bench: VirtualBench) -> None:
     quick = ("--duration", "1", "--near-hz", "780", "--json")
-    measurement = json.loads(run_command(bench, "ctl", "--socket", bench.client.path, "resonance", "x", *quick))
+    result = CliRunner().invoke(main, ["ctl", "--socket", str(bench.client.path), "resonance", "x", *quick])
+    measurement = json.loads(result.stdout)
     assert measurement["resonance"]["hz"] == pytest.approx(LOOP.hz, rel=0.0006)
     assert measurement["resonance"]["damping"] == pytest.approx(LOOP.damping, rel=0.05)
 
@@ -253,104 +108,70 @@ def test_a_resonance_alone_is_measured_as_well(bench: Bench) -> None:
         ({"near_hz": None, "resonance_only": True}, 422, "near_hz: missing"),
     ],
 )
-def test_what_makes_no_sense_is_refused(bench: Bench, change: dict[str, Any], expected_code: int, message: str) -> None:
-    code, text = answer(bench, "POST", "/response", {**QUICK_REQUEST, **change})
+def test_what_makes_no_sense_is_refused(
+    bench: VirtualBench, change: dict[str, Any], expected_code: int, message: str
+) -> None:
+    code, text = bench.answer("POST", "/response", {**QUICK_REQUEST, **change})
     assert (code, message in text["error"]) == (expected_code, True), text
     assert reference_um(bench) == SETPOINT_UM
 
 
-def test_only_a_held_reference_in_closed_loop_is_measured(bench: Bench) -> None:
+def test_only_a_held_reference_in_closed_loop_is_measured(bench: VirtualBench) -> None:
     wave = {"kind": "sine", "amplitude": 1.0, "frequency_hz": 1.0}
     bench.client.post("/reference", {"axis": "x", "reference": wave})
-    code, text = answer(bench, "POST", "/response", QUICK_REQUEST)
+    code, text = bench.answer("POST", "/response", QUICK_REQUEST)
     assert (code, "kind is sine; allowed: hold" in text["error"]) == (409, True), text
     bench.client.post("/setpoint", {"axis": "x", "value": SETPOINT_UM})
     bench.client.post("/mode", {"mode": "feedforward"})
-    code, text = answer(bench, "POST", "/response", QUICK_REQUEST)
+    code, text = bench.answer("POST", "/response", QUICK_REQUEST)
     assert (code, "the mode is not closed_loop" in text["error"]) == (409, True), text
     bench.client.post("/mode", {"mode": "closed_loop"})
     bench.client.post("/stop")
-    code, text = answer(bench, "POST", "/response", QUICK_REQUEST)
+    code, text = bench.answer("POST", "/response", QUICK_REQUEST)
     assert (code, "needs a running loop" in text["error"]) == (409, True), text
     bench.client.post("/start")
     bench.await_state("running")
 
 
-def test_out_of_raw_mode_the_measurement_is_about_the_position_that_is_held(bench: Bench) -> None:
+def test_out_of_raw_mode_the_measurement_is_about_the_position_that_is_held(bench: VirtualBench) -> None:
     """The setpoint of 1 V has become the held position of 4.3 µm."""
     bench.client.post("/mode", {"mode": "raw"})
-    code, text = answer(bench, "POST", "/response", QUICK_REQUEST)
+    code, text = bench.answer("POST", "/response", QUICK_REQUEST)
     assert (code, "the mode is not closed_loop" in text["error"]) == (409, True), text
     bench.client.post("/setpoint", {"axis": "x", "value": 1.0})
     tick = bench.ticks
-    wait_for(lambda: bench.ticks > tick + RATE_HZ // 5, "a position at rest")
+    bench.wait_for(lambda: bench.ticks > tick + RATE_HZ // 5, "a position at rest")
     bench.client.post("/mode", {"mode": "closed_loop"})
     held_um = reference_um(bench)
     assert held_um == pytest.approx(4.3, abs=0.5)
-    code, measurement = answer(bench, "POST", "/response", QUICK_REQUEST)
+    code, measurement = bench.answer("POST", "/response", QUICK_REQUEST)
     assert code == 200, measurement
     assert reference_um(bench) == held_um
     bench.client.post("/setpoint", {"axis": "x", "value": SETPOINT_UM})
 
 
-def test_whoever_sets_a_reference_meanwhile_ends_the_measurement(bench: Bench) -> None:
+def test_whoever_sets_a_reference_meanwhile_ends_the_measurement(bench: VirtualBench) -> None:
     """The measurement ends with an error, and leaves the reference of the other client as it is."""
-    answers: list[tuple[int, Any]] = []
-    measurement = threading.Thread(target=lambda: answers.append(answer(bench, "POST", "/response", QUICK_REQUEST)))
-    measurement.start()
-    wait_for(lambda: reference_um(bench) != SETPOINT_UM, "an excitation")
-    assert answer(bench, "POST", "/response", QUICK_REQUEST)[0] == 503
-    bench.client.post("/setpoint", {"axis": "x", "value": 4.0})
-    measurement.join()
-    ((code, text),) = answers
+
+    def set_another() -> None:
+        bench.wait_for(lambda: reference_um(bench) != SETPOINT_UM, "an excitation")
+        assert bench.answer("POST", "/response", QUICK_REQUEST)[0] == 503
+        bench.client.post("/setpoint", {"axis": "x", "value": 4.0})
+
+    _, code, text = bench.answer_meanwhile("/response", QUICK_REQUEST, set_another)
     assert (code, "another client has set a reference" in text["error"]) == (409, True), text
     assert reference_um(bench) == 4.0
     bench.client.post("/setpoint", {"axis": "x", "value": SETPOINT_UM})
 
 
-def test_after_ctrl_c_what_was_held_is_held_again(bench: Bench) -> None:
-    command = [
-        sys.executable,
-        "-m",
-        "rtloop",
-        "ctl",
-        "--socket",
-        bench.client.path,
-        "response",
-        "x",
-        "--duration",
-        "30",
-    ]
-    client = subprocess.Popen(command, env=bench.environment, stderr=subprocess.PIPE, text=True)
-    wait_for(lambda: reference_um(bench) != SETPOINT_UM, "an excitation")
-    client.send_signal(signal.SIGINT)
-    _, message = client.communicate(timeout=60)
-    assert (client.returncode, "holds 5 µm as before" in message) == (1, True), message
-    assert reference_um(bench) == SETPOINT_UM
+def test_a_loop_that_trips_is_left_to_its_interlocks(bench: VirtualBench) -> None:
+    def tighten() -> None:
+        bench.wait_for(lambda: reference_um(bench) != SETPOINT_UM, "an excitation")
+        bench.client.post("/tune", {"axis": "x", "section": "interlocks", "values": {"position_um": 3.0}})
 
-
-def test_a_loop_that_trips_is_left_to_its_interlocks(bench: Bench) -> None:
-    answers: list[tuple[int, Any]] = []
-    thread = threading.Thread(target=lambda: answers.append(answer(bench, "POST", "/response", QUICK_REQUEST)))
-    thread.start()
-    wait_for(lambda: reference_um(bench) != SETPOINT_UM, "an excitation")
-    bench.client.post("/tune", {"axis": "x", "section": "interlocks", "values": {"position_um": 3.0}})
-    thread.join()
-    ((code, text),) = answers
+    _, code, text = bench.answer_meanwhile("/response", QUICK_REQUEST, tighten)
     assert (code, "the loop tripped (position" in text["error"]) == (409, True), text
     bench.client.post("/tune", {"axis": "x", "section": "interlocks", "values": {"position_um": 30.0}})
     bench.client.post("/reset")
     bench.client.post("/start")
     bench.await_state("running")
-
-
-def test_a_service_that_ends_says_so_to_who_still_measures(bench: Bench) -> None:
-    """End the shared service. This test must be the last of the file."""
-    answers: list[tuple[int, Any]] = []
-    thread = threading.Thread(target=lambda: answers.append(answer(bench, "POST", "/response", QUICK_REQUEST)))
-    thread.start()
-    wait_for(lambda: reference_um(bench) != SETPOINT_UM, "an excitation")
-    assert bench.stop() == 0
-    thread.join()
-    assert answers == [(503, {"error": "response: the service is ending and takes no more requests"})]
-    assert "Traceback" not in bench.log()

@@ -11,7 +11,7 @@ import pytest
 from rtloop.errors import RtloopError
 from rtloop.service.desk import Refusal, UnconfirmedCommand
 from rtloop.service.service import State
-from tests.service.virtual_service import CONFIGURATION, RECOVER, VirtualService
+from tests.virtual.service import CONFIGURATION, RECOVER, VirtualService
 
 PERIOD_S, RETURN_COMMANDS = 0.04, 9
 SINE_V = (2.0, 4.0)

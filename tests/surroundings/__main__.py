@@ -19,6 +19,7 @@ import sys
 import tempfile
 import time
 from concurrent.futures import ThreadPoolExecutor
+from itertools import count
 from pathlib import Path
 
 from rtloop import connect
@@ -112,7 +113,7 @@ class Table:
 
     def __init__(self, bench: Bench, jobs: int, shows_text: bool) -> None:
         self._bench, self._jobs, self._shows_text = bench, jobs, shows_text
-        self._number = 0
+        self._numbers = count()
 
     def run(self, rows: dict[str, Surrounding], commands: dict[str, list[Command]]) -> int:
         """Run the clean cells twice, then the commands of each row; print what failed. Returns 1 if a cell failed."""
@@ -150,10 +151,9 @@ class Table:
             return [future.result() for future in futures]
 
     def _cell(self, command: Command, surrounding: Surrounding) -> Ending:
-        self._number += 1
         if command.shared:
             _let_run(self._bench.socket)
-        number = self._number
+        number = next(self._numbers)
         try:
             return self._bench.run(number, command, surrounding)
         finally:
