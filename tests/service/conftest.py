@@ -1,4 +1,4 @@
-"""Fixtures: a real service on a simulated board, with its control API, shared by the tests of a module."""
+"""Fixtures: a service that the tests of a module share, as real processes on a simulated board or in virtual time."""
 
 from __future__ import annotations
 
@@ -7,6 +7,8 @@ from collections.abc import Iterator
 import pytest
 
 from tests.faults.bench import Bench
+from tests.faults.configuration import on_a_board
+from tests.virtual.bench import VirtualBench
 
 
 @pytest.fixture(scope="module")
@@ -26,3 +28,27 @@ def running(bench: Bench) -> Iterator[Bench]:
     yield bench
     bench.client.post("/stop")
     bench.await_state("stopped")
+
+
+@pytest.fixture(scope="module")
+def virtual_bench(tmp_path_factory: pytest.TempPathFactory) -> Iterator[VirtualBench]:
+    """Yield a service as `bench`, on the simulated rig in virtual time."""
+    folder = tmp_path_factory.mktemp("virtual")
+    text = on_a_board(folder, ("[recording]", "[service]\narm = true\n[recording]"))
+    begin, end = text.index("[driver]"), text.index("[driver.channels.x]")
+    with pytest.MonkeyPatch.context() as patch:
+        bench = VirtualBench(folder, patch, f'{text[:begin]}[driver]\nkind = "sim"\n{text[end:]}')
+        bench.await_state("stopped")
+        yield bench
+        bench.end()
+
+
+@pytest.fixture
+def virtual(virtual_bench: VirtualBench) -> Iterator[VirtualBench]:
+    """Yield the virtual service armed and in closed loop, and stop it afterwards."""
+    virtual_bench.client.post("/arm")
+    virtual_bench.client.post("/start")
+    virtual_bench.await_drive()
+    yield virtual_bench
+    virtual_bench.client.post("/stop")
+    virtual_bench.await_state("stopped")

@@ -14,6 +14,7 @@ from websockets.sync.client import unix_connect
 
 import rtloop
 from rtloop.cli import main
+from tests.command_line import run
 from tests.faults.account import account, runs_in
 from tests.faults.bench import Bench
 from tests.faults.evidence import wait_for
@@ -209,6 +210,14 @@ def test_metrics_and_description(bench: Bench):
     schema = description["paths"]["/tune"]["post"]["requestBody"]["content"]["application/json"]["schema"]
     assert schema["required"] == ["axis", "section", "values"]
     assert schema["additionalProperties"] is False
+
+
+def test_watch_prints_as_many_lines_as_asked(running: Bench):
+    result = run("ctl", "--socket", running.client.path, "watch", "--count", 3)
+    lines = [json.loads(line) for line in result.stdout.splitlines()]
+    assert [line["state"] for line in lines] == ["running"] * 3
+    ticks = [line["tick"] for line in lines]
+    assert ticks == sorted(set(ticks))
 
 
 def test_the_end_is_whole_and_replays(bench: Bench):

@@ -11,12 +11,11 @@ from rtloop.configuration.prepare import prepare
 from rtloop.service.changing.change_history import Change, ChangeHistory
 from rtloop.service.changing.preview import lengthen_step, loop_figures, step_duration_ms
 from tests.command_line import run
-from tests.faults.bench import Bench
 from tests.paper_configuration import PAPER, TEXT, built
-from tests.service.http import answer
+from tests.virtual.bench import VirtualBench
 
 
-def running_axis(bench: Bench) -> dict:
+def running_axis(bench: VirtualBench) -> dict:
     """Return the configuration of the first axis that is in force."""
     return bench.client.get("/configuration")["values"]["axis"][0]
 
@@ -37,44 +36,44 @@ def test_figures_are_those_of_check():
     assert step["t_ms"][-1] >= 1e3 * running.settling_time_s
 
 
-def test_a_preview_changes_nothing_and_takes_no_lock(running: Bench):
-    before = running_axis(running)
+def test_a_preview_changes_nothing_and_takes_no_lock(virtual: VirtualBench):
+    before = running_axis(virtual)
     body = {"axis": "x", "section": "controller", "values": {"gain": 0.008}}
-    preview = running.client.post("/preview", body)
+    preview = virtual.client.post("/preview", body)
     assert preview["after"]["crossover_hz"] < 0.7 * preview["before"]["crossover_hz"]
     assert preview["after"]["gain_margin_db"] > preview["before"]["gain_margin_db"] + 3
-    assert running_axis(running) == before
-    running.client.delete("/lock")
-    running.client.post("/preview", body)
-    assert running.status()["lock"] is None
+    assert running_axis(virtual) == before
+    virtual.client.delete("/lock")
+    virtual.client.post("/preview", body)
+    assert virtual.status()["lock"] is None
     # A preview is refused like the change itself.
     unstable = {"axis": "x", "section": "controller", "values": {"gain": 5.0}}
     for path in ("/preview", "/tune"):
-        code, response = answer(running, "POST", path, unstable)
+        code, response = virtual.answer("POST", path, unstable)
         assert code == 422
         assert "unstable" in response["error"]
-    assert answer(running, "POST", "/preview", body | {"axis": "y"})[0] == 422
-    assert answer(running, "POST", "/preview", body | {"section": "driver"})[0] == 422
-    assert running_axis(running) == before
+    assert virtual.answer("POST", "/preview", body | {"axis": "y"})[0] == 422
+    assert virtual.answer("POST", "/preview", body | {"section": "driver"})[0] == 422
+    assert running_axis(virtual) == before
 
 
-def test_back_step_by_step(running: Bench):
-    before = running_axis(running)
-    code, response = answer(running, "POST", "/undo", {"axis": "x"})
+def test_back_step_by_step(virtual: VirtualBench):
+    before = running_axis(virtual)
+    code, response = virtual.answer("POST", "/undo", {"axis": "x"})
     assert code == 409
     assert "has no change since" in response["error"]
     ticks = [
-        running.client.post("/tune", {"axis": "x", "section": "controller", "values": {"gain": 0.012}})["tick"],
-        running.client.post("/tune", {"axis": "x", "section": "limits", "values": {"command_um": 40.0}})["tick"],
+        virtual.client.post("/tune", {"axis": "x", "section": "controller", "values": {"gain": 0.012}})["tick"],
+        virtual.client.post("/tune", {"axis": "x", "section": "limits", "values": {"command_um": 40.0}})["tick"],
     ]
-    running.client.post("/setpoint", {"axis": "x", "value": 12.5})
-    undone = [running.client.post("/undo", {"axis": "x"}) for _ in range(2)]
+    virtual.client.post("/setpoint", {"axis": "x", "value": 12.5})
+    undone = [virtual.client.post("/undo", {"axis": "x"}) for _ in range(2)]
     assert [change["undone"] for change in undone] == ["limits: command_um", "controller: gain"]
     assert ticks[0] < ticks[1] < undone[0]["tick"] < undone[1]["tick"]
-    assert running_axis(running)["controller"] == before["controller"]
-    assert running_axis(running)["limits"] == before["limits"]
-    assert running.status()["axes"]["x"]["reference_um"] == 12.5
-    assert answer(running, "POST", "/undo", {"axis": "x"})[0] == 409
+    assert running_axis(virtual)["controller"] == before["controller"]
+    assert running_axis(virtual)["limits"] == before["limits"]
+    assert virtual.status()["axes"]["x"]["reference_um"] == 12.5
+    assert virtual.answer("POST", "/undo", {"axis": "x"})[0] == 409
 
 
 def test_changes_to_and_fro_are_taken_back_in_their_order():
@@ -115,10 +114,10 @@ def test_an_axis_undoes_its_own_changes_and_those_of_the_controller_that_it_shar
     assert undo(2) == "controller of 2"
 
 
-def test_a_refused_change_is_none_to_undo(running: Bench):
-    assert answer(running, "POST", "/tune", {"axis": "x", "section": "controller", "values": {"gain": 5.0}})[0] == 422
-    assert answer(running, "POST", "/undo", {"axis": "x"})[0] == 409
-    assert answer(running, "POST", "/undo", {"axis": "y"})[0] == 422
+def test_a_refused_change_is_none_to_undo(virtual: VirtualBench):
+    assert virtual.answer("POST", "/tune", {"axis": "x", "section": "controller", "values": {"gain": 5.0}})[0] == 422
+    assert virtual.answer("POST", "/undo", {"axis": "x"})[0] == 409
+    assert virtual.answer("POST", "/undo", {"axis": "y"})[0] == 422
 
 
 @pytest.mark.parametrize(
@@ -138,11 +137,11 @@ def test_a_loop_that_controls_has_no_problem() -> None:
     assert figures["static_error_percent"] == pytest.approx(0.166384, abs=1e-5)
 
 
-def test_both_steps_of_a_preview_end_at_one_time(running: Bench):
+def test_both_steps_of_a_preview_end_at_one_time(virtual: VirtualBench):
     """The shorter step is lengthened: the present one if the change makes the loop slower, else the new one."""
     for gain in (0.004, 0.02):
         body = {"axis": "x", "section": "controller", "values": {"gain": gain}}
-        preview = running.client.post("/preview", body)
+        preview = virtual.client.post("/preview", body)
         before, after = preview["before"]["step"], preview["after"]["step"]
         assert before["t_ms"] == pytest.approx(after["t_ms"], abs=2e-6)
         slowest_ms = max(preview[key]["settling_ms"] for key in ("before", "after"))

@@ -1,4 +1,4 @@
-"""The real service with its web application, preparation and loop on the simulated rig, in virtual time and one process.
+"""The real service with its web application, preparation and loop on the simulated rig, in virtual time, one process.
 
 Every client of this process, `rtloop ctl` too, gets its answers from this service, but without socket, processes and
 recorder: each record that the loop makes is kept in `rows`.
@@ -106,11 +106,12 @@ class VirtualBench:
         prepared = replace(prepared, plan=plan)
         self.loop = LoopBench(plan)
         supervisor: Any = VirtualSupervisor(self.loop, prepared)
-        self.service._is_preparing = True
         self.service._desk = Desk(self.loop.block, plan.pacing.rate_hz)
         self.service.live = LiveLaw(prepared, self.loop.block, self.service._desk, self.service._offsets_v)
         self.service.supervisor = supervisor
-        self.start(self.service._prepare_and_start)
+        if not self.service.configuration.service.arm:
+            self.service._is_preparing = True
+            self.start(self.service._prepare_and_start)
 
     def start(self, work: Callable[[], object]) -> Thread:
         """Start a thread in virtual time."""
@@ -147,6 +148,12 @@ class VirtualBench:
 
     def await_state(self, state: str) -> None:
         self.wait_for(lambda: self.status()["state"] == state, state)
+
+    def await_drive(self) -> None:
+        """Wait until the loop runs, and for 1,000 further ticks."""
+        self.await_state("running")
+        ticks = self.ticks
+        self.wait_for(lambda: self.ticks > ticks + 1000, "a thousand ticks")
 
     @property
     def ticks(self) -> int:

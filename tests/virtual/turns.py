@@ -1,7 +1,7 @@
 """Virtual time: threads take turns, and no second passes by itself.
 
-A thread gives up its turn in `sleep`; the next turn is that of the thread that wakes first, after the world was advanced
-until then. The order of all work is therefore the same in every run, whatever the host does.
+A thread gives up its turn in `sleep`; the next turn is that of the thread that wakes first, after the world was
+advanced until then. The order of all work is therefore the same in every run, whatever the host does.
 """
 
 from __future__ import annotations
