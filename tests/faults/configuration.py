@@ -113,6 +113,13 @@ def on_a_board(folder: Path, *changes: tuple[str, str]) -> str:
     return _apply_changes(BOARD + '[[axis]]\nname = "x"\n' + LAW + LIMITS, folder, changes)
 
 
+def on_a_rig(folder: Path, *changes: tuple[str, str]) -> str:
+    """Return the text of `on_a_board` with the rig in the loop's own process."""
+    text = on_a_board(folder, *changes)
+    begin, end = text.index("[driver]"), text.index("[driver.channels.x]")
+    return f'{text[:begin]}[driver]\nkind = "sim"\n{text[end:]}'
+
+
 def on_a_card(folder: Path, *changes: tuple[str, str]) -> str:
     """Return the text of a configuration: a first-order plant behind a third party's driver in plain Python."""
     return _apply_changes(CARD + '[[axis]]\nname = "x"\n' + CARD_LAW + LIMITS, folder, changes)

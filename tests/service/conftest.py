@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import pytest
 
 from tests.faults.bench import Bench
-from tests.faults.configuration import on_a_board
+from tests.faults.configuration import on_a_rig
 from tests.virtual.bench import VirtualBench
 
 
@@ -34,10 +34,9 @@ def running(bench: Bench) -> Iterator[Bench]:
 def virtual_bench(tmp_path_factory: pytest.TempPathFactory) -> Iterator[VirtualBench]:
     """Yield a service as `bench`, on the simulated rig in virtual time."""
     folder = tmp_path_factory.mktemp("virtual")
-    text = on_a_board(folder, ("[recording]", "[service]\narm = true\n[recording]"))
-    begin, end = text.index("[driver]"), text.index("[driver.channels.x]")
+    text = on_a_rig(folder, ("[recording]", "[service]\narm = true\n[recording]"))
     with pytest.MonkeyPatch.context() as patch:
-        bench = VirtualBench(folder, patch, f'{text[:begin]}[driver]\nkind = "sim"\n{text[end:]}')
+        bench = VirtualBench(folder, patch, text)
         bench.await_state("stopped")
         yield bench
         bench.end()

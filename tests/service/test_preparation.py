@@ -1,9 +1,11 @@
-"""Depolarisation and tare on a rig with hysteresis; board and recordings are the evidence."""
+"""Depolarisation and tare on a rig with hysteresis; drives and recordings are the evidence."""
 
 from __future__ import annotations
 
 import os
 import signal
+from collections.abc import Callable, Iterator
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,7 +16,8 @@ from rtloop.errors import RtloopError
 from rtloop.service.preparation import decaying_sine
 from tests.faults.account import runs_in
 from tests.faults.bench import Bench
-from tests.faults.evidence import wait_for
+from tests.faults.configuration import on_a_rig
+from tests.virtual.bench import VirtualBench
 
 THRESHOLDS_V = [0.095, 0.38, 0.84, 1.46, 2.21, 3.07, 4.01, 4.98, 5.96, 6.89, 7.76, 8.52, 9.14, 9.61, 9.9]
 WEIGHTS_UM_PER_V = [2.55, 0.57, 1.3, -1.57, 1.25, -0.054, -0.032, 0.66, 0.16, -0.77, 2.02, -1.63, -0.15, 2.99, -1.09]
@@ -65,41 +68,50 @@ def test_the_tare_survives_the_loop(tmp_path):
     assert abs(offsets_v[1][0] - offsets_v[0][-1]) < 1e-12
 
 
-def test_while_the_actuator_is_depolarised_setpoints_move_nothing_and_no_start_undoes_a_stop(tmp_path):
+@pytest.fixture
+def make_bench(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[..., VirtualBench]]:
+    """Yield the constructor of a service in virtual time from changes of the paper's configuration."""
+    benches: list[VirtualBench] = []
+
+    def construct(*changes: tuple[str, str]) -> VirtualBench:
+        benches.append(VirtualBench(tmp_path, monkeypatch, on_a_rig(tmp_path, *changes)))
+        return benches[-1]
+
+    yield construct
+    for bench in benches:
+        bench.end()
+
+
+def test_while_the_actuator_is_depolarised_setpoints_move_nothing_and_no_start_undoes_a_stop(make_bench, caplog):
     """A setpoint of 4 µm would be 4 V in mode raw; the depolarising sine has 2 V."""
-    sine = "[service]\ndepolarise = { amplitude_v = 2.0, cycles = 1000 }\n[recording]"
-    with Bench(tmp_path, ("[recording]", sine)) as bench:
-        wait_for(lambda: bench.output_record().largest_v > 0.5, "the sine")
-        for resource, body in (("/setpoint", {"value": 4.0}), ("/waveform", {"samples": [4.0, 4.0]})):
-            with pytest.raises(RtloopError, match="the actuator is being depolarised; send the request again"):
-                bench.client.post(resource, {"axis": "x"} | body)
-        with pytest.raises(RtloopError, match="mode closed_loop: the actuator is being depolarised or tared; send"):
-            bench.client.post("/start")
-        bench.client.post("/stop")
-        message = "the configured mode does not apply: mode off was requested during the start"
-        wait_for(lambda: message in bench.log(), "the end of the preparation")
-        ticks = bench.ticks
-        wait_for(lambda: bench.ticks > ticks + 1000, "ticks")
-        assert (bench.status()["mode"], bench.output_record().last_v) == ("off", 0.0)
-        assert bench.output_record().largest_v < 2.1
+    caplog.set_level("INFO")
+    bench = make_bench(("[recording]", "[service]\ndepolarise = { amplitude_v = 2.0, cycles = 200 }\n[recording]"))
+    bench.wait_for(lambda: abs(bench.column("x_drive_v")).max() > 0.5, "the sine")
+    for resource, body in (("/setpoint", {"value": 4.0}), ("/waveform", {"samples": [4.0, 4.0]})):
+        with pytest.raises(RtloopError, match="the actuator is being depolarised; send the request again"):
+            bench.client.post(resource, {"axis": "x"} | body)
+    with pytest.raises(RtloopError, match="mode closed_loop: the actuator is being depolarised or tared; send"):
         bench.client.post("/start")
-        bench.await_drive()
-        assert bench.stop() == 0, bench.log()
+    bench.client.post("/stop")
+    message = "the configured mode does not apply: mode off was requested during the start"
+    bench.wait_for(lambda: message in caplog.text, "the end of the preparation")
+    bench.turns.sleep(0.25)
+    assert (bench.status()["mode"], bench.column("x_drive_v")[-1]) == ("off", 0.0)
+    assert abs(bench.column("x_drive_v")).max() < 2.1
+    bench.client.post("/start")
+    bench.await_drive()
+    assert bench.column("x_drive_v")[-1] > 1.0
 
 
-def test_a_service_in_mode_raw_plays_its_reference_after_the_tare(tmp_path):
+def test_a_service_in_mode_raw_plays_its_reference_after_the_tare(make_bench):
     """The reference is a sine from 1 V to 5 V; the service begins at 0 V and then follows the sine."""
-    changes = (
+    bench = make_bench(
         ("[loop]\n", '[loop]\nmode = "raw"\n'),
         ("amplitude = 8.0\noffset = 20.0\n", "amplitude = 2.0\noffset = 3.0\n"),
         ("[recording]", "[service]\ntare_s = 0.1\n[recording]"),
     )
-    with Bench(tmp_path, *changes) as bench:
-        wait_for(lambda: bench.output_record().highest_v > 4.9, "the sine's top")
-        ticks = bench.ticks
-        wait_for(lambda: bench.ticks > ticks + 1000, "a period")
-        assert bench.stop() == 0, bench.log()
-    recording = rtloop.load(runs_in(tmp_path / "recordings")[0])
-    drive_v = recording["x_drive_v"]
-    followed_v = drive_v[np.argmax(drive_v > 4.9) :][:800]  # a period at 4 kHz
+    bench.wait_for(lambda: bench.column("x_drive_v").max() > 4.9, "the sine's top")
+    begin = bench.ticks
+    bench.turns.sleep(0.2)
+    followed_v = bench.column("x_drive_v")[begin:]  # a period
     assert (np.min(followed_v), np.max(followed_v)) == (pytest.approx(1.0, abs=0.01), pytest.approx(5.0, abs=0.01))

@@ -112,6 +112,7 @@ class VirtualBench:
         if not self.service.configuration.service.arm:
             self.service._is_preparing = True
             self.start(self.service._prepare_and_start)
+        self.turns.sleep(WATCH_S)
 
     def start(self, work: Callable[[], object]) -> Thread:
         """Start a thread in virtual time."""
