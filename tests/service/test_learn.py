@@ -12,6 +12,7 @@ import pytest
 from click.testing import CliRunner
 
 from rtloop.cli import main
+from rtloop.service.measuring.player import Player
 from tests.design.measured_loops import compute_margins
 from tests.service.test_response import CONFIGURATION, LOOP, OMEGA, QUICK_REQUEST, RATE_HZ, SETPOINT_UM
 from tests.stage_text import resonance
@@ -149,4 +150,29 @@ def test_a_learning_in_which_the_mode_becomes_raw_leaves_the_drive_as_it_is(runn
     assert axis["drive_v"] == axis["reference_um"] != SETPOINT_UM
     running.client.post("/mode", {"mode": "closed_loop"})
     hold_setpoint(running)
+    assert_reference_returns(running)
+
+
+def test_a_trip_as_the_best_table_begins_leaves_the_setpoint_as_reference(
+    running: VirtualBench, monkeypatch: pytest.MonkeyPatch
+):
+    """The loop trips after the last table has been set, and before the service looks again."""
+    hold_setpoint(running)
+    play = Player.play
+
+    def play_and_trip(player: Player, samples: Any, *, repeat: bool = False) -> int:
+        tick = play(player, samples, repeat=repeat)
+        if repeat:
+            assert running.service.live is not None
+            running.service.live.tune("x", "interlocks", {"position_um": 3.0})
+            running.wait_for(lambda: running.service.state == "tripped", "a trip")
+        return tick
+
+    monkeypatch.setattr(Player, "play", play_and_trip)
+    running.answer("POST", "/learn", REQUEST | {"keep": True})
+    assert reference_um(running) == SETPOINT_UM
+    running.client.post("/undo", {"axis": "x"})
+    running.client.post("/reset")
+    running.client.post("/start")
+    running.await_state("running")
     assert_reference_returns(running)

@@ -144,15 +144,11 @@ class Player:
         """
         ring = self._supervisor.block.ring("ticks")
         rows = np.empty((count, ring.slots.shape[1]))
-        read_count, deadline_s = (
-            0,
-            timing.monotonic_s() + (first + count - self.next_tick) / self.rate_hz + READ_MARGIN_S,
-        )
+        due_s = (first + count - self.next_tick) / self.rate_hz
+        read_count, deadline_s = 0, timing.monotonic_s() + due_s + READ_MARGIN_S
         while read_count < count:
             require_client(self._activity)
-            is_late = (
-                timing.monotonic_s() > deadline_s
-            )  # Read first: a stalled service looks once more after the deadline.
+            is_late = timing.monotonic_s() > deadline_s  # read first: a stalled service looks once more
             new_count, _, lost = drain(ring, first + read_count, rows[read_count:])
             if lost:
                 raise Refusal(f"{self._activity}: ticks were overwritten before the service read them; try again")

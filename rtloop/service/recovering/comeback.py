@@ -159,9 +159,7 @@ def _await_record(supervisor: Supervisor, tick: int) -> Real:
     deadline_s = timing.monotonic_s() + RECORD_TIMEOUT_S
     is_late = False
     while not is_late:
-        is_late = (
-            timing.monotonic_s() >= deadline_s
-        )  # Read first: a stalled service looks once more after the deadline.
+        is_late = timing.monotonic_s() >= deadline_s  # read first: a stalled service looks once more
         rows = supervisor.newest(max(supervisor.ticks - tick, 1))
         match = rows[rows[:, signals.TICK] == tick]
         if len(match):
