@@ -164,6 +164,17 @@ def test_whoever_sets_a_reference_meanwhile_ends_the_measurement(bench: VirtualB
     bench.client.post("/setpoint", {"axis": "x", "value": SETPOINT_UM})
 
 
+def test_a_measurement_that_fails_returns_to_the_setpoint(bench: VirtualBench) -> None:
+    def leave_closed_loop() -> None:
+        bench.wait_for(lambda: reference_um(bench) != SETPOINT_UM, "an excitation")
+        bench.client.post("/mode", {"mode": "feedforward"})
+
+    _, code, text = bench.answer_meanwhile("/response", QUICK_REQUEST, leave_closed_loop)
+    assert (code, "the mode is not closed_loop" in text["error"]) == (409, True), text
+    assert reference_um(bench) == SETPOINT_UM
+    bench.client.post("/mode", {"mode": "closed_loop"})
+
+
 def test_a_loop_that_trips_is_left_to_its_interlocks(bench: VirtualBench) -> None:
     def tighten() -> None:
         bench.wait_for(lambda: reference_um(bench) != SETPOINT_UM, "an excitation")
