@@ -62,6 +62,9 @@ def test_a_scan_is_learned_and_goes_on(running: VirtualBench, tmp_path: Path):
     hold_setpoint(running)
     replay = CliRunner().invoke(main, [*arguments[:3], "waveform", "x", str(tmp_path / "learned.csv"), "--repeat"])
     assert replay.exit_code == 0, replay.output
+    running.turns.sleep(1.0)
+    period_um = running.column("x_position_um")[-20 * TICKS :].reshape(-1, TICKS).mean(axis=0)
+    assert min(np.std(period_um - np.roll(SCAN_UM, shift)) for shift in range(TICKS)) < errors[0] / 20
     hold_setpoint(running)
 
 

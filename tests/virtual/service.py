@@ -21,9 +21,9 @@ from rtloop.service.recovering import worker
 from rtloop.service.recovering.worker import RecoveryWorker
 from rtloop.service.service import Service
 from rtloop.signals import Mode
-from rtloop.supervision.supervisor import Supervisor
 from tests.engine.failing_driver import ScriptedDriver
 from tests.engine.harness import LoopBench
+from tests.virtual.bench import VirtualSupervisor
 from tests.virtual.turns import Turns, virtual_time
 
 RATE_HZ, WATCH_S = 1000.0, 0.005
@@ -63,20 +63,6 @@ max_per_hour = 10
 """
 
 
-class SteppedSupervisor:
-    """The part of a Supervisor that reads the loop's block; the loop runs in this process."""
-
-    newest, latest, trip_reason = Supervisor.newest, Supervisor.latest, Supervisor.trip_reason
-    ended, error = False, None
-
-    def __init__(self, bench: LoopBench, prepared: Any) -> None:
-        self.block, self.prepared = bench.block, prepared
-
-    @property
-    def ticks(self) -> int:
-        return int(self.block["ticks_head"][0])
-
-
 class VirtualService:
     """A service with a loop of one axis, mode feedforward and a sine; `more` ends its configuration.
 
@@ -109,7 +95,7 @@ class VirtualService:
             lambda _: self.driver.written[-1] * UM_PER_V / 10.0 if self.driver.written else 0.0
         )
         self.bench = LoopBench(plan, self.driver)
-        supervisor: Any = SteppedSupervisor(self.bench, prepared)
+        supervisor: Any = VirtualSupervisor(self.bench, prepared)
         self.service._desk = Desk(self.bench.block, RATE_HZ)
         self.service.live = LiveLaw(prepared, self.bench.block, self.service._desk, {})
         self.service.supervisor = supervisor
