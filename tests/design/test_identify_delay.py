@@ -78,6 +78,13 @@ def test_a_fast_lag_does_not_stand_in_for_a_sample_of_delay() -> None:
     assert abs(lag.frequency_hz - 4000.0) < 4 * lag.frequency_std_hz
 
 
+def test_a_lag_that_the_errors_need_is_not_left_out() -> None:
+    """The lag's pole is uncertain by more than itself; without it, the errors would follow from the input."""
+    fit = identify_dynamics(excitation(227.57, 0.0051, 1, up_and_down_drive(1.1), 3561.0))
+    assert (fit.model.order, fit.delay_ticks, fit.left_out_hz) == (3, 1, ())
+    assert fit.tests.is_independent
+
+
 FIVE_POLES, THREE_POLES = Candidate(0, 5, 0.03, 0.03, True), Candidate(3, 3, 0.031, 0.03, True)
 
 
