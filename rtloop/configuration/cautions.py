@@ -207,16 +207,16 @@ def _unreachable(axis: AxisOptions, lowest_um: float, highest_um: float, ends_um
 def _beyond_drive(axis: AxisOptions, lowest_um: float, highest_um: float) -> Iterator[str]:
     """Yield one line if the drive's limits do not allow a reference from `lowest_um` to `highest_um`, else none.
 
-    The feedforward's model goes from rest to the end on the side where the drive reaches farther, else to the farther
-    end, then, with the
-    hysteresis of that motion, to the other end. The line states the positions that the limits allow.
+    The feedforward's model goes from rest to the end on the side where the drive reaches farther, or to the farther end
+    where it reaches equally far; then, with the hysteresis of that motion, to the other end. The line states the
+    positions that the limits allow.
     """
     limits, actuator = axis.limits, axis.feedforward.actuator()
     ends_v = limits.lowest_v, limits.drive_v
     down_um, up_um = drive_ends_um(axis)
     is_even = math.isclose(-down_um, up_um)
-    sides = (lambda end_um: abs(end_um)) if is_even else (lambda end_um: end_um * (down_um + up_um))
-    positions_um = sorted((lowest_um, highest_um), key=sides, reverse=True)
+    first = abs if is_even else lambda end_um: end_um * (down_um + up_um)
+    positions_um = sorted((lowest_um, highest_um), key=first, reverse=True)
     if can_hold(actuator, positions_um, *ends_v):
         return
     is_virgin = lowest_um == highest_um

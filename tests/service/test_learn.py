@@ -121,6 +121,15 @@ def await_tables(bench: VirtualBench) -> None:
     bench.wait_for(lambda: bench.ticks > tick + JUDGED_TICKS, "tables that were judged")
 
 
+def assert_setpoint_is_kept_over_a_reset(bench: VirtualBench) -> None:
+    """Undo the tight interlock, reset and start, and check that the reference is SETPOINT_UM."""
+    bench.client.post("/undo", {"axis": "x"})
+    bench.client.post("/reset")
+    bench.client.post("/start")
+    bench.await_state("running")
+    assert_reference_returns(bench)
+
+
 def learn_until(bench: VirtualBench, end: Callable[[], Any]) -> tuple[Any, int, Any]:
     """Learn from the setpoint, call `end` while tables are tried; return its result, and status and body of /learn."""
     hold_setpoint(bench)
@@ -138,11 +147,7 @@ def test_a_learning_that_trips_leaves_the_setpoint_as_reference(running: Virtual
     _, code, text = learn_until(running, lambda: running.client.post("/tune", tight))
     assert (code, "the loop tripped (position" in text["error"]) == (409, True), text
     assert reference_um(running) == SETPOINT_UM
-    running.client.post("/undo", {"axis": "x"})
-    running.client.post("/reset")
-    running.client.post("/start")
-    running.await_state("running")
-    assert_reference_returns(running)
+    assert_setpoint_is_kept_over_a_reset(running)
 
 
 def test_a_learning_in_which_the_mode_becomes_raw_leaves_the_drive_as_it_is(running: VirtualBench):
@@ -174,8 +179,4 @@ def test_a_trip_as_the_best_table_begins_leaves_the_setpoint_as_reference(
     monkeypatch.setattr(Player, "play", play_and_trip)
     running.answer("POST", "/learn", REQUEST | {"keep": True})
     assert reference_um(running) == SETPOINT_UM
-    running.client.post("/undo", {"axis": "x"})
-    running.client.post("/reset")
-    running.client.post("/start")
-    running.await_state("running")
-    assert_reference_returns(running)
+    assert_setpoint_is_kept_over_a_reset(running)

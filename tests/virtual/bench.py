@@ -24,7 +24,7 @@ from rtloop.engine.messages import MESSAGE
 from rtloop.foundation import timing
 from rtloop.service import service, status
 from rtloop.service.api.application import application
-from rtloop.service.api.lanes import Lanes
+from rtloop.service.api.lanes import Lanes, TooManyRequests
 from rtloop.service.changing.live import LiveLaw
 from rtloop.service.desk import Desk
 from rtloop.service.service import Service
@@ -179,8 +179,6 @@ class VirtualBench:
 
 async def _run_in_lane(lanes: Lanes, lane: Any, action: Callable[..., T], *arguments: Any) -> T:
     """Run an action of a request in the calling thread; as many requests wait at a time as in the real lanes."""
-    from rtloop.service.api.lanes import TooManyRequests
-
     if lanes._pending_counts[lane] >= lane.value[1]:
         raise TooManyRequests("too many requests")
     lanes._pending_counts[lane] += 1
