@@ -9,10 +9,8 @@ from __future__ import annotations
 import asyncio
 import json
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from threading import Thread
-from types import SimpleNamespace
 from typing import Any, TypeVar
 
 import numpy as np
@@ -20,38 +18,12 @@ import pytest
 
 from rtloop.client import Client
 from rtloop.configuration.prepare import prepare
-from rtloop.engine.messages import MESSAGE
-from rtloop.foundation import timing
 from rtloop.service import service, status
 from rtloop.service.api.application import application
 from rtloop.service.api.lanes import Lanes, TooManyRequests
-from rtloop.service.changing.live import LiveLaw
-from rtloop.service.desk import Desk
-from rtloop.service.service import Service
-from rtloop.signals import Mode
-from rtloop.supervision.supervisor import Supervisor
-from tests.engine.harness import LoopBench
-from tests.virtual.turns import Turns, virtual_time
+from tests.virtual.loop import WATCH_S, VirtualLoop
 
 T = TypeVar("T")
-WATCH_S = 0.005
-"""Pause between two looks of the service at its loop."""
-
-
-class VirtualSupervisor:
-    """The part of a Supervisor that reads the loop's block; the loop runs in this process, and nothing is recorded."""
-
-    newest, latest, trip_reason = Supervisor.newest, Supervisor.latest, Supervisor.trip_reason
-    ended, error, realtime = False, None, {}
-
-    def __init__(self, loop: LoopBench, prepared: Any) -> None:
-        self.block, self.prepared = loop.block, prepared
-        self.recorder = SimpleNamespace(written_state={}, replacements=0, quota=None)
-        self.names = SimpleNamespace(identity=lambda _: 0, requester=lambda _: None)
-
-    @property
-    def ticks(self) -> int:
-        return int(self.block["ticks_head"][0])
 
 
 def answer_in_process(application: Any, method: str, resource: str, body: str | bytes | None) -> tuple[int, str, bytes]:
@@ -78,37 +50,23 @@ def answer_in_process(application: Any, method: str, resource: str, body: str | 
     return sent[0]["status"], kind, b"".join(message.get("body", b"") for message in sent[1:])
 
 
-class VirtualBench:
+class VirtualBench(VirtualLoop):
     """A service in closed loop, as `tests.faults.bench.Bench`; `text` is its configuration."""
 
     def __init__(self, folder: Path, monkeypatch: pytest.MonkeyPatch, text: str) -> None:
-        self.folder, self.config = folder, folder / "lab.toml"
-        self.config.write_text(text.replace("FOLDER", str(folder)))
-        self.turns = Turns(self._advance)
-        monkeypatch.setattr(timing, "source", virtual_time(self.turns))
         monkeypatch.setattr(Lanes, "run", _run_in_lane)
         monkeypatch.setattr(status, "timing", lambda _: {})  # an unpaced loop has no lateness
         monkeypatch.setattr(service, "prepare", lambda configuration: prepare(configuration, paced=False))
-        self.service = Service(self.config)
-        self.service.second_opinion.require = lambda _: None  # type: ignore[method-assign]
+        super().__init__(folder, monkeypatch, text.replace("FOLDER", str(folder)))
         web = application(self.service)
         monkeypatch.setattr(Client, "exchange", lambda _, *request, **__: answer_in_process(web, *request[:3]))
         self.client = Client(folder / "lab.sock")
         self.rows: list[np.ndarray[Any, Any]] = []
-        self.loop: LoopBench | None = None
-        self._undone_ticks = 0.0
         self.begin_loop()
 
     def begin_loop(self) -> None:
         """Begin a loop as the service does: off, then prepared and in the configured mode if the service is armed."""
-        prepared = prepare(self.service.configuration, paced=False)
-        plan = replace(prepared.plan, mode=Mode.OFF, schedule=np.zeros(0, MESSAGE), spare_samples=service.SPARE_SAMPLES)
-        prepared = replace(prepared, plan=plan)
-        self.loop = LoopBench(plan)
-        supervisor: Any = VirtualSupervisor(self.loop, prepared)
-        self.service._desk = Desk(self.loop.block, plan.pacing.rate_hz)
-        self.service.live = LiveLaw(prepared, self.loop.block, self.service._desk, self.service._offsets_v)
-        self.service.supervisor = supervisor
+        self.execute()
         if not self.service.configuration.service.arm:
             self.service._is_preparing = True
             self.start(self.service._prepare_and_start)
@@ -117,18 +75,6 @@ class VirtualBench:
     def start(self, work: Callable[[], object]) -> Thread:
         """Start a thread in virtual time."""
         return self.turns.start(work)
-
-    def end(self) -> None:
-        """End all threads."""
-        self.turns.end()
-
-    def wait_for(self, condition: Callable[[], T], what: str, limit_s: float = 60.0) -> T:
-        """Wait until the condition holds and return its value; fails after `limit_s` of virtual time."""
-        end_s = self.turns.now_s + limit_s
-        while not (value := condition()):
-            assert self.turns.now_s < end_s, f"no {what} within {limit_s:g} s; {self.status()}"
-            self.turns.sleep(0.002)
-        return value
 
     def answer(self, method: str, resource: str, body: Any = None) -> tuple[int, Any]:
         """Return the status, and the JSON object or the text of the response."""
@@ -166,15 +112,8 @@ class VirtualBench:
         assert self.loop is not None
         return np.concatenate(self.rows)[:, self.loop.plan.columns.index(signal)]
 
-    def _advance(self, seconds: float) -> None:
-        while self.loop is not None and seconds > 1e-9:
-            part_s = min(seconds, WATCH_S)
-            seconds -= part_s
-            self._undone_ticks += part_s * self.loop.plan.pacing.rate_hz
-            if (ticks := int(self._undone_ticks + 1e-6)) > 0:
-                self._undone_ticks -= ticks
-                self.rows.append(self.loop.run(ticks))
-            self.service._follow_events()
+    def executed(self, rows: np.ndarray[Any, Any]) -> None:
+        self.rows.append(rows)
 
 
 async def _run_in_lane(lanes: Lanes, lane: Any, action: Callable[..., T], *arguments: Any) -> T:

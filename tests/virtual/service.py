@@ -3,30 +3,19 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Sequence
-from dataclasses import replace
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 
-from rtloop.configuration.prepare import prepare
-from rtloop.engine.messages import MESSAGE
-from rtloop.foundation import timing
-from rtloop.service import service
-from rtloop.service.changing.live import LiveLaw
 from rtloop.service.desk import Desk
 from rtloop.service.recovering import worker
 from rtloop.service.recovering.worker import RecoveryWorker
-from rtloop.service.service import Service
-from rtloop.signals import Mode
 from tests.engine.failing_driver import ScriptedDriver
-from tests.engine.harness import LoopBench
-from tests.virtual.bench import VirtualSupervisor
-from tests.virtual.turns import Turns, virtual_time
+from tests.virtual.loop import VirtualLoop
 
-RATE_HZ, WATCH_S = 1000.0, 0.005
+RATE_HZ = 1000.0
 UM_PER_V = 4.0
 CONFIGURATION = f"""
 [loop]
@@ -63,19 +52,14 @@ max_per_hour = 10
 """
 
 
-class VirtualService:
+class VirtualService(VirtualLoop):
     """A service with a loop of one axis, mode feedforward and a sine; `more` ends its configuration.
 
-    The reading follows the drive. While `hangs`, the loop executes no tick, as if its driver did not return.
+    The reading follows the drive.
     """
 
     def __init__(self, folder: Path, monkeypatch: pytest.MonkeyPatch, more: str = RECOVER, base: str = CONFIGURATION):
-        self.turns, self.hangs = Turns(self._advance), False
-        monkeypatch.setattr(timing, "source", virtual_time(self.turns))
-        (folder / "lab.toml").write_text(base + more)
-        self.bench: LoopBench | None = None
-        self.service = Service(folder / "lab.toml")
-        self.service.second_opinion.require = lambda _: None  # type: ignore[method-assign]
+        super().__init__(folder, monkeypatch, base + more)
         self.commands_sent = 0
         submit = Desk.submit
 
@@ -84,26 +68,18 @@ class VirtualService:
             return submit(*arguments, **options)
 
         monkeypatch.setattr(Desk, "submit", count_and_submit)
-        self._undone_ticks, self._since_watch_s, self._is_watched = 0.0, 0.0, True
 
     def begin_loop(self) -> None:
         """Begin a loop with its outputs off, as after a failure, and let it execute its first ticks."""
-        prepared = prepare(self.service.configuration, paced=False)
-        plan = replace(prepared.plan, mode=Mode.OFF, schedule=np.zeros(0, MESSAGE), spare_samples=service.SPARE_SAMPLES)
-        prepared = replace(prepared, plan=plan)
         self.driver = ScriptedDriver(
             lambda _: self.driver.written[-1] * UM_PER_V / 10.0 if self.driver.written else 0.0
         )
-        self.bench = LoopBench(plan, self.driver)
-        supervisor: Any = VirtualSupervisor(self.bench, prepared)
-        self.service._desk = Desk(self.bench.block, RATE_HZ)
-        self.service.live = LiveLaw(prepared, self.bench.block, self.service._desk, {})
-        self.service.supervisor = supervisor
+        self.execute(self.driver)
         self.turns.sleep(0.01)
 
     def end_loop(self) -> None:
         """Take the loop away, as after the death of its process."""
-        self.service.supervisor = self.service._desk = self.service.live = self.bench = None
+        self.service.supervisor = self.service._desk = self.service.live = self.loop = None
 
     def start_recovery(self) -> threading.Thread:
         """Start the thread of the recovery, for 1000 s."""
@@ -122,31 +98,12 @@ class VirtualService:
         self.turns.sleep(0.02)
         self.driver.sample_age_us = 0.0
 
-    def wait_for(self, condition: Callable[[], bool], limit_s: float = 100.0) -> None:
-        """Wait until the condition holds; fails after `limit_s` of virtual time."""
-        end_s = self.turns.now_s + limit_s
-        while not condition():
-            assert self.turns.now_s < end_s, (self.service.state, self.recovery_state)
-            self.turns.sleep(0.001)
-
     @property
     def recovery_state(self) -> str:
-        report = self.service.recovery.for_json()
-        return "" if report is None else str(report["state"])
+        return str(self.recovery.get("state", ""))
 
     def drive_v(self, seconds: float) -> Sequence[float]:
         """Return the drives of the next ticks."""
         before = len(self.driver.written)
         self.turns.sleep(seconds)
         return self.driver.written[before:]
-
-    def _advance(self, seconds: float) -> None:
-        """Execute the ticks of a stretch of time, and read the loop's events every WATCH_S, as the service's watch."""
-        while self.bench is not None and not self.hangs and seconds > 1e-9:
-            part_s = min(seconds, WATCH_S)
-            seconds -= part_s
-            self._undone_ticks += part_s * RATE_HZ
-            if (ticks := int(self._undone_ticks + 1e-6)) > 0:
-                self._undone_ticks -= ticks
-                self.bench.run(ticks)
-            self.service._follow_events()
