@@ -8,58 +8,89 @@ from __future__ import annotations
 
 import asyncio
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from concurrent.futures import Future
+from contextvars import ContextVar, copy_context
 from pathlib import Path
-from threading import Thread
+from threading import Thread, current_thread
 from typing import Any, TypeVar
 
 import numpy as np
 import pytest
 
 from rtloop.client import Client
+from rtloop.client.control import UnansweredRequest
 from rtloop.configuration.prepare import prepare
 from rtloop.service import service, status
 from rtloop.service.api.application import application
-from rtloop.service.api.lanes import Lanes, TooManyRequests
+from rtloop.service.api.lanes import Lane, Lanes, TooManyRequests
 from tests.virtual.loop import WATCH_S, VirtualLoop
 
 T = TypeVar("T")
+LOOP_PASSES = 10
+"""Passes of the event loop after which a request has noticed that its client is gone."""
+client_is_gone = ContextVar[Callable[[], object]]("client_is_gone")
 
 
-def answer_in_process(application: Any, method: str, resource: str, body: str | bytes | None) -> tuple[int, str, bytes]:
-    """Return (HTTP status, content type, body) of the web application's response, computed in the calling thread."""
+def answer_in_process(
+    application: Any,
+    method: str,
+    resource: str,
+    body: str | bytes | None,
+    headers: Mapping[str, str] | None = None,
+    is_gone: Callable[[], object] = lambda: False,
+) -> tuple[int, dict[str, str], bytes]:
+    """Return (HTTP status, headers, body) of the web application's response, computed in the calling thread.
+
+    The client disconnects as soon as `is_gone` returns True.
+    """
     sent: list[Any] = []
     data = body.encode() if isinstance(body, str) else body or b""
     requests = iter([{"type": "http.request", "body": data, "more_body": False}])
 
+    async def respond() -> None:
+        client_is_gone.set(is_gone)
+        await application(scope, receive, send)
+
     async def receive() -> Any:
         for request in requests:
             return request
-        return await asyncio.Event().wait()
+        while not is_gone():
+            await asyncio.sleep(0)
+        return {"type": "http.disconnect"}
 
     async def send(message: Any) -> None:
         sent.append(message)
 
     path, _, query = resource.partition("?")
     scope = {
-        "type": "http", "http_version": "1.1", "method": method, "scheme": "http", "path": path, "headers": [],
-        "raw_path": path.encode(), "query_string": query.encode(), "server": ("localhost", 80), "root_path": "",
+        "type": "http", "http_version": "1.1", "method": method, "scheme": "http", "path": path, "root_path": "",
+        "raw_path": path.encode(), "query_string": query.encode(), "server": ("localhost", 80),
+        "headers": [(name.lower().encode(), value.encode()) for name, value in (headers or {}).items()],
     }  # fmt: skip
-    asyncio.run(application(scope, receive, send))
-    kind = dict(sent[0]["headers"]).get(b"content-type", b"").decode()
-    return sent[0]["status"], kind, b"".join(message.get("body", b"") for message in sent[1:])
+    calling_loop = asyncio.events._get_running_loop()  # the panel's, when it forwards a request to the service
+    asyncio.events._set_running_loop(None)
+    try:
+        asyncio.run(respond())
+    finally:
+        asyncio.events._set_running_loop(calling_loop)
+    received = {name.decode(): value.decode() for name, value in sent[0]["headers"]}
+    return sent[0]["status"], received, b"".join(message.get("body", b"") for message in sent[1:])
 
 
 class VirtualBench(VirtualLoop):
     """A service in closed loop, as `tests.faults.bench.Bench`; `text` is its configuration."""
 
     def __init__(self, folder: Path, monkeypatch: pytest.MonkeyPatch, text: str) -> None:
-        monkeypatch.setattr(Lanes, "run", _run_in_lane)
+        run_in_lane = self._run_in_lane
+        monkeypatch.setattr(Lanes, "run", lambda *arguments: run_in_lane(*arguments))
         monkeypatch.setattr(status, "timing", lambda _: {})  # an unpaced loop has no lateness
         monkeypatch.setattr(service, "prepare", lambda configuration: prepare(configuration, paced=False))
         super().__init__(folder, monkeypatch, text.replace("FOLDER", str(folder)))
-        web = application(self.service)
-        monkeypatch.setattr(Client, "exchange", lambda _, *request, **__: answer_in_process(web, *request[:3]))
+        self._web, exchange = application(self.service), self._exchange
+        monkeypatch.setattr(Client, "exchange", lambda _, *request, **options: exchange(*request, **options))
+        self.gone = set[Thread]()
+        """Clients, by their thread, whose process was killed: each of their requests loses its connection."""
         self.client = Client(folder / "lab.sock")
         self.rows: list[np.ndarray[Any, Any]] = []
         self.begin_loop()
@@ -71,6 +102,17 @@ class VirtualBench(VirtualLoop):
             self.service._is_preparing = True
             self.start(self.service._prepare_and_start)
         self.turns.sleep(WATCH_S)
+
+    def _exchange(
+        self, method: str, resource: str, body: str | bytes | None, _: float = 0.0, cancellation: Any = None
+    ) -> tuple[int, str, bytes]:
+        """Return the service's response to a request of a client, as Client.exchange."""
+        client = current_thread()
+        is_gone = lambda: client in self.gone or (cancellation is not None and cancellation._is_cancelled)
+        code, headers, data = answer_in_process(self._web, method, resource, body, is_gone=is_gone)
+        if is_gone():
+            raise UnansweredRequest(self.client.path, OSError("cancelled"))
+        return code, headers.get("content-type", ""), data
 
     def start(self, work: Callable[[], object]) -> Thread:
         """Start a thread in virtual time."""
@@ -112,16 +154,39 @@ class VirtualBench(VirtualLoop):
         assert self.loop is not None
         return np.concatenate(self.rows)[:, self.loop.plan.columns.index(signal)]
 
+    def newest(self, signal: str) -> float:
+        """Return a signal at the newest tick."""
+        assert self.loop is not None
+        return float(self.rows[-1][-1, self.loop.plan.columns.index(signal)])
+
     def executed(self, rows: np.ndarray[Any, Any]) -> None:
         self.rows.append(rows)
 
+    async def _run_in_lane(self, lanes: Lanes, lane: Any, action: Callable[..., T], *arguments: Any) -> T:
+        """Run an action of a request in a thread in virtual time, as many at a time as in the real lanes."""
+        most_at_a_time, most_pending = lane.value
+        if lanes._pending_counts[lane] >= most_pending:
+            raise TooManyRequests("too many requests")
+        running = lanes.__dict__.setdefault("running", dict.fromkeys(Lane, 0))
+        lanes._pending_counts[lane] += 1
+        try:
+            self.turns.wait(lambda: running[lane] < most_at_a_time)
+            running[lane] += 1
+            future, context, is_gone = Future[T](), copy_context(), client_is_gone.get()
+            self.start(lambda: fulfil(future, lambda: context.run(action, *arguments)))
+            self.turns.wait(lambda: future.done() or is_gone())
+            for _ in range(LOOP_PASSES):
+                await asyncio.sleep(0)
+            self.turns.wait(future.done)
+            running[lane] -= 1
+            return future.result()
+        finally:
+            lanes._pending_counts[lane] -= 1
 
-async def _run_in_lane(lanes: Lanes, lane: Any, action: Callable[..., T], *arguments: Any) -> T:
-    """Run an action of a request in the calling thread; as many requests wait at a time as in the real lanes."""
-    if lanes._pending_counts[lane] >= lane.value[1]:
-        raise TooManyRequests("too many requests")
-    lanes._pending_counts[lane] += 1
+
+def fulfil(future: Future[T], action: Callable[[], T]) -> None:
+    """Put the result of an action, or its error, into `future`."""
     try:
-        return action(*arguments)
-    finally:
-        lanes._pending_counts[lane] -= 1
+        future.set_result(action())
+    except Exception as error:
+        future.set_exception(error)

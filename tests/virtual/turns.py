@@ -1,18 +1,29 @@
 """Virtual time: threads take turns, and no second passes by itself.
 
-A thread gives up its turn in `sleep`; the next turn is that of the thread that wakes first, after the world was
-advanced until then. The order of all work is therefore the same in every run, whatever the host does.
+A thread gives up its turn in `wait`, for a time or until a condition holds; the next turn is that of the thread that
+may go on first, after the world was advanced until then. The order of all work is therefore the same in every run,
+whatever the host does.
 """
 
 from __future__ import annotations
 
+import math
 import threading
 from collections.abc import Callable
 from typing import Any
 
 from rtloop.foundation import timing
 
-LOCK_POLL_S, EVENT_POLL_S, UNIX_S = 0.0005, 0.005, 1.8e9
+UNIX_S = 1.8e9
+POLL_S = 0.005
+"""Time after which the conditions are looked at again, if nothing happens before."""
+LONGEST_S = 10_000.0
+"""Time after which a wait that nothing ends counts as a deadlock."""
+
+
+def never() -> bool:
+    """Return False: the condition of a thread that sleeps."""
+    return False
 
 
 class EndOfTest(BaseException):
@@ -25,13 +36,14 @@ class Turns:
     def __init__(self, advance: Callable[[float], None]) -> None:
         self.now_s, self._advance = 1000.0, advance
         self._changed = threading.Condition()
-        self._wakes_s: dict[threading.Thread, float] = {threading.current_thread(): self.now_s}
+        self._waits: dict[threading.Thread, tuple[float, Callable[[], object]]] = {}
         self._turn: threading.Thread | None = threading.current_thread()
+        self._waits[threading.current_thread()] = self.now_s, never
 
     def end(self) -> None:
         """End all other threads, where they sleep."""
         with self._changed:
-            threads, self._turn = [*self._wakes_s], None
+            threads, self._turn = [*self._waits], None
             self._changed.notify_all()
         for thread in threads:
             if thread is not threading.current_thread():
@@ -39,9 +51,13 @@ class Turns:
 
     def sleep(self, seconds: float) -> None:
         """Give up the turn for a time, in which other threads have theirs."""
+        self.wait(never, seconds)
+
+    def wait(self, condition: Callable[[], object], seconds: float = math.inf) -> None:
+        """Give up the turn until a condition holds, and for `seconds` at most."""
         me = threading.current_thread()
         with self._changed:
-            self._wakes_s[me] = self.now_s + seconds
+            self._waits[me] = self.now_s + seconds, condition
             self._pass_on()
             self._await_turn(me)
 
@@ -57,22 +73,33 @@ class Turns:
                 pass
             finally:
                 with self._changed:
-                    del self._wakes_s[thread]
+                    thread.has_ended = True
+                    del self._waits[thread]
                     if self._turn is thread:
                         self._pass_on()
 
         thread = VirtualThread(self, run)
-        self._wakes_s[thread] = self.now_s
+        self._waits[thread] = self.now_s, never
         thread.start()
         return thread
 
     def _pass_on(self) -> None:
-        """Give the turn to the thread that wakes first, after the time until then."""
-        self._turn = min(self._wakes_s, key=lambda thread: self._wakes_s[thread])
-        wake_s = max(self._wakes_s[self._turn], self.now_s)
-        self._advance(wake_s - self.now_s)
-        self.now_s = wake_s
+        """Give the turn to the thread that may go on first, after the time until then."""
+        last_s = self.now_s + LONGEST_S
+        while True:
+            assert self.now_s < last_s, "each thread waits for another one"
+            wakes_s = {thread: self._wake_s(*wait) for thread, wait in self._waits.items()}
+            turn = min(wakes_s, key=lambda thread: wakes_s[thread])
+            end_s = max(min(wakes_s[turn], self.now_s + POLL_S), self.now_s)
+            self._advance(end_s - self.now_s)
+            self.now_s = end_s
+            if end_s >= wakes_s[turn]:
+                break
+        self._turn = turn
         self._changed.notify_all()
+
+    def _wake_s(self, end_s: float, condition: Callable[[], object]) -> float:
+        return self.now_s if condition() else end_s
 
     def _await_turn(self, me: threading.Thread) -> None:
         assert self._changed.wait_for(lambda: self._turn in (me, None), 60.0), "no turn: a thread waits for a real lock"
@@ -85,29 +112,32 @@ class VirtualThread(threading.Thread):
 
     def __init__(self, turns: Turns, work: Callable[[], None]) -> None:
         super().__init__(target=work, daemon=True)
-        self._turns = turns
+        self._turns, self.has_ended = turns, False
+
+    def is_alive(self) -> bool:
+        return super().is_alive() and not self.has_ended
 
     def join(self, timeout: float | None = None) -> None:
-        end_s = self._turns.now_s + (float("inf") if timeout is None else timeout)
-        while self.is_alive() and self._turns.now_s < end_s:
-            self._turns.sleep(EVENT_POLL_S)
+        self._turns.wait(lambda: not self.is_alive(), math.inf if timeout is None else timeout)
 
 
 class VirtualLock:
     """Lock for which a thread waits in virtual time."""
 
     def __init__(self, turns: Turns, lock: Any) -> None:
-        self._turns, self._lock = turns, lock
+        self._turns, self._lock, self._holds = turns, lock, 0
 
     def __enter__(self) -> None:
         while not self._lock.acquire(blocking=False):
-            self._turns.sleep(LOCK_POLL_S)
+            self._turns.wait(lambda: not self.locked())
+        self._holds += 1
 
     def __exit__(self, *_: object) -> None:
+        self._holds -= 1
         self._lock.release()
 
     def locked(self) -> bool:
-        return bool(self._lock.locked())
+        return self._holds > 0
 
 
 class VirtualEvent(threading.Event):
@@ -118,9 +148,7 @@ class VirtualEvent(threading.Event):
         self._turns = turns
 
     def wait(self, timeout: float | None = None) -> bool:
-        end_s = self._turns.now_s + (float("inf") if timeout is None else timeout)
-        while not self.is_set() and self._turns.now_s < end_s:
-            self._turns.sleep(min(EVENT_POLL_S, end_s - self._turns.now_s))
+        self._turns.wait(self.is_set, math.inf if timeout is None else timeout)
         return self.is_set()
 
 

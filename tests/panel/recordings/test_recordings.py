@@ -209,6 +209,21 @@ def test_processes_beyond_the_limit_are_refused():
     assert (results.count(TooManyRequests), results.count(ProcessFailed)) == (3, 2)
 
 
+def test_a_process_whose_request_is_cancelled_is_killed():
+    """A process that is not killed would be waited for without end."""
+
+    async def run_and_cancel() -> None:
+        request = asyncio.create_task(ProcessRunner().run("http.server", "0", "--bind", "127.0.0.1"))
+        await asyncio.sleep(0.2)
+        request.cancel()
+        with pytest.raises(asyncio.CancelledError):
+            await request
+
+    asyncio.run(run_and_cancel())
+    with pytest.raises(ValueError, match="null byte"):
+        asyncio.run(ProcessRunner().run("rtloop", "\0"))
+
+
 def test_a_command_that_fails_is_named_as_somebody_types_it():
     async def failure_text(runner: ProcessRunner, module: str, *arguments: str) -> str:
         """Return the message of the error with which a command fails."""
