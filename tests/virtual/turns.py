@@ -17,6 +17,8 @@ from rtloop.foundation import timing
 UNIX_S = 1.8e9
 POLL_S = 0.005
 """Time after which the conditions are looked at again, if nothing happens before."""
+REAL_LIMIT_S = 600.0
+"""Real time in which a turn must end: a kernel is perhaps compiled in it, on a busy host."""
 LONGEST_S = 10_000.0
 """Time after which a wait that nothing ends counts as a deadlock."""
 
@@ -102,7 +104,8 @@ class Turns:
         return self.now_s if condition() else end_s
 
     def _await_turn(self, me: threading.Thread) -> None:
-        assert self._changed.wait_for(lambda: self._turn in (me, None), 60.0), "no turn: a thread waits for a real lock"
+        has_turn = self._changed.wait_for(lambda: self._turn in (me, None), REAL_LIMIT_S)
+        assert has_turn, "no turn: a thread waits for a real lock"
         if self._turn is None:
             raise EndOfTest
 

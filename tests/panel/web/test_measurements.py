@@ -16,6 +16,8 @@ from tests.virtual.bench import VirtualBench
 from tests.virtual.panel import VirtualPage
 
 LEARN = {"axis": "x", "samples": SCAN_UM.tolist(), "cycles": 3, "keep": False}
+END_S = 1.0
+"""Virtual time in which a measurement begins, and ends after its page has disconnected; each would last for seconds."""
 RETUNE = {"axis": "x", "within_percent": 0.0}
 
 
@@ -130,8 +132,10 @@ def test_nothing_changes_before_consent_and_then_the_taps_are_the_proposed_ones(
 )
 def test_a_measurement_ends_with_its_page(page: VirtualPage, bench: VirtualBench, path: str, body: dict[str, Any]):
     before = taps(bench)
+    begin_s = bench.turns.now_s
     has_moved = lambda: bench.newest("x_reference_um") != SETPOINT_UM
     page.request("POST", f"/api/{path}?as=ada", body, is_gone=has_moved)
+    assert bench.turns.now_s - begin_s < END_S
     assert bench.status()["measuring"] is None
     assert reference_um(bench) == SETPOINT_UM
     tick = bench.ticks
