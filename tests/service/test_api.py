@@ -2,23 +2,25 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
+import os
+import socket
+import stat
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pytest
-from click.testing import CliRunner
 from prometheus_client.parser import text_string_to_metric_families
 from websockets.sync.client import unix_connect
 
 import rtloop
-from rtloop.cli import main
+from rtloop.service.api.connections import BACKLOG, MAX_CONNECTIONS
 from tests.command_line import run
 from tests.faults.account import account, runs_in
 from tests.faults.bench import Bench
 from tests.faults.evidence import wait_for
-from tests.service.http import GOOD_CONTROLLER, answer
+from tests.service.http import answer
 
 
 def events(bench: Bench, kind: str) -> list[dict[str, Any]]:
@@ -56,80 +58,6 @@ def test_states_and_refusals(bench: Bench):
     wait_for(lambda: bench.output_record().last_v == 0.0, "a safe output")
 
 
-def test_a_trip_latches_until_the_reset(running: Bench):
-    tick = running.client.post("/tune", {"axis": "x", "section": "interlocks", "values": {"position_um": 5.0}})["tick"]
-    assert await_event(running, "load_law", tick)["axis"] == "x"
-    running.await_state("tripped", "position")
-    for path, body in (("/start", {}), ("/arm", {}), ("/mode", {"mode": "feedforward"}), ("/response", {"axis": "x"})):
-        code, response = answer(running, "POST", path, body)
-        assert (code, "`rtloop ctl reset`" in response["error"]) == (409, True), response
-    for path, body in (("/stop", {}), ("/mode", {"mode": "off"}), ("/stop", {})):
-        code, response = answer(running, "POST", path, body)
-        assert code == 200, response
-        assert tick < response["tick"] <= running.ticks
-    assert answer(running, "GET", "/status")[1]["state"] == "tripped"
-    running.client.post("/tune", {"axis": "x", "section": "interlocks", "values": {"position_um": 60.0}})
-    tick = running.client.post("/reset")["tick"]
-    await_event(running, "reset_trip", tick)
-    assert running.client.get("/status")["state"] in ("stopped", "ramping")
-    assert answer(running, "POST", "/start")[0] == 409
-    running.client.post("/arm")
-
-
-def test_modes_and_references(running: Bench):
-    for reference in ({"kind": "hold", "value": 12.0}, {"kind": "triangle", "amplitude": 3.0, "frequency_hz": 2.0},
-                      {"kind": "steps", "levels": [1.0, 2.0], "dwell_s": 0.1}):  # fmt: skip
-        tick = running.client.post("/reference", {"axis": "x", "reference": reference})["tick"]
-        await_event(running, "set_reference", tick)
-    running.client.post("/setpoint", {"axis": "x", "value": 11.0})
-    assert running.client.get("/status")["axes"]["x"]["reference_um"] == 11.0
-    running.client.post("/mode", {"mode": "feedforward"})
-    assert running.client.get("/status")["mode"] == "feedforward"
-
-
-def test_a_healthy_loop_is_not_reset(running: Bench):
-    code, response = answer(running, "POST", "/reset")
-    assert (code, "there is no trip; the state of the service is running" in response["error"]) == (409, True)
-    assert running.client.get("/status")["mode"] == "closed_loop"
-
-
-def test_into_raw_mode_and_out_of_it_what_is_in_force_is_held(running: Bench):
-    """A change of mode does not reuse 20 µm as 20 V, nor 6 V as 6 µm; the recording shows the signals."""
-    running.client.post("/setpoint", {"axis": "x", "value": 20.0})
-    settled = running.ticks + 4000
-    wait_for(lambda: running.ticks > settled, "20 µm")
-    raw_tick = running.client.post("/mode", {"mode": "raw"})["tick"]
-    for volts, expected_code in ((10.5, 422), (-10.5, 422), (6.0, 200)):
-        code, response = answer(running, "POST", "/setpoint", {"axis": "x", "value": volts})
-        assert code == expected_code
-        assert code == 200 or "references in mode raw are in V" in response["error"]
-    settled = running.ticks + 4000
-    wait_for(lambda: running.ticks > settled, "6 V")
-    closed_tick = running.client.post("/mode", {"mode": "closed_loop"})["tick"]
-    wait_for(lambda: running.ticks > closed_tick + 4000, "the loop closed")
-    running.client.post("/stop")
-    await_event(running, "set_mode", closed_tick)
-    recording = rtloop.load(next((running.folder / "recordings").glob("*.mcap.part")))
-    first = int(recording["tick"][0])
-    reference, position, drive = recording.read("x_reference_um", "x_position_um", "x_drive_v")
-    raw, closed = raw_tick - first, closed_tick - first
-    assert reference[raw - 1] == 20.0
-    assert reference[raw] == drive[raw - 1]
-    assert np.ptp(drive[raw - 1 : raw + 3]) < 1e-9
-    assert reference[closed] == position[closed - 1]
-    held = position[closed + 2000 : closed + 4000]
-    assert abs(held.mean() - reference[closed]) < 0.1
-    assert reference[closed] > 15.0  # µm, the position that 6 V have reached
-
-
-def test_a_waveform_plays_once(running: Bench):
-    samples = (15.0 + 5.0 * np.sin(np.linspace(0.0, 2 * np.pi, 500))).tolist()
-    tick = running.client.post("/waveform", {"axis": "x", "samples": samples, "hold_ticks": 2})["tick"]
-    assert await_event(running, "set_reference", tick)["what"]["values"][2:5] == [500.0, 2.0, 0.0]
-    wait_for(lambda: running.ticks > tick + 1100, "the end of the waveform")
-    assert running.client.get("/status")["axes"]["x"]["reference_um"] == samples[-1]
-
-
 def test_setpoints_are_streamed(running: Bench):
     with unix_connect(str(running.client.path), "ws://localhost/setpoints") as stream:
         ticks = []
@@ -145,54 +73,12 @@ def test_setpoints_are_streamed(running: Bench):
     assert "Traceback" not in running.log()
 
 
-@pytest.mark.parametrize(("typed", "code"), [("-5", 0), ("-.5e1", 0), ("-50", 1), ("--nonsense", 2)])
-def test_a_negative_number_is_no_option(running: Bench, typed: str, code: int):
-    result = CliRunner().invoke(main, ["ctl", "--socket", str(running.client.path), "setpoint", "x", typed])
-    assert result.exit_code == code, result.output
-    if code == 0:
-        assert running.client.get("/status")["axes"]["x"]["reference_um"] == -5.0
-
-
 def test_watch_tells_the_newest_signals(bench: Bench):
     lines = iter(bench.client.watch())
     first, second = next(lines), next(lines)
     assert first["state"] == "stopped"
     assert second["tick"] > first["tick"]
     assert set(first["axes"]["x"]) >= {"position_um", "drive_v"}
-
-
-def test_tune_and_swap(running: Bench):
-    for path, body in (
-        ("/tune", {"axis": "x", "section": "controller", "values": {"gain": 0.012}}),
-        ("/tune", {"axis": "x", "section": "limits", "values": {"command_um": 40.0}}),
-        ("/controller", {"axis": "x", "controller": GOOD_CONTROLLER}),
-    ):
-        tick = running.client.post(path, body)["tick"]
-        assert await_event(running, "load_law", tick)["axis"] == "x"
-    assert answer(running, "POST", "/setpoint", {"axis": "x", "value": 41.0})[0] == 422
-    assert running.client.get("/status")["state"] == "running"
-    running.client.post("/reload")  # load the file again
-    assert answer(running, "POST", "/setpoint", {"axis": "x", "value": 20.0})[0] == 200
-
-
-def test_reload(running: Bench):
-    valid_text = running.config.read_text()
-    try:
-        assert running.client.post("/reload") == {"changed": []}
-        running.config.write_text(valid_text.replace("offset = 20.0", "offset = 18.0\nphase_deg = 90.0"))
-        assert running.client.post("/reload") == {"changed": ["axis.x"]}
-        wait_for(lambda: [e for e in events(running, "set_reference") if e["what"]["values"][3] == 18.0], "a reference")
-        for text, code, word in (
-            (valid_text.replace("rate_hz = 4000", "rate_hz = 5000"), 409, "restart"),
-            (valid_text.replace("gain = 0.016", "gain = 0.16"), 422, "unstable"),
-            (valid_text + "[nonsense", 422, "TOML"),
-        ):
-            running.config.write_text(text)
-            assert answer(running, "POST", "/reload")[0] == code
-            assert word in answer(running, "POST", "/reload")[1]["error"]
-    finally:
-        running.config.write_text(valid_text)
-    assert running.client.post("/reload") == {"changed": ["axis.x"]}
 
 
 def test_metrics_and_description(bench: Bench):
@@ -218,6 +104,34 @@ def test_watch_prints_as_many_lines_as_asked(running: Bench):
     assert [line["state"] for line in lines] == ["running"] * 3
     ticks = [line["tick"] for line in lines]
     assert ticks == sorted(set(ticks))
+
+
+def test_more_silent_clients_than_there_are_connections(bench: Bench):
+    """No silent client sends a complete request, and half of them send nothing; the service answers another client."""
+    with contextlib.ExitStack() as stack:
+        for number in range(3 * MAX_CONNECTIONS):
+            client = stack.enter_context(socket.socket(socket.AF_UNIX, socket.SOCK_STREAM))
+            client.connect(str(bench.client.path))
+            if number % 2:
+                with contextlib.suppress(BrokenPipeError, ConnectionResetError):
+                    client.send(b"POST /mode HTTP/1.1\r\nContent-Length: 100\r\n\r\n{")
+        open_files = len(os.listdir(f"/proc/{bench.pid('service')}/fd"))
+        assert open_files < MAX_CONNECTIONS + 3 * BACKLOG  # one backlog is being accepted, another being closed
+        assert bench.client.get("/status")["state"] == "stopped"
+        bench.client.post("/stop")
+
+
+def test_the_socket_is_for_owner_and_group(bench: Bench):
+    mode = os.stat(bench.client.path).st_mode
+    assert stat.S_ISSOCK(mode)
+    assert stat.S_IMODE(mode) == 0o660
+
+
+def test_a_client_that_says_nothing_hinders_nobody(bench: Bench):
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as silent:
+        silent.connect(str(bench.client.path))
+        silent.send(b"POST /mode HTTP/1.1\r\nContent-Length: 100\r\n\r\n{")
+        assert bench.client.get("/status")["state"] == "stopped"
 
 
 def test_the_end_is_whole_and_replays(bench: Bench):

@@ -21,6 +21,7 @@ import pytest
 from rtloop.client import Client
 from rtloop.client.control import UnansweredRequest
 from rtloop.configuration.prepare import prepare
+from rtloop.recording.file.topics.events import event_from_message
 from rtloop.service import service, status
 from rtloop.service.api.application import application
 from rtloop.service.api.lanes import Lane, Lanes, TooManyRequests
@@ -81,6 +82,8 @@ def answer_in_process(
 class VirtualBench(VirtualLoop):
     """A service in closed loop, as `tests.faults.bench.Bench`; `text` is its configuration."""
 
+    poll_s = 0.005
+
     def __init__(self, folder: Path, monkeypatch: pytest.MonkeyPatch, text: str) -> None:
         run_in_lane = self._run_in_lane
         monkeypatch.setattr(Lanes, "run", lambda *arguments: run_in_lane(*arguments))
@@ -92,6 +95,7 @@ class VirtualBench(VirtualLoop):
         self.gone = set[Thread]()
         """Clients, by their thread, whose process was killed: each of their requests loses its connection."""
         self.client = Client(folder / "lab.sock")
+        self._messages: list[Any] = []
         self.rows: list[np.ndarray[Any, Any]] = []
         self.begin_loop()
 
@@ -154,6 +158,20 @@ class VirtualBench(VirtualLoop):
         assert self.loop is not None
         return np.concatenate(self.rows)[:, self.loop.plan.columns.index(signal)]
 
+    def events(self, kind: str) -> list[dict[str, Any]]:
+        """Return the loop's events of a kind, as they would be recorded."""
+        axes = [axis.name for axis in self.service.configuration.axes]
+        events = [event_from_message(message, axes, 0) for message in self._messages]
+        return [dict(event) for event in events if event["kind"] == kind]
+
+    def event(self, kind: str, tick: int) -> dict[str, Any]:
+        """Return the event of an operator's change at `tick`, as soon as the loop has executed it."""
+        (event,) = self.wait_for(
+            lambda: [event for event in self.events(kind) if event["tick"] == tick], f"{kind} at {tick}"
+        )
+        assert event["who"] == "operator"
+        return event
+
     def newest(self, signal: str) -> float:
         """Return a signal at the newest tick."""
         assert self.loop is not None
@@ -161,6 +179,8 @@ class VirtualBench(VirtualLoop):
 
     def executed(self, rows: np.ndarray[Any, Any]) -> None:
         self.rows.append(rows)
+        if self.loop is not None:
+            self._messages.extend(self.loop.drain("events"))
 
     async def _run_in_lane(self, lanes: Lanes, lane: Any, action: Callable[..., T], *arguments: Any) -> T:
         """Run an action of a request in a thread in virtual time, as many at a time as in the real lanes."""

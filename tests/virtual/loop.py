@@ -51,6 +51,8 @@ class VirtualLoop:
     While `hangs`, the loop executes no tick, as if its driver did not return.
     """
 
+    poll_s = 0.001
+
     def __init__(self, folder: Path, monkeypatch: pytest.MonkeyPatch, text: str) -> None:
         self.folder, self.config = folder, folder / "lab.toml"
         self.config.write_text(text)
@@ -77,12 +79,12 @@ class VirtualLoop:
         """End all threads."""
         self.turns.end()
 
-    def wait_for(self, condition: Callable[[], T], what: str = "change", limit_s: float = 100.0) -> T:
+    def wait_for(self, condition: Callable[[], T], what: str = "change", limit_s: float = 20.0) -> T:
         """Wait until the condition holds and return its value; fails after `limit_s` of virtual time."""
         end_s = self.turns.now_s + limit_s
         while not (value := condition()):
             assert self.turns.now_s < end_s, f"no {what} within {limit_s:g} s; {self.service.state}, {self.recovery}"
-            self.turns.sleep(0.001)
+            self.turns.sleep(self.poll_s)
         return value
 
     @property
