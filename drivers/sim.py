@@ -12,13 +12,12 @@ import numpy as np
 from rtloop.drivers.base import Channel, Driver, Facts, Pointers, Wiring
 from rtloop.foundation.native.compiled import cfunc
 from rtloop.foundation.native.pointers import SIGNATURE, address_pointer, carray
-from rtloop.hil.options import RigOptions
+from rtloop.hil.options import ConverterOptions, RigOptions
 from rtloop.hil.rig import COEFFICIENTS, STATE, advance, build_rig, sample
 
 _COUNTS, _ADDRESSES = ("count", "looped"), ("coefficients", "state", "looped_v")
 CONTEXT = np.dtype([*((name, np.uint32) for name in _COUNTS), *((name, np.int64) for name in _ADDRESSES)], align=True)
 OBSERVED_PER_AXIS = 2
-LOOPBACK_RANGE_V = 10.0
 
 
 @cfunc(SIGNATURE)
@@ -115,14 +114,14 @@ class SimDriver(Driver):
         axes = self._axes_by_plant()
         plants = [self._rig_options.plants.get(axis, self._rig_options.plant) for axis in axes]
         observed = tuple(f"{axis}_{name}" for axis in axes for name in ("true_position_um", "hysteresis_um"))
-        inputs = self._channels("adc", [plant.adc.range_v for plant in plants])
-        outputs = self._channels("dac", [plant.dac.range_v for plant in plants])
+        inputs = self._channels("adc", [plant.adc for plant in plants])
+        outputs = self._channels("dac", [plant.dac for plant in plants])
         return Facts(inputs, outputs, observed, exclusive=False, real=False)
 
-    def _channels(self, prefix: str, ranges_v: list[float]) -> tuple[Channel, ...]:
-        """Return the channels `prefix`0, 1, …: one per plant with ± its range in V, then those for loopback, ±10 V."""
-        all_ranges_v = ranges_v + [LOOPBACK_RANGE_V] * self._loopback_v.size
-        return tuple(Channel(f"{prefix}{i}", -range_v, range_v) for i, range_v in enumerate(all_ranges_v))
+    def _channels(self, prefix: str, converters: list[ConverterOptions]) -> tuple[Channel, ...]:
+        """Return the channels `prefix`0, 1, …: one for each plant's converter, then those for loopback, ±10 V."""
+        converters += [ConverterOptions()] * self._loopback_v.size
+        return tuple(Channel(f"{prefix}{i}", each.lowest_v, each.range_v) for i, each in enumerate(converters))
 
     def open(self) -> Pointers:
         """Return pointers to the compiled rig, which continues from its present state."""

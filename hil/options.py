@@ -178,12 +178,19 @@ class SensorOptions(Options):
 
 
 class ConverterOptions(Options):
-    """An ADC or a DAC with ±`range_v`; 0 bits is an ideal converter, which only clips to its range."""
+    """An ADC or a DAC from `min_v` to `range_v`; 0 bits is an ideal converter, which only clips to its range."""
 
     range_v: float = Field(default=10.0, gt=0)
-    """Largest magnitude of the voltage; the converter clips beyond it."""
+    """Highest voltage; the converter clips beyond it."""
+    min_v: float | None = Field(default=None, le=0)
+    """Lowest voltage, below which the converter clips, by default minus `range_v`; 0 for a range of one sign."""
     bits: int = Field(default=16, ge=0, le=32)
     """Resolution of the converter; with 0 it has no steps."""
+
+    @property
+    def lowest_v(self) -> float:
+        """Lowest voltage: `min_v`, or −`range_v` where it is not set."""
+        return -self.range_v if self.min_v is None else self.min_v
 
 
 class DisturbanceOptions(Options):

@@ -138,7 +138,7 @@ def _axis_coefficients(plant: PlantOptions, period_s: float) -> dict[str, object
     if plant.hysteresis.bouc_wen is not None:
         fields |= {f"bw_{name}": value for name, value in plant.hysteresis.bouc_wen}
     for name, converter in (("adc", plant.adc), ("dac", plant.dac)):
-        span = converters.lsb_and_range(converter.range_v, converter.bits)
+        span = converters.lsb_and_range(converter.lowest_v, converter.range_v, converter.bits)
         fields |= dict(zip((f"{name}_lsb_v", f"{name}_lowest_v", f"{name}_highest_v"), span, strict=True))
     fields |= creep.discretise(plant.creep.gains, plant.creep.time_constants_s, period_s)
     with _prefix_errors("dynamics"):

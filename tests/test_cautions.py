@@ -263,3 +263,45 @@ def test_a_run_that_ends_before_its_first_step_says_so(duration_s: float | None,
         "step. Use --duration with at least 1"
     )
     assert lines == [expected] * is_named
+
+
+STEPS = 'kind = "steps"\nlevels = [20.0, -20.0]\ndwell_s = 0.05\n'
+TEN_STEPS = f"{STEPS}repeat = false\n".replace("[20.0, -20.0]", str([20.0, -20.0] * 5))
+SINE = 'kind = "sine"\namplitude = 15.0\nfrequency_hz = 20.0\n'
+OSCILLATION, TRACKING = ("swing_ticks", "oscillation"), ("tracking_error_um", "tracking")
+
+
+@pytest.mark.parametrize(
+    ("reference", "keys", "trip"),
+    [
+        (STEPS, {"swing_ticks": 600}, OSCILLATION),
+        (STEPS, {"swing_ticks": 400}, None),
+        (STEPS.replace("20.0", "1.0"), {"swing_ticks": 600}, None),
+        (TEN_STEPS, {"swing_ticks": 600}, OSCILLATION),
+        (TEN_STEPS.replace(", 20.0, -20.0]", "]"), {"swing_ticks": 600}, None),
+        (SINE, {"swing_ticks": 260}, OSCILLATION),
+        (SINE.replace("sine", "triangle"), {"swing_ticks": 260}, OSCILLATION),
+        (SINE, {"swing_ticks": 240}, None),
+        (SINE, {"tracking_error_um": 2.0, "tracking_ticks": 60}, TRACKING),
+        (SINE, {"tracking_error_um": 2.0, "tracking_ticks": 260}, None),
+        (STEPS, {"tracking_error_um": 2.0, "tracking_ticks": 40}, TRACKING),
+        (STEPS, {"tracking_error_um": 2.0, "tracking_ticks": 400}, TRACKING),
+        (STEPS, {"tracking_error_um": 2.0, "tracking_ticks": 499}, None),
+        ('kind = "hold"\nvalue = 10.0\n', {"tracking_error_um": 2.0, "tracking_ticks": 300}, TRACKING),
+        ('kind = "hold"\nvalue = 10.0\n', {"tracking_error_um": 2.0, "tracking_ticks": 400}, None),
+    ],
+)
+def test_a_trip_that_is_certain_is_named_before_the_run(
+    tmp_path: Path, reference: str, keys: dict[str, float], trip: tuple[str, str] | None
+) -> None:
+    """The run trips where, and only where, there is a warning."""
+    interlocks = {"oscillation_um": 4.0, "oscillation_swings": 8, "tracking_error_um": 60.0, "tracking_ticks": 500}
+    lines = "".join(f"{key} = {value}\n" for key, value in {**interlocks, **keys}.items())
+    config = tmp_path / "stage.toml"
+    config.write_text(TEXT.partition("[axis.interlocks]")[0] + f"{INTERLOCKS}\n{lines}[axis.reference]\n{reference}")
+    result = run("run", config, "--unpaced", "--duration", 0.6, "--out", tmp_path / "out")
+    warnings = " ".join(result.stderr.split()).split("warning: ")[1:]
+    assert ("the loop would trip" in " ".join(warnings)) == ("trip  " in result.stdout) == (trip is not None)
+    if trip is not None:
+        assert f"interlocks.{trip[0]} = " in warnings[0]
+        assert f" {trip[1]};" in result.stdout

@@ -26,6 +26,15 @@ def test_the_papers_configuration_is_good():
     assert (prepared.plan.mode, prepared.plan.axes) == (Mode.CLOSED_LOOP, ("x",))
 
 
+@pytest.mark.parametrize("keys", ["ki_per_s = 100.0", ""])
+def test_a_controller_without_its_kind_is_told_the_kinds(keys):
+    *_, fault = faults((CONTROLLER, f"[axis.controller]\n{keys}\n"))
+    assert fault.startswith(
+        "axis.x.controller: kind: missing, which means 'transfer'; allowed: coupled, integral_resonant, pid, "
+        "positive_position, repetitive, transfer, an installed law"
+    )
+
+
 @pytest.mark.parametrize("name", ["absent.toml", "."])
 def test_a_file_that_cannot_be_read(tmp_path, name):
     with pytest.raises(InputFileError, match=re.escape(str(tmp_path / name)) + ": (No such file|Is a directory)") as e:
@@ -62,7 +71,7 @@ ONE_FAULT = [
     (("[recording]", "[recrding]"), "recrding: unknown key; did you mean recording\\?"),
     # driver
     (('kind = "sim"', 'kind = "comedy"'), r"driver.kind: 'comedy' is not a known driver; allowed: .*\bsim\b.*"),
-    (('kind = "sim"', ""), "driver.kind: missing; needs the name of a driver"),
+    (('kind = "sim"', ""), "driver.kind: missing; allowed: can, comedi, serial, shm, sim, udp"),
     (("latency_ticks = 0 ", "latency_ticks = 99 "), "driver.latency_ticks: 99: must be less than .* 16"),
     (('input = "adc0"', 'input = "adc7"'), "driver.channels.x: input 'adc7' with output 'dac0'; .*"),
     (("[driver.channels.x]", "[driver.channels.x]\nscale = 1"), "driver.channels.x.scale: unknown key"),
@@ -86,7 +95,10 @@ ONE_FAULT = [
     # reference
     (("dwell_s = 0.2", "dwell_s = 1e-9"), "axis.x.reference.dwell_s: 1e-09 s; .* at least one period of 0.0001 s"),
     (('kind = "steps"', 'kind = "stairs"'), "axis.x.reference.kind: 'stairs'; allowed: 'hold', 'steps', .*"),
-    (('kind = "steps"', ""), "axis.x.reference.kind: missing; this key is required"),
+    (
+        ('kind = "steps"', ""),
+        "axis.x.reference.kind: missing; allowed: 'hold', 'steps', 'table', 'sine', 'triangle', 'chirp', 'input'",
+    ),
     ((REFERENCE, 'kind = "table"\nfile = "absent.csv"\n\n'), "axis.x.reference.file: .*absent.csv: No such file .*"),
     ((REFERENCE, 'kind = "sine"\namplitude = 1.0\nfrequency_hz = 9999.0\n\n'),
      "axis.x.reference.frequency_hz: 9999 Hz; allowed: below half of the loop's rate, 5000 Hz"),

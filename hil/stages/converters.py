@@ -1,9 +1,9 @@
-"""ADC and DAC: n bits over ±range, and the whole periods that a written value takes to arrive.
+"""ADC and DAC: n bits from `min_v` to `range_v`, and the whole periods that a written value takes to arrive.
 
-    code = rint(V / LSB), half to even, −2^(n−1) <= code <= 2^(n−1) − 1,      LSB = 2·range / 2^n
+    V = LSB · rint(V / LSB), half to even, min <= V <= range − LSB,      LSB = (range − min) / 2^n
 
-The highest code is one LSB below the range, as in a two's complement converter. 0 bits is an ideal converter: no
-codes, but clipped to the range all the same.
+The highest value is one LSB below the range, as in a two's complement converter. 0 bits is an ideal converter: no
+steps, but clipped to the range all the same.
 """
 
 from __future__ import annotations
@@ -28,12 +28,12 @@ COEFFICIENTS = [
 STATE = [("dac_v", "f8"), ("queue_v", "f8", (MAX_LATENCY,)), ("queue_head", "i8")]
 
 
-def lsb_and_range(range_v: float, bits: int) -> tuple[float, float, float]:
+def lsb_and_range(min_v: float, range_v: float, bits: int) -> tuple[float, float, float]:
     """Return the LSB (0 for an ideal converter, `bits` 0), the lowest and the highest value [V] of a converter."""
     if bits == 0:
-        return 0.0, -range_v, range_v
-    lsb_v = 2.0 * range_v / 2**bits
-    return lsb_v, -range_v, (2 ** (bits - 1) - 1) * lsb_v
+        return 0.0, min_v, range_v
+    lsb_v = (range_v - min_v) / 2**bits
+    return lsb_v, min_v, range_v - lsb_v
 
 
 @jit

@@ -196,7 +196,7 @@ def _draw_histogram(figure: Any, curves: FigureValues, ink: Palette) -> None:
     Values beyond the limit have another colour, and a mark each if they are at most MARKED_RIGS.
     """
     panel, values = figure.subplots(), curves.values[np.isfinite(curves.values)]
-    values = values[values <= _axis_end(curves)]
+    values = values[values <= _axis_end(values, curves)]
     beyond = values[values > curves.limit]
     if values.size:
         drawn = np.append(values, _finite(curves.limit, curves.nominal))
@@ -220,12 +220,12 @@ def _draw_histogram(figure: Any, curves: FigureValues, ink: Palette) -> None:
     _add_legend(figure, ink)
 
 
-def _axis_end(curves: FigureValues) -> float:
-    """Return the largest finite value, or the end of an axis that leaves out outliers and shows limit and nominal rig.
+def _axis_end(values: Real, curves: FigureValues) -> float:
+    """Return the largest of the finite `values` (n,), or the end of an axis that leaves out outliers and shows limit
+    and nominal rig.
 
     At most 5 % of the values are outliers: they lie OUTLIER_SPANS beyond the 95 % quantile.
     """
-    values = curves.values[np.isfinite(curves.values)]
     if not values.size:
         return np.inf
     low, high = np.quantile(values, (0.05, 0.95), method="inverted_cdf")
@@ -238,9 +238,9 @@ def histogram_title(curves: FigureValues) -> str:
 
     Rigs beyond the end of the axis are counted too.
     """
-    finite, infinite = (int(np.count_nonzero(test(curves.values))) for test in (np.isfinite, np.isposinf))
-    parts = [count_text(finite, "rig")]
-    if (outliers := curves.values[np.isfinite(curves.values) & (curves.values > _axis_end(curves))]).size:
+    values, infinite = curves.values[np.isfinite(curves.values)], int(np.count_nonzero(np.isposinf(curves.values)))
+    parts = [count_text(values.size, "rig")]
+    if (outliers := values[values > _axis_end(values, curves)]).size:
         verb = "lies" if outliers.size == 1 else "lie"
         parts.append(f"{count_text(outliers.size, 'rig')} {verb} beyond this axis, up to {outliers.max():.4g}")
     if infinite:

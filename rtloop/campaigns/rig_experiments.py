@@ -13,7 +13,7 @@ from pydantic import Field, model_validator
 
 from rtloop.configuration.reference_options import HoldOptions, ReferenceOptions, StepsOptions, WaveOptions
 from rtloop.foundation.arrays import Real
-from rtloop.foundation.options import Numbers, Options
+from rtloop.foundation.options import AnyKind, Numbers, Options
 from rtloop.recording.views.steps import measure_step
 
 POINTS = 8
@@ -284,4 +284,4 @@ class DisturbanceExperiment(ExperimentOptions):
         return float(np.max(error_um)), float(np.sqrt(np.mean(error_um**2))), settling_ms
 
 
-Experiment = Annotated[StepsExperiment | WaveExperiment | DisturbanceExperiment, Field(discriminator="kind")]
+Experiment = Annotated[StepsExperiment | WaveExperiment | DisturbanceExperiment, Field(discriminator="kind"), AnyKind]

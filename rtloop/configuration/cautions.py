@@ -14,11 +14,12 @@ import numpy as np
 
 from rtloop.analysis.step_response import SETTLING_BAND
 from rtloop.configuration.axis import AxisOptions
+from rtloop.configuration.certain_trips import certain_trips
 from rtloop.configuration.checks import AxisCheck
 from rtloop.configuration.file import Configuration
 from rtloop.configuration.prepare import Prepared, build_driver
 from rtloop.configuration.reference_options import StepsOptions
-from rtloop.configuration.references import extent, references_in_plan, volts
+from rtloop.configuration.references import extent, played_samples, references_in_plan, volts
 from rtloop.configuration.rig import driver_delay_ticks
 from rtloop.configuration.simulated import (
     RigComparison,
@@ -29,7 +30,6 @@ from rtloop.configuration.simulated import (
 )
 from rtloop.engine.plan import Plan
 from rtloop.hysteresis.reach import can_hold, reachable_range
-from rtloop.kernel.reference import Generator
 from rtloop.signals import Mode
 
 HIGHEST_MEASURED_HZ = 100_000
@@ -54,7 +54,11 @@ def option_cautions(prepared: Prepared) -> list[str]:
     warnings += build_driver(configuration).cautions()
     warnings += _first_step(prepared)
     for axis, check in zip(configuration.axes, prepared.checks, strict=True):
-        lines = (*reference_cautions(configuration, prepared.plan, axis), *_reach(configuration, axis))
+        lines = (
+            *reference_cautions(configuration, prepared.plan, axis),
+            *_certain_trips(prepared, axis, check),
+            *_reach(configuration, axis),
+        )
         warnings += [f"axis.{axis.name}.{line}" for line in lines]
         comparison = compare_with_rig(configuration, axis, check)
         warnings += [*_delay(configuration, axis, check), *comparison.contradictions]
@@ -167,9 +171,8 @@ def reference_cautions(configuration: Configuration, plan: Plan, axis: AxisOptio
     """
     limits = axis.limits
     for label, mode, values in references_in_plan(plan, plan.axes.index(axis.name)):
-        first, count = (int(values[1]), int(values[2])) if values[0] == Generator.TABLE else (0, 0)
-        command_um = plan.table[first + count : first + 2 * count] if values[0] == Generator.TABLE and values[5] else []
-        lowest, highest = extent(values, plan.table[first : first + count])
+        samples, command_um = played_samples(plan, values)
+        lowest, highest = extent(values, samples)
         if mode == Mode.RAW and not limits.lowest_v <= lowest <= highest <= limits.drive_v:
             allowed = f"{limits.lowest_v:g} V … {limits.drive_v:g} V"
             yield f"{label}: {volts(lowest, highest)}, beyond the drive's limits, {allowed}"
@@ -178,6 +181,16 @@ def reference_cautions(configuration: Configuration, plan: Plan, axis: AxisOptio
             yield from (f"{label}: {line}" for line in _unreachable(axis, lowest, highest, ends_um))
         if (largest_um := float(np.max(np.abs(command_um), initial=0.0))) > limits.command_um:
             yield f"{label}: adds {largest_um:g} µm to the command, beyond limits.command_um = {limits.command_um:g}"
+
+
+def _certain_trips(prepared: Prepared, axis: AxisOptions, check: AxisCheck) -> Iterator[str]:
+    """Yield a line for each interlock that a reference of the axis in closed loop, its own or the schedule's, trips."""
+    plan, rate_hz = prepared.plan, prepared.configuration.loop.rate_hz
+    for label, mode, values in references_in_plan(plan, plan.axes.index(axis.name)):
+        if mode == Mode.CLOSED_LOOP:
+            samples, _ = played_samples(plan, values)
+            trips = certain_trips(axis, check, values, samples, rate_hz, is_first=label == "reference")
+            yield from (f"{label}: {line}" for line in trips)
 
 
 def _unreachable(axis: AxisOptions, lowest_um: float, highest_um: float, ends_um: tuple[float, float]) -> Iterator[str]:

@@ -22,7 +22,7 @@ from rtloop.configuration.service import ServiceOptions
 from rtloop.configuration.text_files import parse_toml, read_text
 from rtloop.drivers.base import Wiring
 from rtloop.drivers.errors import DriverError
-from rtloop.drivers.registry import driver_class
+from rtloop.drivers.registry import driver_class, kinds
 from rtloop.errors import ConfigError
 from rtloop.foundation.options import LARGEST_INTEGER, Options
 from rtloop.kernel.layout import MAX_LAWS
@@ -255,7 +255,7 @@ def _driver(raw: object, folder: Path, faults: list[str]) -> tuple[str, Options 
     if channels is None and isinstance(channel_tables, dict):
         channels = channel_tables  # their names are known all the same
     if not isinstance(kind, str):
-        faults.append(f"driver.kind: {'missing' if kind is None else repr(kind)}; needs the name of a driver")
+        faults.append(f"driver.kind: {'missing' if kind is None else repr(kind)}; allowed: {', '.join(kinds())}")
         return "", None, channels or {}
     try:
         model = driver_class(kind).options_model
@@ -336,10 +336,9 @@ def _fault(detail: Any, prefix: str, raw: object, known_keys: set[str], missing_
             return f"{key}: unknown key in this table; {path[-1]} belongs in another table"
         suggestions = suggestions or get_close_matches(path[-1], known_keys, n=1)
         return f"{key}: unknown key" + (f"; did you mean {suggestions[0]}?" if suggestions else "")
-    if detail["type"] == "union_tag_not_found":
-        return f"{key}.kind: missing; this key is required"
     if detail["type"] == "union_tag_invalid":
-        return f"{key}.kind: {detail['ctx']['tag']!r}; allowed: {detail['ctx']['expected_tags']}"
+        tag = detail["ctx"]["tag"]
+        return f"{key}.kind: {repr(tag) if tag else 'missing'}; allowed: {detail['ctx']['expected_tags']}"
     if detail["type"] == "tuple_type" and isinstance(detail["input"], dict):
         return f"{key}: a single table; allowed: a list of tables, each with the heading [[{key}]]"
     message = detail["msg"].removeprefix("Value error, ").replace("Input should be", "must be")

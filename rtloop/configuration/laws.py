@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
 
-from pydantic import BeforeValidator, SerializeAsAny, ValidationInfo
+from pydantic import BeforeValidator, SerializeAsAny, ValidationError, ValidationInfo
 
 from rtloop.configuration.text_files import InputFileError, read_text
 from rtloop.kernel.layout import MAX_COUPLED
@@ -97,7 +97,8 @@ def select_options(value: object, info: ValidationInfo, base: type[Law], default
     """Return a table as options of the law that it names, bound to this law; a value that is no table unchanged.
 
     Raises ValueError for a law that is missing, is no subclass of `base`, does not allow so many axes, or is not loaded
-    by the running loop; ValidationError for wrong options.
+    by the running loop; ValidationError for wrong options, with one fault more where the table names no law and has
+    no or unknown keys.
     """
     if not isinstance(value, Mapping):
         return value
@@ -105,8 +106,17 @@ def select_options(value: object, info: ValidationInfo, base: type[Law], default
     law = library.find(value, default)
     law_type = law_class(law)
     if not issubclass(law_type, base):
-        raise ValueError(f"law {law.kind!r} is not a {base.__name__.lower()}")
-    options = law_type.options_model.model_validate(dict(value), context=info.context)
+        raise ValueError(f"law {law.kind!r} is not a {base.__name__.lower()}; allowed: {_shipped_kinds(base)}")
+    try:
+        options = law_type.options_model.model_validate(dict(value), context=info.context)
+    except ValidationError as error:
+        faults: list[Any] = list(error.errors())
+        is_of_another_law = not value or any(fault["type"] == "extra_forbidden" for fault in faults)
+        if value.get("kind") or value.get("file") or not is_of_another_law:
+            raise
+        message = f"kind: missing, which means {default!r}; allowed: {_shipped_kinds(base)}"
+        faults.append({"type": "value_error", "ctx": {"error": message}, "input": value})
+        raise ValidationError.from_exception_data(error.title, faults) from None
     law = replace(law, axes=_axes(law, law_type, options))
     if library.loaded is not None and law not in library.loaded:
         raise ValueError(
@@ -115,6 +125,12 @@ def select_options(value: object, info: ValidationInfo, base: type[Law], default
         )
     options.bind(law)
     return options
+
+
+def _shipped_kinds(base: type[Law]) -> str:
+    """Return the kinds of the shipped laws that are subclasses of `base`, and the key for another law, as text."""
+    shipped = [kind for kind in BUILT_IN if issubclass(law_class(LawReference(kind)), base)]
+    return ", ".join([*shipped, "an installed law, or a file with file = …"])
 
 
 def _axes(law: LawReference, kind: type[Law], options: Any) -> int:

@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from rtloop.foundation.options import Numbers, Options
+from rtloop.foundation.options import AnyKind, Numbers, Options
 
 
 class HoldOptions(Options):
@@ -95,5 +95,7 @@ class InputOptions(Options):
 
 
 ReferenceOptions = Annotated[
-    HoldOptions | StepsOptions | TableOptions | WaveOptions | ChirpOptions | InputOptions, Field(discriminator="kind")
+    HoldOptions | StepsOptions | TableOptions | WaveOptions | ChirpOptions | InputOptions,
+    Field(discriminator="kind"),
+    AnyKind,
 ]

@@ -181,6 +181,17 @@ def references_in_plan(plan: Plan, axis: int) -> Iterator[tuple[str, Mode, list[
             yield f"reference from tick {command['tick']} on", mode, command["values"].tolist()
 
 
+def played_samples(plan: Plan, values: Sequence[float]) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
+    """Return the samples (n,) that a generator `values` plays from the plan's table, and its additions to the command
+    in µm (n,); none, (0,), for a kind without a table or without such additions.
+    """
+    if values[0] != Generator.TABLE:
+        return np.empty(0), np.empty(0)
+    first, count = int(values[1]), int(values[2])
+    last = first + 2 * count if values[5] else first + count
+    return plan.table[first : first + count], plan.table[first + count : last]
+
+
 def volts(lowest: float, highest: float) -> str:
     """Return a range of voltages as text, such as "0 V … 10 V"; "5 V" where both ends are equal."""
     return f"{lowest:g} V" if lowest == highest else f"{lowest:g} V … {highest:g} V"

@@ -8,13 +8,15 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from typing import Annotated, Any, Self
 
-from pydantic import BaseModel, ConfigDict, Field, field_validator
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, field_validator
 
 Numbers = Annotated[tuple[float, ...], Field(strict=False)]
 Root = Annotated[tuple[float, float], Field(strict=False)]
 """[real part, imaginary part] in rad/s."""
 Factor = Annotated[tuple[float, ...], Field(strict=False, min_length=1, max_length=3)]
 """Coefficients of 1, s or s², the highest power first."""
+AnyKind = BeforeValidator(lambda table: {"kind": "", **table} if isinstance(table, Mapping) else table)
+"""Validator before a union by `kind`: a table without a kind gets the kind "", whose error lists the allowed ones."""
 
 
 LARGEST, SMALLEST = 1e100, 1e-100

@@ -2,8 +2,9 @@
 
     x_{k+1} = x_k + LAG (g v_applied − x_k)        plant: a lag with the gain g of the law's model, or 1
 
-Both loops return from the position at the edge of the limited range. One rested there; the other had a reference of
-BEYOND times that position. A law without windup returns equally from both."""
+Both loops return from the position at the edge of the limited range. One rested there; the other had an error of
+BEYOND times that position, minus the position. A law without windup returns equally from both. The error comes from the
+reference or from a load, an offset of the measured position, so that a law's own use of one of them is no windup."""
 
 from __future__ import annotations
 
@@ -39,11 +40,14 @@ class Return(NamedTuple):
 
 
 class LimitedLoop:
-    """Loop of a law's `tick` and the plant; `limit_um` is the limit of the command."""
+    """Loop of a law's `tick` and the plant; `limit_um` is the limit of the command.
 
-    def __init__(self, tick: Tick, gains: Real, limit_um: float) -> None:
+    With `by_load` a load takes the place of the reference: the law's reference is 0, its position x − reference.
+    """
+
+    def __init__(self, tick: Tick, gains: Real, limit_um: float, by_load: bool) -> None:
         """Put the plant, with `gains` (axes,), at the edge of its limited range; the caller sets the law's state."""
-        self._tick, self._gains, self.limit_um = tick, gains, limit_um
+        self._tick, self._gains, self.limit_um, self._by_load = tick, gains, limit_um, by_load
         self.position_um = self.edge_um
 
     @property
@@ -58,8 +62,9 @@ class LimitedLoop:
         """
         positions = np.empty((ticks, self._gains.size))
         limit_um = self.limit_um if limited else np.inf
+        load_um = reference_um if self._by_load else np.zeros_like(reference_um)
         for k in range(ticks):
-            applied_um = self._tick(self.position_um, reference_um, limit_um)
+            applied_um = self._tick(self.position_um - load_um, reference_um - load_um, limit_um)
             self.position_um = positions[k] = self.position_um + LAG * (self._gains * applied_um - self.position_um)
         return positions
 

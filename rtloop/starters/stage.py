@@ -71,7 +71,7 @@ def _values(figures: StageFigures) -> dict[str, object]:
         "thresholds_v": _numbers(actuator.thresholds_v),
         "weights_um_per_v": _numbers(actuator.weights_um_per_v),
         "levels": _numbers(_levels_um(actuator, position_um)),
-        "sensor_min_line": _sensor_min_line(figures.sensor_min_v, noise_um / um_per_v),
+        **_sensor_min_lines(figures.sensor_min_v, noise_um / um_per_v),
         "delay_ticks": DELAY_TICKS,
         "swing_ticks": math.ceil(1.5 * period_ticks),
         "frozen_ticks": max(50, math.ceil(period_ticks / 2)),
@@ -100,17 +100,21 @@ def _loop_numbers(figures: StageFigures, actuator: Actuator) -> dict[str, float]
     }
 
 
-def _sensor_min_line(sensor_min_v: float | None, noise_v: float) -> str:
-    """Return the line of TOML with the interlock against a low reading; "" if the lowest reading `sensor_min_v` is
-    None.
+def _sensor_min_lines(sensor_min_v: float | None, noise_v: float) -> dict[str, str]:
+    """Return the lines of TOML for the lowest reading of the simulated ADC, and for the interlock against a low
+    reading, by name; "" if the lowest reading `sensor_min_v` is None.
 
     The interlock lies SENSOR_MARGIN_V above `sensor_min_v`, or lower: always below the noise at rest, about 0 V, whose
     rms is `noise_v`.
     """
     if sensor_min_v is None:
-        return ""
+        return {"adc_lines": "", "sensor_min_line": ""}
     interlock_v = min(sensor_min_v + SENSOR_MARGIN_V, -max(SENSOR_MARGIN_V, NOISE_DEVIATIONS * noise_v))
-    return f"sensor_min_v = {_number(interlock_v)}           # the sensor's lowest reading is {sensor_min_v:g} V\n"
+    comment = f"           # the sensor's lowest reading is {sensor_min_v:g} V\n"
+    return {
+        "adc_lines": f"\n[driver.plant.adc]\nmin_v = {_number(sensor_min_v)}",
+        "sensor_min_line": f"sensor_min_v = {_number(interlock_v)}{comment}",
+    }
 
 
 def _travel_numbers(range_um: float, reach_um: float, remanence_um: float) -> dict[str, float]:

@@ -188,6 +188,10 @@ def test_a_key_without_effect_or_sense_is_an_error(tmp_path, uncertain, message)
     [
         ({"keys": 'axis = "y"'}, "axis: 'y' is unknown; allowed: x"),
         ({"keys": "rigs = 0"}, "rigs"),
+        (
+            {"experiments": STEPS.replace('kind = "steps"', "")},
+            "experiment.0.kind: missing; allowed: 'steps', 'sine', 'scan', 'disturbance'",
+        ),
         ({"experiments": STEPS + STEPS}, "two experiments have the name 'steps'"),
         (
             {"experiments": STEPS.replace("[10.0]", "[0.0]")},

@@ -30,14 +30,14 @@ class TestThreeAxes(TestOneAxis):
 
 class TestNarrowConverters(TestOneAxis):
     def driver(self) -> Driver:
-        plant = {"dac": {"range_v": 5.0, "bits": 12}, "adc": {"range_v": 2.5}}
+        plant = {"dac": {"range_v": 5.0, "bits": 12}, "adc": {"range_v": 2.5, "min_v": 0.0}}
         return SimDriver(RigOptions.model_validate({"plants": {"y": plant}}), THREE_AXES, 10_000.0)
 
 
 def test_ranges_are_the_converters():
     facts = TestNarrowConverters().driver().facts
     assert [(c.name, c.maximum_v) for c in facts.outputs] == [("dac0", 10.0), ("dac1", 5.0), ("dac2", 10.0)]
-    assert [(c.name, c.minimum_v) for c in facts.inputs] == [("adc0", -10.0), ("adc1", -2.5), ("adc2", -10.0)]
+    assert [(c.name, c.minimum_v) for c in facts.inputs] == [("adc0", -10.0), ("adc1", 0.0), ("adc2", -10.0)]
 
 
 def test_observed_signals_have_the_name_of_their_plant_s_axis():

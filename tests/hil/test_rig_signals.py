@@ -98,26 +98,41 @@ def test_sensor_resolution_and_scale(run, ideal):
 )
 def test_converter_codes(value, code):
     """4 bits over ±10 V: an LSB of 1.25 V, codes −8 … 7, halves to the even code."""
-    assert quantise(*lsb_and_range(10.0, 4), float(value)) == 1.25 * code
+    assert quantise(*lsb_and_range(-10.0, 10.0, 4), float(value)) == 1.25 * code
     if 2.5 > abs(value) > 0:
-        assert quantise(*lsb_and_range(10.0, 4), float(value)) == 1.25 * round(Fraction(value) / Fraction(1.25))
+        assert quantise(*lsb_and_range(-10.0, 10.0, 4), float(value)) == 1.25 * round(Fraction(value) / Fraction(1.25))
+
+
+@pytest.mark.parametrize(("bits", "highest_v"), [(4, 9.375), (0, 10.0)])
+def test_a_converter_of_one_sign_clips_at_0_v(bits, highest_v):
+    """4 bits over 0 … 10 V: an LSB of 0.625 V, codes 0 … 15."""
+    span = lsb_and_range(0.0, 10.0, bits)
+    assert [quantise(*span, value) for value in (-3.0, -1e-9, 0.0, 2.5, 99.0)] == [0.0, 0.0, 0.0, 2.5, highest_v]
+
+
+def test_an_adc_of_one_sign_reads_no_noise_below_0_v(run):
+    plant = PlantOptions(sensor=SensorOptions(um_per_v=1.0, noise_um=0.1), adc=ConverterOptions(min_v=0.0))
+    adc_v = run(np.zeros(1000), RigOptions(plant=plant)).adc_v
+    assert adc_v.min() == 0.0
+    assert 0.4 < np.mean(adc_v == 0.0) < 0.6
+    assert 0.2 < adc_v.max() < 0.5
 
 
 @given(st.floats(-9.9, 9.9), st.integers(8, 32))
 def test_converter_error_is_half_an_lsb_at_most(value, bits):
-    lsb, output = 20 / 2**bits, quantise(*lsb_and_range(10.0, bits), value)
+    lsb, output = 20 / 2**bits, quantise(*lsb_and_range(-10.0, 10.0, bits), value)
     assert abs(output - value) <= lsb / 2 * (1 + 1e-6)
     assert float(output / lsb).is_integer()
 
 
 @given(st.floats(-1e308, 1e308) | st.just(float("inf")) | st.just(float("-inf")))
 def test_ideal_converter_clips_only(value):
-    assert quantise(*lsb_and_range(10.0, 0), value) == min(max(value, -10.0), 10.0)
+    assert quantise(*lsb_and_range(-10.0, 10.0, 0), value) == min(max(value, -10.0), 10.0)
 
 
 @pytest.mark.parametrize("bits", [0, 16])
 def test_nan_stays_visible_in_the_adc(bits):
-    assert np.isnan(quantise(*lsb_and_range(10.0, bits), float("nan")))
+    assert np.isnan(quantise(*lsb_and_range(-10.0, 10.0, bits), float("nan")))
 
 
 @pytest.mark.parametrize("latency", [0, 1, 3, 16])

@@ -37,6 +37,38 @@ class CorrectIntegrator(Controller):
         s.integral_um = told.command_um
 
 
+class WithReferencePath(CorrectIntegrator):
+    """Adds the reference to the command, whose limit moves the integrator far."""
+
+    @staticmethod
+    def output(c: Any, s: Any, told: Any) -> float:
+        return s.integral_um + told.reference_um
+
+    @staticmethod
+    def enter(c: Any, s: Any, told: Any) -> None:
+        s.integral_um = told.command_um - told.reference_um
+
+
+class WithWeightedReference(CorrectIntegrator):
+    """PI whose reference has the weight 0.2 in the proportional part, with conditional integration."""
+
+    @staticmethod
+    def output(c: Any, s: Any, told: Any) -> float:
+        return 0.5 * (0.2 * told.reference_um - told.position_um) + s.integral_um
+
+    @staticmethod
+    def update(c: Any, s: Any, told: Any) -> None:
+        if (told.applied_um - told.command_um) * told.error_um >= 0.0:
+            s.integral_um += c.ki * told.error_um
+
+    @staticmethod
+    def enter(c: Any, s: Any, told: Any) -> None:
+        s.integral_um = told.command_um - 0.5 * (0.2 * told.reference_um - told.position_um)
+
+
+CORRECT = (CorrectIntegrator, WithReferencePath, WithWeightedReference)
+
+
 class InfiniteCoefficient(CorrectIntegrator):
     def build(self) -> dict[str, Any]:
         return {"ki": math.inf}
@@ -120,6 +152,18 @@ class WindsUpALittle(CorrectIntegrator):
         s.integral_um += c.ki * told.error_um + 0.004 * (told.applied_um - told.command_um)
 
 
+class WindsUpBehindAReferencePath(WithReferencePath):
+    @staticmethod
+    def update(c: Any, s: Any, told: Any) -> None:
+        s.integral_um += c.ki * told.error_um
+
+
+class WindsUpBehindAWeightedReference(WithWeightedReference):
+    @staticmethod
+    def update(c: Any, s: Any, told: Any) -> None:
+        s.integral_um += c.ki * told.error_um
+
+
 class EntersAtZero(CorrectIntegrator):
     @staticmethod
     def enter(c: Any, s: Any, told: Any) -> None:
@@ -199,6 +243,8 @@ BROKEN = {
     NoAntiWindup: STAYS,
     WindsUp: WINDUP,
     WindsUpALittle: WINDUP,
+    WindsUpBehindAReferencePath: WINDUP,
+    WindsUpBehindAWeightedReference: WINDUP,
     EntersAtZero: ENTERS,
     EntersWithTheErrorForgotten: ENTERS,
     KeepsNan: POISON,

@@ -86,7 +86,8 @@ def state(folder: Path) -> str | None:
 def test_the_pages_law_is_the_new_one_and_fits_on_a_screen(folder: Path):
     run_command(folder, "rtloop law new damping")
     files = {name: "\n".join(line[4:] for line in text.splitlines()).strip() for name, text in FILE.findall(PAGE)}
-    files.pop("test_notch.py")  # belongs to tutorial 3
+    for other in ("test_notch.py", "conditional.py"):
+        files.pop(other)
     for name, text in files.items():
         written = (folder / name).read_text()
         assert written.strip().endswith(text), name
@@ -112,6 +113,25 @@ def test_the_documented_test_of_the_notch_passes_and_finds_a_wrong_notch(folder:
     report = pytest_report(folder, "test_notch.py", "test_wrong.py", "-k", "integrator_behind")
     assert "1 failed, 1 passed" in report, report
     assert "FAILED test_wrong.py" in report, report
+
+
+def test_the_pages_conditional_integration_passes_and_an_unconditional_one_winds_up(folder: Path):
+    (page_law,) = [text for name, text in FILE.findall(PAGE) if name == "conditional.py"]
+    right = "\n".join(line[4:] for line in page_law.splitlines())
+    condition = "if step_um * (told.applied_um - told.command_um) >= 0.0:"
+    assert right.count(condition) == 1
+    for name, text in (("conditional", right), ("wrong", right.replace(condition, "if True:"))):
+        (folder / f"{name}.py").write_text(text)
+        (folder / f"test_{name}.py").write_text(
+            f"from {name} import Conditional, ConditionalOptions\n"
+            "from rtloop.laws.conformance import LawConformance\n"
+            "class TestConditional(LawConformance):\n"
+            "    law = Conditional(ConditionalOptions(kp=1.5, ki_per_s=150.0, feed=0.5), 1e-4, None)\n"
+        )
+    report = pytest_report(folder, "test_conditional.py", "test_wrong.py", "-k", "wind or enter or finite")
+    assert "1 failed, 7 passed" in report, report
+    assert "FAILED test_wrong.py" in report, report
+    assert "the law winds up" in report, report
 
 
 def pytest_report(folder: Path, *arguments: str) -> str:

@@ -91,10 +91,10 @@ def test_a_controller_of_several_axes_has_up_to_48_states(order: int, fits: bool
 def test_the_edge_of_the_limited_range_is_the_limit_times_the_plants_gain() -> None:
     """A command at the limit holds the plant at the edge, and half the limit lets it return half way to 0."""
     gains = np.array([2.0, 0.5])
-    loop = LimitedLoop(lambda position, reference, limit: np.full(2, min(limit, 10.0)), gains, 10.0)
+    loop = LimitedLoop(lambda position, reference, limit: np.full(2, min(limit, 10.0)), gains, 10.0, by_load=False)
     assert loop.edge_um.tolist() == [20.0, 5.0]
     np.testing.assert_allclose(loop.follow(np.zeros(2), 3, limited=True), [[20.0, 5.0]] * 3)
-    loop = LimitedLoop(lambda position, reference, limit: np.full(2, 5.0), gains, 10.0)
+    loop = LimitedLoop(lambda position, reference, limit: np.full(2, 5.0), gains, 10.0, by_load=False)
     np.testing.assert_allclose(loop.follow(np.zeros(2), 200, limited=True)[-1], [10.0, 2.5])
 
 

@@ -188,8 +188,10 @@ def test_the_interlock_of_the_sensor_lies_below_the_noise_at_rest(lowest_v, nois
         range_um=90.0, drive_min_v=0.0, sensor_um_per_v=10.0, sensor_noise_um=noise_um, sensor_min_v=lowest_v
     )
     for name in ("stage.toml", "stage-sine.toml", "stage-step.toml"):
-        interlocks = tomllib.loads(stage_files(figures)[name])["axis"][0]["interlocks"]
+        configuration = tomllib.loads(stage_files(figures)[name])
+        interlocks, plant = configuration["axis"][0]["interlocks"], configuration["driver"]["plant"]
         assert interlocks.get("sensor_min_v") == (None if interlock_v is None else pytest.approx(interlock_v))
+        assert plant.get("adc", {}).get("min_v") == lowest_v
 
 
 def test_a_sensor_from_0_v_on_needs_a_drive_from_0_v_on() -> None:

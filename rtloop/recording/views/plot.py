@@ -30,6 +30,8 @@ if TYPE_CHECKING:
 FORMATS = (".png", ".pdf", ".svg")
 POINTS = 20_000
 MAX_LABELS = 12
+LABEL_DISTANCE = 0.025
+"""Least horizontal distance of two labels, as a share of the panel's width: 8 points of text at 30° need it."""
 USUAL, HIDING = 0.75, 20.0
 """Quantile of an error that its peaks exceed by this factor where they would hide it."""
 COLOURS = {
@@ -102,7 +104,7 @@ def _draw(figure: Figure, drawing: DrawnRecording) -> None:
         subplot.set_ylabel(label, parse_math=False)
         subplot.grid(visible=True, alpha=0.3)
         subplot.margins(x=0)
-        subplot.legend(loc="upper right", fontsize=8, framealpha=0.8, ncols=2)
+        subplot.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), fontsize=8, edgecolor="none")
     plots[-1].set_xlabel("time since the start of the run / s")
     _mark_events(plots, drawing.marks)
 
@@ -129,10 +131,22 @@ def _draw_trace(subplot: Axes, band: Band, kind: str) -> None:
 
 
 def _mark_events(panels: list[Axes], events: list[Mark]) -> None:
-    """Draw a line at each event in every panel, and the labels of the first MAX_LABELS events above the top panel."""
+    """Draw a line at each event in every panel, and the labels of the first MAX_LABELS events above the top panel.
+
+    A label that would lie on the one before is moved to the right, and a line leads to it.
+    """
     for event in events:
         for panel in panels:
             panel.axvline(event.time_s, color="tab:red" if event.bad else "0.3", linewidth=0.7, linestyle=":")
+    place_s, end_s = -np.inf, panels[0].get_xlim()[1]
+    distance_s = LABEL_DISTANCE * (end_s - panels[0].get_xlim()[0])
+    transform = panels[0].get_xaxis_transform()
     for event in events[:MAX_LABELS]:
-        place, transform = (event.time_s, 1.02), panels[0].get_xaxis_transform()
-        panels[0].text(*place, event.label, transform=transform, rotation=30, fontsize=8, parse_math=False)
+        place_s = max(event.time_s, place_s + distance_s)
+        color = "tab:red" if event.bad else "0.3"
+        panels[0].annotate(
+            event.label, (event.time_s, 1.0), (place_s, 1.06), transform, transform, rotation=30, fontsize=8,
+            parse_math=False, color=color, annotation_clip=False,
+            arrowprops={"arrowstyle": "-", "color": color, "linewidth": 0.7, "shrinkA": 0, "shrinkB": 0,
+                        "relpos": (0, 0)},
+        )  # fmt: skip
