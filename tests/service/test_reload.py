@@ -218,6 +218,10 @@ def test_a_refused_tare_does_not_come_with_the_next_change(live):
         return np.frombuffer(staged, live.prepared.plan.coefficients.dtype)["offset_v"].tolist()
 
     desk = live._staging.desk
+    desk.refuses |= {(Kind.LOAD_LAW, 0), (Kind.LOAD_LAW, 1)}
+    with pytest.raises(Refusal):
+        live.tare(1, 0.4)
+    desk.refuses.clear()
     assert live.tare(0, 0.25) == 7
     desk.refuses.add((Kind.LOAD_LAW, 0))
     with pytest.raises(Refusal):
