@@ -173,6 +173,24 @@ def test_after_lost_events_the_reference_is_unknown_until_mode_and_setpoint_are_
     assert bench.references.trip[:2] == (2, Mode.CLOSED_LOOP)
 
 
+def test_a_trip_after_a_reset_has_neither_causes_nor_stop_of_the_first(bench: Bench) -> None:
+    def newest_trip() -> tuple[Any, ...]:
+        bench.references.follow()
+        return (*bench.references.trip[:2], *bench.references.trip[3:])
+
+    bench.trip()
+    sensor, both = Flag.TRIP_SENSOR_RANGE, Flag.TRIP_SENSOR_RANGE | Flag.TRIP_POSITION
+    assert newest_trip() == (1, Mode.CLOSED_LOOP, sensor, sensor, False)
+    bench.loop.law.coefficients["position_limit_um"] = -1.0
+    bench.set_mode(Mode.OFF)
+    assert newest_trip() == (1, Mode.CLOSED_LOOP, sensor, both, True)
+    bench.loop.law.coefficients["position_limit_um"] = 60.0
+    bench.desk.submit(Kind.RESET_TRIP)
+    bench.set_mode(Mode.FEEDFORWARD)
+    bench.trip()
+    assert newest_trip() == (2, Mode.FEEDFORWARD, sensor, sensor, False)
+
+
 def test_a_setpoint_that_is_set_just_now_is_read_from_a_record_that_has_it(
     bench: Bench, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -12,6 +12,8 @@ import numpy as np
 import pytest
 
 from rtloop.configuration.prepare import prepare
+from rtloop.drivers.base import Channel, Facts, Wiring
+from rtloop.drivers.python import PythonDriver
 from rtloop.engine.messages import MESSAGE
 from rtloop.foundation import timing
 from rtloop.service import service
@@ -26,9 +28,9 @@ from tests.engine.harness import LoopBench
 from tests.virtual.bench import VirtualSupervisor
 from tests.virtual.turns import Turns, virtual_time
 
-RATE_HZ, WATCH_S = 1000.0, 0.005
-UM_PER_V = 4.0
-CONFIGURATION = f"""
+RATE_HZ, WATCH_S, TRIP_SLEW_V_PER_S = 1000.0, 0.005, 1000.0
+UM_PER_V = np.array([4.0, 2.0])
+HEAD = f"""
 [loop]
 rate_hz = {RATE_HZ:g}
 mode = "feedforward"
@@ -38,22 +40,37 @@ kind = "sim"
 input = "adc0"
 output = "dac0"
 um_per_v = 10.0
+[driver.channels.y]
+input = "adc1"
+output = "dac1"
+um_per_v = 10.0
+"""
+"""The loop without its axes, as `axis_text` has them."""
+
+
+def axis_text(name: str, um_per_v: float, amplitude: float, offset: float) -> str:
+    """Return the configuration of an axis, whose reference is a sine."""
+    return f"""
 [[axis]]
-name = "x"
+name = "{name}"
 [axis.feedforward]
 thresholds_v = [0.0]
-weights_um_per_v = [{UM_PER_V}]
+weights_um_per_v = [{um_per_v}]
 [axis.limits]
 bump_s = 0.002
-trip_slew_v_per_s = 1000.0
+trip_slew_v_per_s = {TRIP_SLEW_V_PER_S:g}
 [axis.interlocks]
 sample_age_us = 1000.0
 [axis.reference]
 kind = "sine"
-amplitude = 4.0
-offset = 12.0
+amplitude = {amplitude}
+offset = {offset}
 frequency_hz = 25.0
 """
+
+
+FEEDFORWARD = HEAD + axis_text("x", 4.0, 4.0, 12.0) + axis_text("y", 2.0, 2.0, 12.0)
+RAW = HEAD.replace("feedforward", "raw") + axis_text("x", 4.0, 1.0, 3.0) + axis_text("y", 2.0, 1.0, 6.0)
 RECOVER = """
 [service.recover]
 wait_s = 0.1
@@ -63,13 +80,37 @@ max_per_hour = 10
 """
 
 
+class FollowingDriver(ScriptedDriver):
+    """Driver of the axes x and y, whose readings follow their drives; `written` has the drives of both."""
+
+    def __init__(self) -> None:
+        PythonDriver.__init__(
+            self, self.options_model(), {"x": Wiring("adc0", "dac0"), "y": Wiring("adc1", "dac1")}, 10_000
+        )
+        self.written: list[Sequence[float]] = []  # type: ignore[assignment]
+
+    @property
+    def facts(self) -> Facts:
+        inputs, outputs = (tuple(Channel(f"{kind}{number}") for number in range(2)) for kind in ("adc", "dac"))
+        return Facts(inputs, outputs, (), real=False)
+
+    def read(self) -> Sequence[float]:
+        return tuple(UM_PER_V / 10.0 * self.written[-1]) if self.written else (0.0, 0.0)
+
+    def observe(self) -> Sequence[float]:
+        return ()
+
+    def write(self, volts: Sequence[float]) -> None:
+        self.written.append(tuple(volts))
+
+
 class VirtualService:
-    """A service with a loop of one axis, mode feedforward and a sine; `more` ends its configuration.
+    """A service with a loop of the axes x and y, mode feedforward and a sine; `more` ends its configuration.
 
     The reading follows the drive. While `hangs`, the loop executes no tick, as if its driver did not return.
     """
 
-    def __init__(self, folder: Path, monkeypatch: pytest.MonkeyPatch, more: str = RECOVER, base: str = CONFIGURATION):
+    def __init__(self, folder: Path, monkeypatch: pytest.MonkeyPatch, more: str = RECOVER, base: str = FEEDFORWARD):
         self.turns, self.hangs = Turns(self._advance), False
         monkeypatch.setattr(timing, "source", virtual_time(self.turns))
         (folder / "lab.toml").write_text(base + more)
@@ -91,9 +132,7 @@ class VirtualService:
         prepared = prepare(self.service.configuration, paced=False)
         plan = replace(prepared.plan, mode=Mode.OFF, schedule=np.zeros(0, MESSAGE), spare_samples=service.SPARE_SAMPLES)
         prepared = replace(prepared, plan=plan)
-        self.driver = ScriptedDriver(
-            lambda _: self.driver.written[-1] * UM_PER_V / 10.0 if self.driver.written else 0.0
-        )
+        self.driver = FollowingDriver()
         self.bench = LoopBench(plan, self.driver)
         supervisor: Any = VirtualSupervisor(self.bench, prepared)
         self.service._desk = Desk(self.bench.block, RATE_HZ)
@@ -134,11 +173,11 @@ class VirtualService:
         report = self.service.recovery.for_json()
         return "" if report is None else str(report["state"])
 
-    def drive_v(self, seconds: float) -> Sequence[float]:
-        """Return the drives of the next ticks."""
+    def drive_v(self, seconds: float) -> np.ndarray[Any, Any]:
+        """Return the drives of the next ticks (ticks, axes)."""
         before = len(self.driver.written)
         self.turns.sleep(seconds)
-        return self.driver.written[before:]
+        return np.array(self.driver.written[before:])
 
     def _advance(self, seconds: float) -> None:
         """Execute the ticks of a stretch of time, and read the loop's events every WATCH_S, as the service's watch."""
