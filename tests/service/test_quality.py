@@ -132,6 +132,7 @@ def test_they_go_on_in_the_next_loop(bench: QualityBench):
     tripped[400:, FLAGS] = POSITION
     bench.run(tripped)
     bench.replace_loop()
+    tripped[:, FLAGS] = POSITION
     bench.run(tripped)
     assert bench.samples["ticks_summed_total",] == 1_000
     assert bench.samples["trips_total", "position"] == 2
