@@ -88,6 +88,8 @@ class FollowingDriver(ScriptedDriver):
             self, self.options_model(), {"x": Wiring("adc0", "dac0"), "y": Wiring("adc1", "dac1")}, 10_000
         )
         self.written: list[Sequence[float]] = []  # type: ignore[assignment]
+        self.offsets_v = np.zeros(2)
+        """Readings of the axes at a drive of 0 V."""
 
     @property
     def facts(self) -> Facts:
@@ -95,7 +97,8 @@ class FollowingDriver(ScriptedDriver):
         return Facts(inputs, outputs, (), real=False)
 
     def read(self) -> Sequence[float]:
-        return tuple(UM_PER_V / 10.0 * self.written[-1]) if self.written else (0.0, 0.0)
+        drives_v = np.array(self.written[-1]) if self.written else np.zeros(2)
+        return tuple((self.offsets_v + UM_PER_V / 10.0 * drives_v).tolist())
 
     def observe(self) -> Sequence[float]:
         return ()
@@ -136,7 +139,7 @@ class VirtualService:
         self.bench = LoopBench(plan, self.driver)
         supervisor: Any = VirtualSupervisor(self.bench, prepared)
         self.service._desk = Desk(self.bench.block, RATE_HZ)
-        self.service.live = LiveLaw(prepared, self.bench.block, self.service._desk, {})
+        self.service.live = LiveLaw(prepared, self.bench.block, self.service._desk, self.service._offsets_v)
         self.service.supervisor = supervisor
         self.turns.sleep(0.01)
 
