@@ -16,8 +16,8 @@ from rtloop.recording.file.event_window import EventWindow
 from rtloop.recording.file.topics import format
 from rtloop.recording.file.topics.contents import Message
 from rtloop.recording.file.topics.overview import are_plausible
-from rtloop.signals import DEADLINE, TICK
-from tests.recording.hand_made_loop import COLUMNS, RATE_HZ, make_rows
+from rtloop.signals import DEADLINE, TICK, Mode
+from tests.recording.hand_made_loop import COLUMNS, RATE_HZ, HandMadeLoop, make_rows
 
 PERIOD_NS = 100_000
 
@@ -98,6 +98,16 @@ def test_intervals_must_have_whole_ticks_and_times_in_order(ranges, plausible, c
 def entry(channel: int, *, tick: int = 0, from_loop: bool = False) -> PendingEntry:
     """Return a pending message of a channel, at a tick."""
     return PendingEntry(tick, Message(channel, tick * PERIOD_NS, b"{}"), from_loop)
+
+
+def test_a_reader_of_a_ring_counts_the_slots_of_all_its_losses() -> None:
+    loop = HandMadeLoop()
+    reader, slots = RingReader(loop.block, "events"), len(loop.block.ring("events").slots)
+    for lost in (7, 12):
+        for tick in range(slots + lost - reader.lost):
+            loop.command(tick, Mode.OFF)
+        assert len(reader.take()) == slots
+        assert reader.lost == lost
 
 
 def test_events_of_the_recorder_are_not_counted_as_waiting_and_snapshots_are() -> None:
