@@ -140,14 +140,12 @@ def test_ticks_are_retained_after_the_last_of_several_hits() -> None:
     rows = make_rows(500)
     rows[:, PERIODS_MISSED] = 0.0
     rows[100, PERIODS_MISSED], rows[[0, 250], -1] = 1.0, 1e3
-    buffer = SegmentBuffer(
-        EventWindow(0.0, 0.01, (f"{COLUMNS[-1]} > 900", "late"), 0.01), list(COLUMNS), RATE_HZ, 0, -1
-    )
-    for first in range(0, 500, 100):
+    window = EventWindow(0.0, 0.01, (f"{COLUMNS[-1]} > 900", "late"), 0.01)
+    buffer = SegmentBuffer(window, list(COLUMNS), RATE_HZ, 0, -1)
+    for first, end in ((0, 300), (300, 400), (400, 500)):
         buffer.begin_segment(first)
-        part = rows[first : first + 100]
-        buffer.find_hits([], part)
-        buffer.add([], part)
+        buffer.find_hits([], rows[first:end])
+        buffer.add([], rows[first:end])
     taken_rows = [batch.rows for batch in iter(lambda: buffer.next_batch(lambda _: False, decide_all=True), None)]
     assert np.concatenate(taken_rows).tobytes() == rows[:400].tobytes()
 
