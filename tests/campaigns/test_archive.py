@@ -220,6 +220,9 @@ def test_the_files_of_a_rotated_run_are_one_recording(tmp_path):
     (complete,) = find_recordings([tmp_path])
     assert [Path(path).name for path in complete.paths] == [f"run-000{number}.mcap" for number in (1, 2, 3)]
     assert replay_verdict(*map(Path, complete.paths)) == {"verdict": "identical", "reason": ""}
+    changed_ns = complete.mtime_ns + 1_000_000_000
+    os.utime(complete.paths[1], ns=(changed_ns, changed_ns))
+    assert find_recordings([tmp_path]) == [complete._replace(mtime_ns=changed_ns)]
     (tmp_path / "run-0001.mcap").unlink()
     (remaining,) = find_recordings([tmp_path])
     assert replay_verdict(*map(Path, remaining.paths)) == {

@@ -13,7 +13,7 @@ import pytest
 from rtloop.cli import main
 from rtloop.client import Client
 from rtloop.client.connection import Connection, read_controller
-from rtloop.client.control import BUILD_RESOURCES
+from rtloop.client.control import BUILD_RESOURCES, Cancellation
 from rtloop.errors import ConfigError, LoopFault, UnavailableError
 from rtloop.service.api.lanes import Lane
 from rtloop.service.api.requests import REQUESTS as SERVICE_REQUESTS
@@ -134,6 +134,18 @@ def test_who_finds_a_dead_service_is_told_the_name_to_park(tmp_path: Path, has_n
     )
     with pytest.raises(UnavailableError, match=f"the service has died.* {remedy}$"):
         Client(path).get("/status")
+
+
+def test_a_cancellation_ends_each_connection_attached_before_or_after_it():
+    cancellation = Cancellation()
+    for is_first in (True, False):
+        ours, peer = socket.socketpair()
+        with ours, peer:
+            cancellation.attach(ours)
+            if is_first:
+                cancellation.cancel()
+            peer.settimeout(1.0)
+            assert peer.recv(1) == b""
 
 
 def test_the_documentation_tells_properties_from_methods():

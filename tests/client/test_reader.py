@@ -35,7 +35,8 @@ class LoopBlock:
 
     def begin(self) -> None:
         """Create the block's contents with an empty ring of ticks."""
-        self.ring = SharedBlock.create(Sizes(len(COLUMNS), 1, 400.0, 64, 1), self._fd).ring("ticks")
+        block = SharedBlock.create(Sizes(len(COLUMNS), 1, 400.0, 64, 1), self._fd)
+        self.ring, self.events = block.ring("ticks"), block.ring("events")
 
     def run(self, ticks: int) -> None:
         """Publish the records of the next `ticks` ticks; the position of tick n is −n µm."""
@@ -43,6 +44,13 @@ class LoopBlock:
             self.ring.slots[claim(self.ring, np.uint64(tick))] = tick, tick * 2.5e6, -tick
             publish(self.ring, np.uint64(tick))
         self.tick += ticks
+
+    def report(self, *ticks: int) -> None:
+        """Publish an event at each of these ticks."""
+        for tick in ticks:
+            position = self.events.head[0]
+            self.events.slots[claim(self.events, position)]["tick"] = tick
+            publish(self.events, position)
 
     def close(self) -> None:
         os.close(self._fd)
@@ -87,8 +95,10 @@ def test_the_reader_reads_each_tick_once_and_changes_to_another_run(
     loop.begin()
     assert reader.read() is None
     loop.run(10)
+    loop.report(3, 7)
     assert span(reader.read()) == (0, 10, 0, 0)
     assert reader.read() is None
+    assert reader.read_messages()["tick"].tolist() == [3, 7]
     loop.run(5)
     new_loop = make_block()
     new_loop.begin()
@@ -96,7 +106,9 @@ def test_the_reader_reads_each_tick_once_and_changes_to_another_run(
     assert reader.read() is None
     assert reader.run == 1
     new_loop.run(3)
+    new_loop.report(0, 1, 2)
     assert span(reader.read()) == (0, 3, 0, 1)
+    assert reader.read_messages()["tick"].tolist() == [0, 1, 2]
     assert reader.lost_ticks == 0
 
 

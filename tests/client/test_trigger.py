@@ -178,15 +178,19 @@ def test_a_step_for_one_tick_is_one_sweep_each_way():
 
 
 def test_another_run_discards_the_open_sweep():
-    """An open sweep can be closed early with the ticks so far; a rise from one run to the next is no edge."""
+    """An open sweep can be closed early with the ticks so far; a rise from one run to the next is no edge, and the
+    hold-off ends with the run.
+    """
     low, high = np.zeros((50, 4)), np.ones((50, 4))
     low[40, 3] = 2.0
-    trigger = Trigger(Settings(20, Mode.NORMAL, 0.0), lambda: Edge("s", 1.0))
+    trigger = Trigger(Settings(20, Mode.NORMAL, 0.0, 1000), lambda: Edge("s", 1.0))
     assert trigger.feed(Stretch(COLUMNS, 0, low)) == []
     assert trigger.close() == Sweep(0, 40, 40, 50, Cause.TRIGGER)
     assert trigger.feed(Stretch(COLUMNS, 0, high, 0, 1)) == []
     assert trigger.open_sweep is None
     assert trigger.close() is None
+    assert trigger.feed(Stretch(COLUMNS, 50, low, 0, 1)) == []
+    assert trigger.close() == Sweep(1, 90, 90, 100, Cause.TRIGGER)
 
 
 def test_a_single_sweep_waits_to_be_armed():

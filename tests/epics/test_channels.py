@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import threading
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -60,6 +61,48 @@ def test_an_unknown_value_is_invalid_and_keeps_the_last_one():
 def test_a_trip_is_a_major_alarm():
     assert read_after("TRIPPED", "no", "yes") == ("yes", "MAJOR_ALARM")
     assert read_after("STATE", "tripped", "stopped") == ("stopped", "NO_ALARM")
+
+
+def test_a_unit_that_changes_alone_is_shown():
+    """A reference of 5 µm, then one of 5 V in mode raw."""
+
+    async def show_in_both_modes() -> list[str]:
+        channel, units = make_channel("REFERENCE", TABLE["x:REFERENCE"]), []
+        for mode in ("closed_loop", "raw"):
+            await channel.show(5.0, mode)
+            units.append(channel.units)
+        return units
+
+    assert asyncio.run(show_in_both_modes()) == ["um", "V"]
+
+
+def test_each_loss_of_the_service_is_logged_and_a_later_axis_gets_channels():
+    async def lose_twice() -> list[str]:
+        log: list[str] = []
+        server = ChannelServer(None, "L:", True, log.append)  # type: ignore[arg-type]
+        for axes in ({"x": {}}, {"x": {}, "y": {}}):
+            await server.show_status({"state": "running", "armed": True, "axes": axes})
+            await server._show_lost("gone")
+            await server._show_lost("gone")
+        assert "L:y:SETPOINT" in server.database
+        return log
+
+    lost = "gone; the channels are INVALID until the service answers"
+    assert asyncio.run(lose_twice()) == [lost, "the service answers", lost]
+
+
+def test_a_write_that_succeeds_clears_the_refusal_of_the_one_before():
+    async def write_twice() -> list[Any]:
+        connection: Any = SimpleNamespace(status={"state": "running", "armed": True, "axes": {}})
+        server = ChannelServer(connection, "L:", True, lambda _: None)
+        message, shown = server.database["L:MESSAGE"], []
+        for refusal in (LoopFault("refused"), None):
+            await server._report_write(message, "127.0.0.1", refusal)
+            shown.append(message.value)
+        server._reader.shutdown()
+        return shown
+
+    assert asyncio.run(write_twice()) == ["L:MESSAGE: refused", ""]
 
 
 class SlowLoop:

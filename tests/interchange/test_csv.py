@@ -64,6 +64,16 @@ def test_a_decimal_comma_that_comes_late(tmp_path: Path):
     assert read_csv(tmp_path / "scan.csv").columns["u"].tolist() == [0.0] * 20_000 + [0.5] * 20_000
 
 
+def test_a_decimal_comma_in_the_middle_alone_of_utf_16(tmp_path: Path):
+    """Half of the file's bytes is an odd number: the sample of the middle must not begin there, within a character."""
+    values = ["0"] * 20_000 + ["0,5"] * 20_000 + ["0"] * 20_000
+    content = ("t;u\n" + "".join(f"0;{value}\n" for value in values) + "\n").encode("utf-16-le")
+    assert len(content) // 2 % 2 == 1
+    (tmp_path / "scan.csv").write_bytes(content)
+    column = read_csv(tmp_path / "scan.csv").columns["u"]
+    assert column.tolist() == [float(value.replace(",", ".")) for value in values]
+
+
 def test_missing_numbers_are_nan(tmp_path: Path):
     (tmp_path / "scan.csv").write_text("t,u\n0,nan\n1,\n2,inf\n3,-inf\n4,1e-300\n5,NULL\n")
     column = read_csv(tmp_path / "scan.csv").columns["u"]

@@ -306,7 +306,7 @@ class RunningDesk:
 
 
 def test_it_is_tuned_and_swapped_while_it_runs(tmp_path, monkeypatch):
-    """A change may name either axis and causes no jump; a replay is identical."""
+    """A change may name either axis, keeps the tared offset of both and causes no jump; a replay is identical."""
     monkeypatch.setattr(live, "prepare_limited", lambda configuration: prepare(configuration, paced=False))
     (tmp_path / "mine.py").write_text(MINE)
     text = EXAMPLE.replace("rate_hz = 10000", 'rate_hz = 10000\nlaws = ["mine.py"]')
@@ -314,7 +314,7 @@ def test_it_is_tuned_and_swapped_while_it_runs(tmp_path, monkeypatch):
     session = Session(loop.block, tmp_path / "live.mcap", loop.header, Options(min_free_bytes=0))
     desk = RunningDesk(loop, session)
     desk.run(3000)
-    law = live.LiveLaw(loop.prepared, loop.block, desk, {1: 0.001})  # type: ignore[arg-type]
+    law = live.LiveLaw(loop.prepared, loop.block, desk, {0: 0.002, 1: 0.001})  # type: ignore[arg-type]
     law.tune("y", "controller", {"tracking_s": 0.002})
     law.tune("y", "limits", {"command_um": 40.0})
     law.tune("x", "limits", {"command_um": 39.0})
@@ -337,7 +337,9 @@ def test_it_is_tuned_and_swapped_while_it_runs(tmp_path, monkeypatch):
     recording = rtloop.load(tmp_path / "live.mcap")
     assert [event["axis"] for event in recording.events if event["kind"] == "load_law"] == ["x", "y", *["x"] * 5]
     assert not [event for event in recording.events if event["kind"] in ("tripped", "refused")]
-    for axis, reference_um in (("x", 8.0), ("y", -6.0)):
+    for axis, reference_um, offset_v in (("x", 8.0, 0.002), ("y", -6.0, 0.001)):
+        position_v = recording[f"{axis}_position_um"][-1] / loop.prepared.configuration.channels[axis].um_per_v
+        assert recording[f"{axis}_adc_v"][-1] - position_v == pytest.approx(offset_v, abs=1e-9)
         assert np.max(np.abs(np.diff(recording[f"{axis}_drive_v"][2000:]))) < 0.05
         assert abs(recording[f"{axis}_position_um"][-400:].mean() - reference_um) < 0.1
     report = replay(recording, trust=TrustedLaws(recorded=True))

@@ -254,24 +254,26 @@ def rows() -> Rows:
     return rows
 
 
-@pytest.mark.parametrize(
-    ("text", "span"),
-    [
-        ("trip", (1060, 1060)),
-        ("mode", (1050, 1050)),
-        ("command", (1050, 1070)),
-        ("late", (1040, 1040)),
-        ("v>4.75", (1098, 1099)),
-        (" abs( v ) >= 4.95 ", (1000, 1000)),
-        ("v == 0", (1050, 1050)),
-        ("v < -4.85", (1000, 1001)),
-        ("v <= -4.9e0", (1000, 1001)),
-    ],
-)
-def test_a_condition_holds_at_the_right_ticks(text: str, span: tuple[int, int], rows: Rows):
+SPANS = {
+    "trip": (1060, 1060),
+    "mode": (1050, 1050),
+    "command": (1050, 1070),
+    "late": (1040, 1040),
+    "v>4.75": (1098, 1099),
+    " abs( v ) >= 4.95 ": (1000, 1000),
+    "v == 0": (1050, 1050),
+    "v < -4.85": (1000, 1001),
+    "v <= -4.9e0": (1000, 1001),
+}
+"""First and last tick at which each condition holds."""
+
+
+@pytest.mark.parametrize("texts", [*([text] for text in SPANS), [*SPANS]], ids=str)
+def test_a_condition_holds_at_the_right_ticks(texts: list[str], rows: Rows):
     events = [(1050, "set_mode"), (1060, "tripped"), (1070, "stop"), (1080, "lateness_over")]
-    (hit,) = Conditions([text], COLUMNS).find_hits(rows, events)
-    assert ((hit.first, hit.last), hit.condition) == (span, text)
+    hits = Conditions(texts, COLUMNS).find_hits(rows, events)
+    assert {hit.condition: (hit.first, hit.last) for hit in hits} == {text: SPANS[text] for text in texts}
+    assert [hit.first for hit in hits] == sorted(hit.first for hit in hits)
 
 
 def test_no_comparison_holds_for_nan(rows: Rows):

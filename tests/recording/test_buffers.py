@@ -12,12 +12,12 @@ from rtloop.recording.capture.decimation import Decimation
 from rtloop.recording.capture.pending import PendingEntry, count_pending
 from rtloop.recording.capture.rings import RingReader
 from rtloop.recording.capture.segment_buffer import SegmentBuffer
-from rtloop.recording.file.event_window import EventWindow
+from rtloop.recording.file.event_window import OVERVIEW_BATCH_S, EventWindow
 from rtloop.recording.file.topics import format
 from rtloop.recording.file.topics.contents import Message
 from rtloop.recording.file.topics.overview import are_plausible
-from rtloop.signals import DEADLINE, TICK
-from tests.recording.hand_made_loop import COLUMNS, RATE_HZ, make_rows
+from rtloop.signals import DEADLINE, PERIODS_MISSED, TICK, Mode
+from tests.recording.hand_made_loop import COLUMNS, RATE_HZ, HandMadeLoop, make_rows
 
 PERIOD_NS = 100_000
 
@@ -100,6 +100,16 @@ def entry(channel: int, *, tick: int = 0, from_loop: bool = False) -> PendingEnt
     return PendingEntry(tick, Message(channel, tick * PERIOD_NS, b"{}"), from_loop)
 
 
+def test_a_reader_of_a_ring_counts_the_slots_of_all_its_losses() -> None:
+    loop = HandMadeLoop()
+    reader, slots = RingReader(loop.block, "events"), len(loop.block.ring("events").slots)
+    for lost in (7, 12):
+        for tick in range(slots + lost - reader.lost):
+            loop.command(tick, Mode.OFF)
+        assert len(reader.take()) == slots
+        assert reader.lost == lost
+
+
 def test_events_of_the_recorder_are_not_counted_as_waiting_and_snapshots_are() -> None:
     entries = [entry(format.EVENTS, from_loop=True), entry(format.EVENTS), entry(format.LAW), entry(format.LAW)]
     assert count_pending(entries, format.EVENTS) == 1
@@ -123,3 +133,31 @@ def test_rows_put_back_into_an_empty_buffer_are_followed_by_the_next_ones_of_the
         assert not len(batch.intervals)
         taken_rows.append(batch.rows)
     assert np.concatenate(taken_rows).tobytes() == rows[:200].tobytes()
+
+
+def test_ticks_are_retained_after_the_last_of_several_hits() -> None:
+    """One condition holds from tick 0 to tick 250, another one at tick 100 alone."""
+    rows = make_rows(500)
+    rows[:, PERIODS_MISSED] = 0.0
+    rows[100, PERIODS_MISSED], rows[[0, 250], -1] = 1.0, 1e3
+    window = EventWindow(0.0, 0.01, (f"{COLUMNS[-1]} > 900", "late"), 0.01)
+    buffer = SegmentBuffer(window, list(COLUMNS), RATE_HZ, 0, -1)
+    for first, end in ((0, 300), (300, 400), (400, 500)):
+        buffer.begin_segment(first)
+        buffer.find_hits([], rows[first:end])
+        buffer.add([], rows[first:end])
+    taken_rows = [batch.rows for batch in iter(lambda: buffer.next_batch(lambda _: False, decide_all=True), None)]
+    assert np.concatenate(taken_rows).tobytes() == rows[:400].tobytes()
+
+
+def test_each_overview_waits_for_as_many_ticks_as_the_first() -> None:
+    rate_hz, snapshot_ticks, every_ticks = 100.0, 100, 10
+    batch_ticks = round(OVERVIEW_BATCH_S * rate_hz)
+    rows = make_rows(snapshot_ticks + 3 * batch_ticks)
+    buffer, sizes = SegmentBuffer(EventWindow(0.0, 0.0, ("trip",), 0.1), list(COLUMNS), rate_hz, 0, -1), []
+    for first in range(0, len(rows), snapshot_ticks):
+        buffer.begin_segment(first)
+        buffer.add([], rows[first : first + snapshot_ticks])
+        while (batch := buffer.next_batch(lambda _: False)) is not None:
+            sizes += [len(batch.intervals) * every_ticks] if len(batch.intervals) else []
+    assert sizes == [batch_ticks] * 2

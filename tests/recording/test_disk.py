@@ -108,9 +108,10 @@ def test_recording_resumes_in_a_new_file_at_the_next_snapshot(disk: Disk, run: R
 
 def test_recording_resumes_after_each_of_several_failures(disk: Disk, tmp_path: Path):
     run = RecordedRun(tmp_path / "run.mcap", rotate_s=3.0)
-    for tick in range(15_000, 120_000, 30_000):
-        run_with_failing_disk(run, disk, errno.ENOSPC, tick, tick + 8_000)
+    for number, tick in zip([errno.ENOSPC, errno.EIO] * 2, range(15_000, 120_000, 30_000), strict=True):
+        run_with_failing_disk(run, disk, number, tick, tick + 8_000)
     totals = run.end(140_000)
+    assert os.strerror(errno.ENOSPC) in totals["error"]  # The first one is reported.
     require_every_tick_accounted(totals, 140_000, gaps=4)
     assert load(totals["paths"]).problems == []
 

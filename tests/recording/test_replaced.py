@@ -14,6 +14,7 @@ import pytest
 
 from rtloop.engine.memory import SharedBlock, Word
 from rtloop.recording.capture import session
+from rtloop.recording.capture.progress import FLUSHED
 from rtloop.recording.capture.session import Options, Session
 from rtloop.recording.cutting.cut import cut
 from rtloop.recording.file.reader import Snapshot
@@ -315,6 +316,19 @@ def test_a_replacement_that_is_too_late_for_the_snapshot_continues_at_the_end_of
     assert (report.identical, report.gaps) == (True, [])
     (unverified,) = replay(second).not_verified
     assert (unverified["first_tick"], unverified["count"]) == (KILLED, 2 * SNAPSHOT - KILLED)
+
+
+def test_ticks_lost_in_the_last_write_of_a_dead_recorder_count_as_lost(tmp_path: Path):
+    """The recorder dies after the write, and before it stores that the write is done."""
+    run, _ = begin_run(tmp_path)
+    words = {word: run.loop.block.load(word) for word in FLUSHED}
+    run.loop.run(len(HandMadeLoop().block["ticks_slots"]) + 123)
+    run.drain()
+    run.session._write_all()
+    for word, value in words.items():
+        run.loop.block.store(word, value)
+    run.begin(sequence=2)
+    assert run.end(run.loop.tick + 100)["ticks_lost"] == 123
 
 
 def test_replacements_that_die_before_they_repeated_all_ticks_leave_each_tick_once(files: RunFiles, tmp_path: Path):

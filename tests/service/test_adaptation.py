@@ -22,11 +22,14 @@ GAIN = {"gain": {"value": 1.0204, "std": 0.0014}, "gain_percent_from_model": 2.0
 
 
 class ScheduleBench:
-    """Retune schedule of a stand-in service: axis x adapts, axis y does not. Each command prints `report` as JSON."""
+    """Retune schedule of a stand-in service: axis x adapts, axis y does not, axis z adapts every `z_s`, if at all. Each
+    command prints `report` as JSON.
+    """
 
-    def __init__(self, code: int = 0, stderr: str = "", report: dict[str, Any] = TUNED) -> None:
+    def __init__(self, code: int = 0, stderr: str = "", report: dict[str, Any] = TUNED, z_s: float = 0.0) -> None:
         adapts = AdaptOptions(every_s=60.0, bound_percent=7.0)
         axes = [SimpleNamespace(name="x", adapt=adapts), SimpleNamespace(name="y", adapt=None)]
+        axes += [SimpleNamespace(name="z", adapt=AdaptOptions(every_s=z_s))] if z_s else []
         self.service: Any = SimpleNamespace(state=State.RUNNING, configuration=SimpleNamespace(axes=axes))
         self.commands: list[list[str]] = []
         self.result = subprocess.CompletedProcess([], code, json.dumps(report), stderr)
@@ -52,6 +55,13 @@ def test_it_is_due_after_the_loop_has_run_for_so_long():
     assert "ctl --socket /run/lab.sock retune x --yes --json" in command
     assert "--bound-percent 7.0" in command
     assert "--gain-um 0.0" in command
+
+
+def test_each_axis_is_due_after_its_own_time():
+    bench = ScheduleBench(z_s=90.0)
+    assert [bench.count_commands(time_s) for time_s in (0.0, 60.0, 90.0, 120.0, 179.0, 180.0)] == [0, 1, 2, 3, 3, 5]
+    axes = [command[command.index("retune") + 1] for command in bench.commands]
+    assert axes == ["x", "z", "x", "x", "z"]
 
 
 @pytest.mark.parametrize("state", [state for state in State if state is not State.RUNNING])

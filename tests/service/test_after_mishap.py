@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -16,6 +17,7 @@ from rtloop.engine.memory import ProcessState, SharedBlock, Sizes, Word
 from rtloop.errors import LoopFault, OutputError, UnavailableError
 from rtloop.foundation import timing
 from rtloop.recording.capture.requester_names import RequesterNames
+from rtloop.service import service as service_module
 from rtloop.service.service import Service, State
 from rtloop.service.status import status
 from rtloop.supervision import parking, recorder_keeper
@@ -117,6 +119,9 @@ class IdleRecorder:
     def end(self) -> bool:
         return True
 
+    def send(self, _: bytes) -> None:
+        """Accept orders, and do nothing."""
+
 
 def make_keeper(block: SharedBlock, folder: Path) -> RecorderKeeper:
     """Return the keeper of an idle recorder that has its orders; the recordings are in `folder`."""
@@ -166,6 +171,11 @@ def test_a_recorder_is_replaced_only_if_there_is_something_to_record(block, tmp_
     block["ticks_head"][0] = 500
     block.store(Word.RECORDER_CURSOR, recorded)
     for _ in range(200):
+        keeper._replace_if_dead()
+        clock.sleep(0.05)
+    assert keeper.replacements == replaced
+    block.store(Word.RECORDER_STATE, ProcessState.READY)
+    for _ in range(10):  # The replacement has its own time, which begins with its orders.
         keeper._replace_if_dead()
         clock.sleep(0.05)
     assert keeper.replacements == replaced
@@ -257,6 +267,23 @@ def test_nothing_drives_the_outputs_after_a_start_that_failed(monkeypatch, caplo
     service.run()
     assert (outputs_off_flags, service.state) == ([False, True], State.TRIPPED)
     assert ("neither depolarised nor tared" in caplog.text) == (driving == "a depolarisation")
+
+
+def test_each_tared_axis_keeps_its_offset_in_the_next_loop(monkeypatch):
+    offsets_v: list[list[float]] = []
+
+    def refuse_start(_: object, prepared: Any, *__: object) -> None:
+        offsets_v.append(prepared.plan.coefficients["offset_v"].tolist())
+        raise UnavailableError("no loop starts in this test")
+
+    monkeypatch.setattr(service_module, "Supervisor", refuse_start)
+    monkeypatch.setattr(service_module, "Processes", lambda _: nullcontext())
+    monkeypatch.setattr(service_module, "write_note", lambda *_: None)
+    service = Service(DEPLOY / "two-axis.toml")
+    service._offsets_v |= {0: 0.1, 1: 0.2}
+    with pytest.raises(UnavailableError):
+        service._run_loop(outputs_off=True)
+    assert offsets_v == [[0.1, 0.2]]
 
 
 def test_a_status_without_a_tick_says_why_it_has_no_axes(monkeypatch):

@@ -24,6 +24,15 @@ def block() -> SharedBlock:
     return SharedBlock.create(Sizes(columns=20, axes=1, rate_hz=1000.0, snapshot_bytes=64, table_samples=0))
 
 
+def test_the_words_of_the_newest_changes_are_stored(block, monkeypatch):
+    monkeypatch.setattr(desk_module, "MAX_CHANGES", 2)
+    monkeypatch.setattr(Desk, "_answer", lambda *_: 0)
+    desk = Desk(block)
+    for change in ("first", "second", "third"):
+        desk.submit(Kind.LOAD_LAW, axis=0, values=[1.0], change=change)
+    assert [desk.change_text(identity) for identity in range(4)] == [None, None, "second", "third"]
+
+
 @pytest.mark.parametrize("stall_s", [0.0, 60.0])
 def test_the_desk_answers_when_the_record_of_the_tick_is_there(block, monkeypatch, stall_s):
     """The loop publishes the event of a tick before the tick's record; until then the ring's head stays there.

@@ -70,6 +70,13 @@ class Bench:
     def set_mode(self, mode: Mode, *, holds_output: bool = True) -> None:
         self.desk.submit(Kind.SET_MODE, values=[float(mode), 0.0, float(holds_output)])
 
+    def trip(self) -> None:
+        """Let the loop trip by its sensor's range, whose limits come back at once."""
+        limits_v = self.loop.law.coefficients["sensor_max_v"]
+        before_v, limits_v[:] = limits_v.copy(), -100.0
+        self.loop.run(2)
+        limits_v[:] = before_v
+
     def setpoint_of_loop(self, number: int = 0) -> float | None:
         """Return the constant reference (µm) in the loop's memory; None for another kind or in V."""
         generator = self.loop.assembly.generators[number]
@@ -123,7 +130,6 @@ def test_a_scheduled_setpoint_is_the_held_one() -> None:
 def test_the_service_knows_the_references_of_the_loop_after_any_commands(seed: int) -> None:
     """The commands are random modes, references, trips and resets on two axes; the loop's memory is the oracle."""
     bench, random, setpoints = Bench(TWO_AXES), np.random.default_rng(seed), 0
-    limits_v = bench.loop.law.coefficients["sensor_max_v"]
     for _ in range(150):
         action = random.choice(["mode", "setpoint", "sine", "reset", "trip"], p=[0.4, 0.4, 0.1, 0.05, 0.05])
         if action == "mode":
@@ -135,9 +141,7 @@ def test_the_service_knows_the_references_of_the_loop_after_any_commands(seed: i
         elif action == "reset":
             bench.desk.submit(Kind.RESET_TRIP)
         else:
-            before_v, limits_v[:] = limits_v.copy(), -100.0
-            bench.loop.run(2)
-            limits_v[:] = before_v
+            bench.trip()
         for number in range(2):
             setpoint_um = bench.setpoint_of_loop(number)
             if setpoint_um is None:
@@ -150,6 +154,9 @@ def test_the_service_knows_the_references_of_the_loop_after_any_commands(seed: i
 
 
 def test_after_lost_events_the_reference_is_unknown_until_mode_and_setpoint_are_set(bench: Bench) -> None:
+    bench.trip()
+    bench.references.follow()
+    bench.desk.submit(Kind.RESET_TRIP)
     for _ in range(len(bench.loop.block.ring("events").slots) // 4 + 1):
         for _ in range(4):
             bench.loop.send(Kind.LOAD_LAW, axis=7)  # There is no such axis: the loop refuses it by an event.
@@ -161,6 +168,27 @@ def test_after_lost_events_the_reference_is_unknown_until_mode_and_setpoint_are_
             bench.references.constant_reference_um(0)
     bench.references.set("x", {"kind": "hold", "value": 2.0})
     assert bench.references.constant_reference_um(0) == 2.0
+    bench.trip()  # The reset of the first trip is among the lost events.
+    bench.references.follow()
+    assert bench.references.trip[:2] == (2, Mode.CLOSED_LOOP)
+
+
+def test_a_trip_after_a_reset_has_neither_causes_nor_stop_of_the_first(bench: Bench) -> None:
+    def newest_trip() -> tuple[Any, ...]:
+        bench.references.follow()
+        return (*bench.references.trip[:2], *bench.references.trip[3:])
+
+    bench.trip()
+    sensor, both = Flag.TRIP_SENSOR_RANGE, Flag.TRIP_SENSOR_RANGE | Flag.TRIP_POSITION
+    assert newest_trip() == (1, Mode.CLOSED_LOOP, sensor, sensor, False)
+    bench.loop.law.coefficients["position_limit_um"] = -1.0
+    bench.set_mode(Mode.OFF)
+    assert newest_trip() == (1, Mode.CLOSED_LOOP, sensor, both, True)
+    bench.loop.law.coefficients["position_limit_um"] = 60.0
+    bench.desk.submit(Kind.RESET_TRIP)
+    bench.set_mode(Mode.FEEDFORWARD)
+    bench.trip()
+    assert newest_trip() == (2, Mode.FEEDFORWARD, sensor, sensor, False)
 
 
 def test_a_setpoint_that_is_set_just_now_is_read_from_a_record_that_has_it(

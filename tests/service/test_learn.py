@@ -142,9 +142,20 @@ def learn_until(bench: VirtualBench, end: Callable[[], Any]) -> tuple[Any, int, 
 
 
 def test_a_learning_that_trips_leaves_the_setpoint_as_reference(running: VirtualBench):
-    """After a reset the stage returns to its setpoint, and does not scan."""
+    """After a reset the stage returns to its setpoint, and does not scan. Until the trip, the status has the rms errors
+    of all cycles, first of the one without learning.
+    """
     tight = {"axis": "x", "section": "interlocks", "values": {"position_um": 3.0}}
-    _, code, text = learn_until(running, lambda: running.client.post("/tune", tight))
+
+    def read_progress_and_trip() -> Any:
+        running.wait_for(lambda: len(running.status()["measuring"]["rms_um"]) == 2, "a cycle with a learned table")
+        progress = running.status()["measuring"]
+        running.client.post("/tune", tight)
+        return progress
+
+    progress, code, text = learn_until(running, read_progress_and_trip)
+    assert (progress["activity"], progress["axis"], progress["cycles"]) == ("learn", "x", LONG_CYCLES)
+    assert progress["rms_um"][0] > max(0.5, 3.0 * progress["rms_um"][1])
     assert (code, "the loop tripped (position" in text["error"]) == (409, True), text
     assert reference_um(running) == SETPOINT_UM
     assert_setpoint_is_kept_over_a_reset(running)

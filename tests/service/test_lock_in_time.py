@@ -104,6 +104,19 @@ def test_work_that_goes_on_is_no_silence():
     assert bench.request("bob", "/lock")[0] == 200
 
 
+def test_the_last_of_several_requests_begins_the_silence():
+    clock = Clock()
+    lock = Lock(clock)
+    with lock.hold("ada"):
+        with lock.hold("ada"):
+            pass
+        clock.now_s += 300.0
+        with pytest.raises(Refusal, match=r"^ada has held the lock since "):
+            lock.take("bob")
+    clock.now_s += 60.0
+    lock.take("bob")
+
+
 def test_nothing_that_was_asked_for_before_the_key_came_takes_effect_after_it():
     bench = Bench()
     desk = Desk(None)  # type: ignore[arg-type]

@@ -15,7 +15,7 @@ from rtloop.drivers.base import Wiring
 from rtloop.drivers.errors import DriverError
 from rtloop.drivers.shm import ShmDriver, ShmOptions
 from rtloop.engine.memory import SharedBlock, Sizes
-from rtloop.errors import OutputError, UnavailableError
+from rtloop.errors import OutputError, RtloopError, UnavailableError
 from rtloop.hil import board
 from rtloop.supervision import parking
 from rtloop.supervision.hardware import Hardware, UnreadableNote, read_note, write_note
@@ -80,6 +80,16 @@ def test_a_board_that_cannot_be_mapped_is_told(tmp_path: Path, monkeypatch: pyte
     with pytest.raises(DriverError, match="Too many open files"):
         driver.open()
     assert len(os.listdir("/proc/self/fd")) == open_before
+
+
+def test_an_account_has_each_failure_and_the_exit_code_of_the_first():
+    account = ParkingAccount("lab")
+    for failure in (DriverError("the card is gone"), OutputError("the note stays")):
+        with account.collect_failures():
+            raise failure
+    with pytest.raises(RtloopError, match="no output was parked\nthe card is gone\nthe note stays") as caught:
+        account.result()
+    assert caught.value.exit_code == UnavailableError.exit_code
 
 
 def test_a_board_and_a_block_that_cannot_be_closed_are_parked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

@@ -14,10 +14,12 @@ import rtloop
 from rtloop.configuration.service import DepolariseOptions
 from rtloop.errors import RtloopError
 from rtloop.service.preparation import decaying_sine
+from rtloop.signals import ADC, POSITION, axis_column
 from tests.faults.account import runs_in
 from tests.faults.bench import Bench
 from tests.faults.configuration import on_a_rig
 from tests.virtual.bench import VirtualBench
+from tests.virtual.service import VirtualService
 
 THRESHOLDS_V = [0.095, 0.38, 0.84, 1.46, 2.21, 3.07, 4.01, 4.98, 5.96, 6.89, 7.76, 8.52, 9.14, 9.61, 9.9]
 WEIGHTS_UM_PER_V = [2.55, 0.57, 1.3, -1.57, 1.25, -0.054, -0.032, 0.66, 0.16, -0.77, 2.02, -1.63, -0.15, 2.99, -1.09]
@@ -68,6 +70,20 @@ def test_the_tare_survives_the_loop(tmp_path):
     assert abs(offsets_v[1][0] - offsets_v[0][-1]) < 1e-12
 
 
+def test_each_axis_is_tared_by_its_own_reading(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    bench = VirtualService(tmp_path, monkeypatch, "[service]\ntare_s = 0.05\n")
+    bench.begin_loop()
+    bench.driver.offsets_v = np.array([0.1, -0.2])
+    bench.turns.start(bench.service._prepare_and_start).join()
+    assert bench.service._offsets_v == {0: pytest.approx(0.1, abs=1e-9), 1: pytest.approx(-0.2, abs=1e-9)}
+    assert bench.service.supervisor is not None
+    newest = bench.service.supervisor.newest(1)[-1]
+    for number, offset_v in enumerate((0.1, -0.2)):
+        reading_v, position_um = (newest[axis_column(number, column)] for column in (ADC, POSITION))
+        assert position_um == pytest.approx(10.0 * (reading_v - offset_v), abs=1e-9)
+    bench.turns.end()
+
+
 @pytest.fixture
 def make_bench(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[..., VirtualBench]]:
     """Yield the constructor of a service in virtual time from changes of the paper's configuration."""
@@ -101,6 +117,7 @@ def test_while_the_actuator_is_depolarised_setpoints_move_nothing_and_no_start_u
     bench.client.post("/start")
     bench.await_drive()
     assert bench.column("x_drive_v")[-1] > 1.0
+    bench.client.post("/setpoint", {"axis": "x", "value": 4.0})  # The preparation that has ended refuses no reference.
 
 
 def test_a_service_in_mode_raw_plays_its_reference_after_the_tare(make_bench):

@@ -55,6 +55,10 @@ def test_a_preview_changes_nothing_and_takes_no_lock(virtual: VirtualBench):
     assert virtual.answer("POST", "/preview", body | {"axis": "y"})[0] == 422
     assert virtual.answer("POST", "/preview", body | {"section": "driver"})[0] == 422
     assert running_axis(virtual) == before
+    # After a change, a preview compares with the changed law.
+    virtual.client.post("/tune", body)
+    assert virtual.client.post("/preview", body)["before"]["crossover_hz"] == preview["after"]["crossover_hz"]
+    virtual.client.post("/undo", {"axis": "x"})
 
 
 def test_back_step_by_step(virtual: VirtualBench):

@@ -13,7 +13,9 @@ from prometheus_client.parser import text_string_to_metric_families
 from rtloop.configuration.axis import LimitsOptions
 from rtloop.service.api.metrics import QualityCollector
 from rtloop.service.measuring.quality import Quality
+from tests.engine.harness import LoopBench, prepare_text
 from tests.recording.hand_made_loop import AXES, COLUMNS, HandMadeLoop, make_rows
+from tests.recording.real_loop import ROOT, TWO_AXES
 
 TICKS = 12_000
 MODE, FLAGS, LATENESS, MISSED = map(COLUMNS.index, ("mode", "flags", "lateness_us", "periods_missed"))
@@ -130,9 +132,28 @@ def test_they_go_on_in_the_next_loop(bench: QualityBench):
     tripped[400:, FLAGS] = POSITION
     bench.run(tripped)
     bench.replace_loop()
+    tripped[:, FLAGS] = POSITION
     bench.run(tripped)
     assert bench.samples["ticks_summed_total",] == 1_000
     assert bench.samples["trips_total", "position"] == 2
+
+
+def test_each_axis_has_sums_of_its_own_and_is_judged_by_its_own_limits():
+    prepared, quality = prepare_text(TWO_AXES, ROOT / "deploy"), Quality()
+    loop = LoopBench(prepared.plan)
+    supervisor: Any = SimpleNamespace(block=loop.block, ticks=1, prepared=prepared)
+    rows = [loop.run(1_000)]
+    wide, narrow = (LimitsOptions(command_um=1e3, settled_within_um=within_um) for within_um in (1e3, 1e-9))
+    for limits, conditions in (([wide, narrow], ["controlled", "not settled"]),
+                               ([narrow, wide], ["not settled", "controlled"])):  # fmt: skip
+        quality.update(supervisor, limits)
+        assert [sums.condition for sums in quality.axes.values()] == conditions
+        rows.append(loop.run(1_000))
+    for name, sums in quality.axes.items():
+        drive_v = np.concatenate(rows[:-1])[:, prepared.plan.columns.index(f"{name}_drive_v")]
+        assert sums.drive_v2 == pytest.approx(np.sum(drive_v**2), rel=1e-12)
+    quality.update(None)
+    assert [sums.condition for sums in quality.axes.values()] == [None, None]
 
 
 def test_without_a_loop_there_is_nothing(bench: QualityBench):

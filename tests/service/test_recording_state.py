@@ -83,3 +83,7 @@ def test_a_recorder_that_is_behind_again_and_again_is_told_of_once_and_then_how_
         "the recorder has stopped or is too slow",
         "No space left on device",
     ]
+    slow.store(Word.RECORDER_FAILURE, 0)
+    update(59_000, 95, 0.5 * QUIET_S)
+    update(59_000, 95, QUIET_S)
+    assert messages[-2:] == [None, "ticks are recorded again after 1.0 s; 6 ticks lost"]

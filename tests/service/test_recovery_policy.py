@@ -56,19 +56,21 @@ def sound_rows(count: int, first_tick: int = 0) -> Any:
 
 
 class Loop:
-    """Stand-in for a loop's supervisor and live law; the test determines its records and trips."""
+    """Stand-in for a loop's supervisor and live law, with references of two axes; the test determines its records and
+    trips.
+    """
 
     def __init__(self) -> None:
         self.rows: deque[Any] = deque(maxlen=1000)
         self.ticks, self.prepared, self.references = 0, PREPARED, self
-        self.trip, self.client_counts, self.ended = NO_TRIP, (0,), False
-        self.reference = Setting((float(Generator.HOLD), 20.0), False)
+        self.trip, self.client_counts, self.ended = NO_TRIP, (0, 0), False
+        self.settings = [Setting((float(Generator.HOLD), value), False) for value in (20.0, 30.0)]
 
     def follow(self) -> None:
         pass
 
-    def setting(self, _: int) -> Setting:
-        return self.reference
+    def setting(self, number: int) -> Setting:
+        return self.settings[number]
 
     def execute(self, rows: Any) -> None:
         self.rows.append(rows)
@@ -149,7 +151,8 @@ def test_a_trip_from_outside_is_confirmed_as_often_as_the_policy_says():
     assert bench.run(WAIT_S + (CONFIRMATIONS - 0.5) * PERIOD_S) is None
     assert (bench.report["state"], bench.report["confirmed"]) == ("confirming", CONFIRMATIONS - 1)
     confirmed = bench.run(2 * PERIOD_S)
-    assert (confirmed.former.mode, confirmed.former.settings[0].values[1]) == (Mode.CLOSED_LOOP, 20.0)
+    assert confirmed.former.mode is Mode.CLOSED_LOOP
+    assert [setting.values[1] for setting in confirmed.former.settings] == [20.0, 30.0]
     assert bench.report["state"] == "returning"
     assert bench.recovery.finish(confirmed.serial)
     assert (bench.report["state"], bench.report["left"]) == ("ready", 1)
@@ -192,6 +195,12 @@ def test_unsound_readings_are_reported_now_and_then():
     bench.run(60.0, spoil)
     assert 5 <= sum(step is RecoveryStep.UNSOUND for step, _ in bench.steps) <= 7
     assert bench.report["state"] == "confirming"
+
+    def spoil_otherwise(rows: Any) -> None:
+        rows[:, signals.SAMPLE_AGE] = np.inf
+
+    bench.run(2 * PERIOD_S, spoil_otherwise)  # Another reason is reported at once.
+    assert bench.steps == [(RecoveryStep.UNSOUND, StepReason.AGE)]
 
 
 @pytest.mark.parametrize("cause", [flag for flag in Flag if flag & signals.TRIP_MASK])
@@ -243,6 +252,7 @@ def test_after_its_number_within_an_hour_a_trip_stays_latched():
     assert bench.report["state"] == "latched"
     bench.recovery.clear()
     bench.now_s += HOUR_S
+    assert bench.report["left"] == 2
     bench.trip(Flag.TRIP_STALE)
     bench.recover()
 
@@ -380,12 +390,25 @@ def test_a_reference_in_another_unit_is_not_returned_to():
     assert "reference" in bench.report["reason"]
 
 
-def test_a_setpoint_of_a_client_while_tripped_is_returned_to():
-    bench = Bench()
+@pytest.mark.parametrize("number", [0, 1])
+def test_a_setpoint_of_a_client_while_tripped_is_returned_to(number: int):
+    bench, values, counts = Bench(), [20.0, 30.0], [0, 0]
     bench.trip(Flag.TRIP_STALE)
     bench.run(WAIT_S)
-    bench.loop.reference, bench.loop.client_counts = Setting((float(Generator.HOLD), 5.0), False), (1,)
-    assert bench.run(10.0).former.settings[0].values[1] == 5.0
+    values[number], counts[number] = 5.0, 1
+    bench.loop.settings[number] = Setting((float(Generator.HOLD), 5.0), False)
+    bench.loop.client_counts = (counts[0], counts[1])
+    assert [setting.values[1] for setting in bench.run(10.0).former.settings] == values
+
+
+@pytest.mark.parametrize("number", [0, 1])
+def test_a_configured_table_that_was_changed_is_not_returned_to(number: int):
+    bench = Bench()
+    bench.loop.settings[number] = Setting((float(Generator.TABLE), 0.0, 4.0, 1.0, 1.0, 0.0), False)
+    bench.trip(Flag.TRIP_STALE)
+    bench.loop.prepared = replace(PREPARED, plan=replace(PREPARED.plan, table=np.ones(4)))
+    assert bench.run(60.0) is None
+    assert "changed" in bench.report["reason"]
 
 
 def test_a_policy_that_is_removed_ends_it():
@@ -408,6 +431,13 @@ def test_only_the_end_of_a_loop_by_an_allowed_cause_is_covered():
     assert bench.host.faults == ["the card is gone", "another"]
     bench.recovery.remove_own_faults(serial=1)  # The loops that ended otherwise have latched it.
     assert bench.host.faults == ["another"]
+    bench.host.faults += ["the card is gone"]  # This end is not accepted, although an equal one was.
+    bench.recovery.remove_own_faults(serial=1)
+    assert bench.host.faults == ["another", "the card is gone"]
+    assert bench.recovery.accept_end("driver_failed", "the card is gone")
+    bench.recovery.clear()
+    bench.recovery.remove_own_faults(serial=1)
+    assert bench.host.faults == ["another", "the card is gone"]
 
 
 def test_the_first_loop_of_a_service_must_start():
@@ -423,9 +453,10 @@ def test_the_pause_between_starts_doubles_up_to_a_limit():
         pauses_s.append(bench.recovery.pause_s)
     assert pauses_s[:3] == [WAIT_S, 2 * WAIT_S, 4 * WAIT_S]
     assert pauses_s[-1] == LONGEST_PAUSE_S
-    bench.recovery.clear()
-    bench.recovery.accept_failed_start("no answer")
-    assert bench.recovery.pause_s == WAIT_S
+    for end in (bench.recovery.clear, lambda: (bench.trip(Flag.TRIP_STALE), bench.recover())):
+        end()
+        bench.recovery.accept_failed_start("no answer")
+        assert bench.recovery.pause_s == WAIT_S
 
 
 AXIS = {name: signals.axis_column(0, column) for name, column in
@@ -459,6 +490,16 @@ def test_a_reading_is_sound_within_the_limits_of_the_interlocks(column, value, r
     rows = sound_rows(10)
     rows[5, column] = value
     assert unsound_reason(rows, change_interlocks(None, late_ticks=0, sample_age_us=1000.0)) is reason
+
+
+@pytest.mark.parametrize("number", [0, 1])
+def test_the_reading_of_each_axis_must_be_sound(number: int):
+    prepared = prepare(load(DEPLOY / "two-axis.toml"))
+    rows = np.zeros((10, len(prepared.plan.columns)))
+    rows[:, signals.TICK] = np.arange(10)
+    assert unsound_reason(rows, prepared) is None
+    rows[5, signals.axis_column(number, signals.ADC)] = np.nan
+    assert unsound_reason(rows, prepared) is StepReason.SENSOR
 
 
 @pytest.mark.parametrize(

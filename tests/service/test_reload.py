@@ -14,6 +14,7 @@ from rtloop.engine.memory import SharedBlock
 from rtloop.engine.messages import Kind
 from rtloop.errors import ConfigError
 from rtloop.service.changing.live import LiveLaw
+from rtloop.service.changing.preview import loop_figures
 from rtloop.service.desk import Refusal, UnconfirmedCommand
 
 DEPLOY = Path(__file__).resolve().parents[2] / "deploy"
@@ -141,6 +142,18 @@ def test_undo_leaves_the_reference_that_came_after_the_change(live, monkeypatch:
     assert position_limits_um(live) == [60.0, 50.0]
 
 
+def test_a_preview_compares_with_the_law_of_its_axis(live, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr("rtloop.service.changing.live.prepare_limited", prepare)
+    monkeypatch.setattr(
+        "rtloop.service.changing.live.figures_limited", lambda c, *rest: loop_figures(prepare(c), *rest)
+    )
+    live.tune(SECOND, "controller", {"gain": 0.012})
+    first_hz, second_hz = (
+        live.preview(axis, "limits", {"command_um": 40.0})["before"]["crossover_hz"] for axis in (FIRST, SECOND)
+    )
+    assert second_hz < 0.9 * first_hz
+
+
 def test_a_reload_ends_what_can_be_undone_and_one_that_changes_nothing_does_not(live, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr("rtloop.service.changing.live.prepare_limited", prepare)
     live.tune(FIRST, "interlocks", {"position_um": 50.0})
@@ -218,6 +231,10 @@ def test_a_refused_tare_does_not_come_with_the_next_change(live):
         return np.frombuffer(staged, live.prepared.plan.coefficients.dtype)["offset_v"].tolist()
 
     desk = live._staging.desk
+    desk.refuses |= {(Kind.LOAD_LAW, 0), (Kind.LOAD_LAW, 1)}
+    with pytest.raises(Refusal):
+        live.tare(1, 0.4)
+    desk.refuses.clear()
     assert live.tare(0, 0.25) == 7
     desk.refuses.add((Kind.LOAD_LAW, 0))
     with pytest.raises(Refusal):

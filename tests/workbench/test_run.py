@@ -210,9 +210,11 @@ def test_a_part_of_a_recording_is_refused_where_the_whole_is_needed(paper_run: R
 
 
 def test_a_tripped_run_is_a_result_and_no_exception(tmp_path: Path):
-    """The result is of a loop that was recorded in this process."""
-    text = changed_configuration(("position_um = 60.0", "position_um = 5.0"))
-    path, *_ = record(tmp_path / "run.mcap", text, 3_000)
+    """The result is of a loop that was recorded in this process; before its trip, it has made a whole step."""
+    text = changed_configuration(
+        ("position_um = 60.0", "position_um = 5.0"), ("levels = [20.0, 0.0, -20.0, 0.0]", "levels = [2.0, 0.0, 20.0]")
+    )
+    path, *_ = record(tmp_path / "run.mcap", text, 6_000)
     supervised = SupervisedRun([path], "done", {"complete": True}, [], None, 0)
     prepared = prepare(parse(text, "run", PAPER.parent, "run"))
     result = RunResult(prepared, supervised, summarise([path]), ["a"], None)
