@@ -80,7 +80,7 @@ def init(folder: Path, kind: str, name: str | None, config: Path | None, **figur
 
     \b
     paper   the paper's loop, its specification and a campaign
-    stage   a simulated stage of one resonance, its controller and a specification
+    stage   a simulated stage of one resonance, its controller, a specification and a campaign
     law     a controller in Python, its test and a configuration that uses it (`rtloop law new` too)
     driver  a driver in Python as a package, its test and a configuration
 

@@ -41,7 +41,7 @@ def paper() -> Starter:
 
 
 def stage(figures: StageFigures) -> Starter:
-    """Return files and first commands: a simulated stage with its controller, its two excitations, a specification.
+    """Return files and first commands: a simulated stage with controller, two excitations, specification, campaign.
 
     The constructor of StageFigures has checked the ranges of `figures`.
     """
@@ -53,6 +53,7 @@ def stage(figures: StageFigures) -> Starter:
         "rtloop design auto sine/*.mcap step/*.mcap --specs stage-spec.toml --robust --out robust.toml"
         "  # with integral action",
         "rtloop run designed.toml --duration 2",
+        "rtloop campaign run stage-campaign.toml --config robust.toml",
     )
     return Starter(texts, commands)
 

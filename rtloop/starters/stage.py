@@ -1,4 +1,4 @@
-"""A simulated stage with one resonance, from a few figures: configuration, specification and two excitations.
+"""A simulated stage with one resonance, from a few figures: configuration, specification, excitations and campaign.
 
     D(s) = ω²/(s² + 2ζω s + ω²)        C(s) = ki/s,  ki = min(2ζω/3, 0.1 rate)
 
@@ -18,7 +18,7 @@ from rtloop.starters.stage_excitation import excitation_values
 from rtloop.starters.stage_figures import RATES_HZ, SAMPLES_PER_PERIOD, TRAVEL_V, StageFigures
 from rtloop.starters.templates import fill_template
 
-FILES = ("stage.toml", "stage-spec.toml", "stage-sine.toml", "stage-step.toml")
+FILES = ("stage.toml", "stage-spec.toml", "stage-sine.toml", "stage-step.toml", "stage-campaign.toml")
 DELAY_TICKS = 1
 """Delay of the simulated board: written in tick k, seen in tick k + 2."""
 GAIN_MARGIN, LARGEST_GAIN_PER_TICK = 3.0, 0.1
@@ -36,13 +36,15 @@ LEAST_DWELL_S, DWELL_DECAYS, RUN_LEVELS = 0.1, 16.0, 5
 """Duration of a level of the reference: at least LEAST_DWELL_S, and so many time constants of the loop's slowest pole,
 of which a step takes about three to settle to 5 %; levels in the first run, with the one at which it begins.
 """
-SHORTEST_RUN_S = 2
+SHORTEST_RUN_S, LONGEST_CAMPAIGN_DWELL_S = 2, 10.0
 SETTLING_PERIODS, RESPONSE_PER_OMEGA = 4.8, 0.15
 """Settling time to specify, in periods of the resonance; pole of the tracking weight relative to ω."""
 
 
 def stage_files(figures: StageFigures) -> dict[str, str]:
-    """Return the texts of FILES by name: the loop, its specification, and a slow sine and a step without controller."""
+    """Return the texts of FILES by name: the loop, its specification, a slow sine and a step without controller, and a
+    campaign.
+    """
     values = _values(figures)
     values["rig"] = fill_template("stage-rig.toml", **values).rstrip("\n")
     return {name: fill_template(name, **values) for name in FILES}
@@ -101,6 +103,7 @@ def _loop_numbers(figures: StageFigures, actuator: Actuator) -> dict[str, float]
         "damping_term": 2 * figures.damping * omega,
         "ki_per_s": ki_per_s,
         "dwell_s": dwell_s,
+        "campaign_dwell_s": min(dwell_s, LONGEST_CAMPAIGN_DWELL_S),
         "trip_slew_v_per_s": figures.drive_v * min(100.0, figures.resonance_hz),
         "frozen_drive_v": figures.drive_v / 20,
         "settling_ms": 1e3 * SETTLING_PERIODS / figures.resonance_hz,

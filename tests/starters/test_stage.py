@@ -11,6 +11,8 @@ import numpy as np
 import pytest
 from scipy.signal import cont2discrete
 
+from rtloop.campaigns.campaign_file import load_campaign
+from rtloop.campaigns.case import CaseRunner
 from rtloop.configuration.cautions import cautions
 from rtloop.configuration.file import parse
 from rtloop.configuration.prepare import prepare
@@ -97,6 +99,23 @@ def test_a_level_of_the_reference_lasts_five_settling_times_and_the_run_five_lev
     assert f"rtloop run stage.toml --duration {duration_s:g}" in starter.texts["stage.toml"]
 
 
+def test_the_campaign_is_of_the_stage_and_of_a_designed_loop(tmp_path: Path) -> None:
+    """A configuration with a specification is judged by it; the levels and the loop of stage.toml are the stage's."""
+    texts = stage_files(StageFigures(310.0, 0.012, 80.0, drive_min_v=0.0, sensor_um_per_v=8.0, sensor_min_v=0.0))
+    for name, text in texts.items():
+        (tmp_path / name).write_text(text)
+    (tmp_path / "designed.toml").write_text(texts["stage.toml"].replace("# specification =", "specification ="))
+    own = load_campaign(tmp_path / "stage-campaign.toml")
+    assert own.limits == {}
+    designed = load_campaign(tmp_path / "stage-campaign.toml", configuration=tmp_path / "designed.toml")
+    specified = tomllib.loads(texts["stage-spec.toml"])["specification"]
+    assert designed.limits["steps.overshoot_percent"] == specified["overshoot_percent"]
+    assert designed.limits["steps.settling_ms"] == specified["settling_ms"]
+    case = CaseRunner(own).run(1)
+    assert case.missed == ()
+    assert case.figures["steps.static_error_percent"] < 0.01
+
+
 def test_a_light_resonance_limits_the_gain() -> None:
     stage = stage_values(StageFigures(800.0, 0.02))
     assert largest_pole(stage, 8.0) > 1
@@ -137,7 +156,7 @@ def test_the_largest_drive_moves_the_stage_by_its_range(range_um: float) -> None
 
 def test_figures_appear_in_the_files() -> None:
     texts = stage_files(StageFigures(1234.5, 0.01, 7.0, 8.0, 0.002, 0.001, 25_000.0))
-    stage, specification, sine, step = (tomllib.loads(text) for text in texts.values())
+    stage, specification, sine, step, _ = (tomllib.loads(text) for text in texts.values())
     sensor = {"noise_um": 0.002, "resolution_um": 0.001}
     assert stage["driver"]["plant"]["sensor"].items() >= sensor.items()
     assert specification["sensor"] == sensor
