@@ -89,7 +89,7 @@ class ExperimentOptions(Options):
 
 
 class StepsExperiment(ExperimentOptions):
-    """Steps between levels, from rest at 0; figures are the worst of all steps.
+    """Steps between levels, from rest at 0; figures are the worst of all steps that count.
 
     Overshoot and settling time are infinite if a step does not reach its level.
     """
@@ -102,6 +102,9 @@ class StepsExperiment(ExperimentOptions):
     """Duration of each level, rounded to whole ticks."""
     cycles: int = Field(default=1, ge=1, le=1000)
     """Number of times that the levels are played."""
+    first_step: bool | None = None
+    """Whether the step from rest to the first level counts; by default not for a drive of one sign, at whose end it
+    begins. The only step counts always."""
 
     @model_validator(mode="after")
     def _check(self) -> Self:
@@ -112,6 +115,10 @@ class StepsExperiment(ExperimentOptions):
                 "different from the level before"
             )
         return self
+
+    def about(self, middle_um: float) -> Self:
+        """Return the experiment with `first_step`, unless it is given: True for a middle at 0."""
+        return self if self.first_step is not None else self.model_copy(update={"first_step": middle_um == 0.0})
 
     @property
     def duration_s(self) -> float:
@@ -134,7 +141,7 @@ class StepsExperiment(ExperimentOptions):
         return ("overshoot_percent", "settling_ms", "static_error_percent")
 
     def measure(self, motion: Motion) -> tuple[float, ...]:
-        """Return the largest overshoot (%), settling time (ms) and static error (%) of all steps.
+        """Return the largest overshoot (%), settling time (ms) and static error (%) of all steps that count.
 
         Overshoot and settling time are infinite if a step misses its level, all three if a position is not finite.
         """
@@ -144,6 +151,8 @@ class StepsExperiment(ExperimentOptions):
             during_um = position_um[number * dwell - 1 : (number + 1) * dwell]
             steps.append(measure_step(during_um, next_um, next_um - level_um, POINTS * motion.rate_hz))
             level_um = next_um
+        if self.first_step is False and len(steps) > 1:
+            del steps[0]
         return tuple(np.max(np.where(np.isnan(steps), np.inf, steps), axis=0).tolist())
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -10,6 +11,7 @@ import click
 from rtloop.cli.exit_codes import report_errors
 from rtloop.cli.identify import AXIS
 from rtloop.cli.options import JSON, OUTPUT, TARGET
+from rtloop.cli.output.progress import StatusLine
 from rtloop.cli.robust import print_taps
 from rtloop.cli.verify import verify_configuration
 from rtloop.errors import NoDesign
@@ -60,7 +62,13 @@ def auto(
     recordings = (hysteresis, step, specs, out, axis, order)
     synthesised_norm = 0.0
     if robust:
-        loop = write_robust_design(*recordings, lambda line: click.echo(line, err=True))
+        with StatusLine("identifying the stage", sys.stderr) as status:
+
+            def show(line: str) -> None:
+                click.echo(line, err=True)
+                status.update("searching a controller and taps")
+
+            loop = write_robust_design(*recordings, show)
         print_taps(loop.taps, loop.subject)
         controller_percent, options = loop.design.scenarios.resonance_percent, loop.subject.options
         figures = (
@@ -69,7 +77,8 @@ def auto(
         )
         stage = loop.stage
     else:
-        chain = write_design(*recordings)
+        with StatusLine("identifying the stage and synthesising a controller", sys.stderr):
+            chain = write_design(*recordings)
         synthesis, stage = chain.synthesis, chain.stage
         synthesised_norm = synthesis.achieved
         figures = (

@@ -71,7 +71,8 @@ def run(
     Ctrl-C, the rigs that run are finished, and no other begins. Results are Parquet files in the folder of --out, with
     recordings of the worst rigs.
 
-    Exit 1 if a rig failed, tripped or crashed its worker, and if no rig passed.
+    Exit 0 where every rig that can run passed. Exit 1 where a rig exceeded a limit, tripped or crashed its worker, or
+    where no rig can run.
     """
     require_readable(campaign)
     from rtloop.supervision.interruption import Interruption
@@ -108,7 +109,8 @@ def run(
 def report(folder: Path, worst_count: int, page: Path | None, as_json: bool) -> int:
     """Report from the results in FOLDER alone.
 
-    Exit 1 if a rig failed, tripped or crashed its worker, and if no rig passed.
+    Exit 0 where every rig that can run passed. Exit 1 where a rig exceeded a limit, tripped or crashed its worker, or
+    where no rig can run.
     """
     if folder.is_file():
         require_readable(folder)
@@ -191,9 +193,9 @@ def _report(folder: Path, worst_count: int, as_json: bool, page: Path | None) ->
     """Print the summary of a campaign's results in `folder`, with its `worst_count` worst rigs; then write it as HTML
     to `page`, if given, over an existing file.
 
-    Returns the exit code: 1 if a rig failed (also by a trip) or crashed its worker, or no rig passed, else 0. Raises
-    InputFileError for a folder without results or with damaged ones, MissingExtra without pyarrow, OutputError if
-    `page` cannot be written.
+    Returns the exit code: 0 if every rig that can run passed, 1 if one did not or none can run. Raises InputFileError
+    for a folder without results or with damaged ones, MissingExtra without pyarrow, OutputError if `page` cannot be
+    written.
     """
     from rtloop.campaigns.summary import summarise_campaign
 

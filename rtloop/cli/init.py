@@ -8,10 +8,11 @@ from typing import TYPE_CHECKING
 import click
 
 from rtloop.cli.exit_codes import report_errors
-from rtloop.cli.laws import LAW_NAME
-from rtloop.cli.options import OUTPUT, TARGET
+from rtloop.cli.laws import LAW_NAME, STAGE, load_stage
+from rtloop.cli.options import TARGET
 
 if TYPE_CHECKING:
+    from rtloop.configuration.file import Configuration
     from rtloop.starters.folder import Starter
 
 NAMES = {"law": "my_law", "driver": "my_card"}
@@ -28,12 +29,7 @@ NAMES = {"law": "my_law", "driver": "my_card"}
     help="Subject of the files: the paper's loop, a simulated stage, a law or a driver.",
 )
 @click.option("--name", type=LAW_NAME, help="Name of the law or driver.  [default: my_law or my_card]")
-@click.option(
-    "--config",
-    type=OUTPUT,
-    metavar="STAGE.toml",
-    help="Configuration in FOLDER, in which the law will run.  [default: the paper's rig]",
-)
+@STAGE
 @click.option("--resonance-hz", type=float, help="Resonance of the stage, 1 to 10000 Hz.  [default: 800]")
 @click.option("--damping", type=float, help="Damping ratio of the resonance, 0.001 to 0.9.  [default: 0.02]")
 @click.option("--range-um", type=float, help="Position at the largest drive, reached from rest, in µm.  [default: 20]")
@@ -80,15 +76,16 @@ def init(folder: Path, kind: str, name: str | None, config: Path | None, **figur
 
     \b
     paper   the paper's loop, its specification and a campaign
-    stage   a simulated stage of one resonance, its controller and a specification
+    stage   a simulated stage of one resonance, its controller, a specification and a campaign
     law     a controller in Python, its test and a configuration that uses it (`rtloop law new` too)
     driver  a driver in Python as a package, its test and a configuration
 
     No file is overwritten: where one exists already, nothing is written.
     """
-    if config is not None:
-        _require_in_folder(config, folder, kind)
-    starter = _starter(kind, name, config, {key: value for key, value in figures.items() if value is not None})
+    if config is not None and kind != "law":
+        raise click.UsageError(f"--config: not allowed with --kind {kind}; allowed with --kind law")
+    stage = load_stage(config, folder)
+    starter = _starter(kind, name, stage, {key: value for key, value in figures.items() if value is not None})
     from rtloop.starters.folder import write_starter
 
     for path in write_starter(starter, folder):
@@ -98,25 +95,12 @@ def init(folder: Path, kind: str, name: str | None, config: Path | None, **figur
         click.echo(f"  {command}")
 
 
-def _require_in_folder(config: Path, folder: Path, kind: str) -> None:
-    """Raise UsageError unless `kind` is "law" and the configuration lies directly in `folder`.
-
-    The relative paths in a configuration from another folder would name other files.
-    """
-    if kind != "law":
-        raise click.UsageError(f"--config: not allowed with --kind {kind}; allowed with --kind law")
-    if config.resolve().parent != folder.resolve():
-        raise click.UsageError(
-            f"--config: {config} is not in {folder.resolve()}; allowed: a file directly in this folder"
-        )
-
-
-def _starter(kind: str, name: str | None, config: Path | None, figures: dict[str, float]) -> Starter:
+def _starter(kind: str, name: str | None, stage: Configuration | None, figures: dict[str, float]) -> Starter:
     """Return the files of a kind, not yet written, and the commands that come next.
 
-    `name` is the name of a law or driver (None: its entry in NAMES); `config` is the configuration for a law (None: the
+    `name` is the name of a law or driver (None: its entry in NAMES); `stage` is the configuration for a law (None: the
     paper's rig); `figures` are the given options of a stage by their names. Raises UsageError for an option that
-    belongs to another kind or is out of range, RtloopError for a configuration that is unreadable or invalid.
+    belongs to another kind or is out of range.
     """
     from rtloop.starters import folder
     from rtloop.starters.stage_figures import stage_figures
@@ -135,6 +119,4 @@ def _starter(kind: str, name: str | None, config: Path | None, figures: dict[str
         return folder.paper()
     if kind == "driver":
         return folder.driver(name or NAMES[kind])
-    from rtloop.configuration.file import load
-
-    return folder.law(name or NAMES[kind], None if config is None else load(config))
+    return folder.law(name or NAMES[kind], stage)

@@ -4,20 +4,29 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from rtloop.cli.exit_codes import report_errors
-from rtloop.cli.options import JSON, TARGET, MatchingText
+from rtloop.cli.options import JSON, OUTPUT, TARGET, MatchingText
 from rtloop.cli.output import echo_json
 from rtloop.errors import ConfigError
 from rtloop.workbench.tables import console, escape, table
+
+if TYPE_CHECKING:
+    from rtloop.configuration.file import Configuration
 
 LAW_NAME = MatchingText(
     "name", r"[a-z][a-z0-9_]{0,31}", "small letters, digits and '_', a letter first, at most 32 characters"
 )
 """A name that is valid for a file, a module and a class."""
+STAGE = click.option(
+    "--config",
+    type=OUTPUT,
+    metavar="STAGE.toml",
+    help="Configuration, in the folder of the files, in which the law will run.  [default: the paper's rig]",
+)
 
 
 @click.command()
@@ -37,19 +46,37 @@ def law() -> None:
 @law.command()
 @click.argument("name", type=LAW_NAME)
 @click.option("--out", type=TARGET, default=Path(), help="Folder for the three files.  [default: the current folder]")
+@STAGE
 @report_errors
-def new(name: str, out: Path) -> None:
-    """Write NAME.py, its test and an example configuration.
+def new(name: str, out: Path, config: Path | None) -> None:
+    """Write NAME.py, its test and a configuration that uses it.
 
     The law in NAME.py is a PI controller that runs; docs/laws.md explains how to change it. `rtloop init --kind law`
-    writes the same files and the schema for editors, and can take a configuration of your stage (--config).
+    writes the same files and the schema for editors.
     """
     from rtloop.starters.law import law_files
     from rtloop.starters.new_files import write_new_files
 
-    for path in write_new_files(out, law_files(name)):
+    for path in write_new_files(out, law_files(name, load_stage(config, out))):
         click.echo(path)
     click.echo(f"next: rtloop check {out / name}.toml")
+
+
+def load_stage(config: Path | None, folder: Path) -> Configuration | None:
+    """Load the configuration in which a law of `folder` will run; None without one.
+
+    Raises UsageError for a configuration that does not lie directly in `folder`, because its relative paths would name
+    other files there; RtloopError for one that is unreadable or invalid.
+    """
+    if config is None:
+        return None
+    if config.resolve().parent != folder.resolve():
+        raise click.UsageError(
+            f"--config: {config} is not in {folder.resolve()}; allowed: a file directly in this folder"
+        )
+    from rtloop.configuration.file import load
+
+    return load(config)
 
 
 def list_laws() -> list[dict[str, object]]:

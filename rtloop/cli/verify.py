@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -12,6 +13,7 @@ import click
 from rtloop.cli.exit_codes import report_errors
 from rtloop.cli.options import CONFIG, JSON, OUTPUT, TARGET
 from rtloop.cli.output import echo_json, print_warnings
+from rtloop.cli.output.progress import StatusLine
 from rtloop.errors import ConfigError
 from rtloop.workbench.tables import console, escape, table
 from rtloop.workbench.written_files import write_outputs
@@ -47,28 +49,31 @@ def verify(config: Path, spec: Path | None, out: Path | None, as_json: bool) -> 
 
 
 def verify_configuration(config: Path, spec: Path | None, out: Path | None, as_json: bool) -> int:
-    """Judge and print every axis that has a controller; write a report to the folder `out`, if given.
+    """Judge and print every axis that has a controller; write a report to the folder `out`, if given. A terminal shows
+    the present step.
 
     Returns the exit code: 1 where a loop is unstable or misses its specification, else 0. `spec` replaces the axes' own
     specifications. Raises ConfigError for an invalid configuration or specification, if no axis has a controller, or
     where python-control computes other figures; InputFileError for a file that cannot be read, OutputError for a report
     that cannot be written, MissingExtra for a report without matplotlib.
     """
-    from rtloop.configuration.checks import Findings, check_axes
-    from rtloop.configuration.file import load
-    from rtloop.design.verification.axes import add_simulation, verify_axis
-    from rtloop.design.verification.json_values import as_dict
+    with StatusLine("judging the linear loops", sys.stderr) as status:
+        from rtloop.configuration.checks import Findings, check_axes
+        from rtloop.configuration.file import load
+        from rtloop.design.verification.axes import add_simulation, verify_axis
+        from rtloop.design.verification.json_values import as_dict
 
-    configuration = load(config)
-    findings = Findings()
-    checks = check_axes(configuration, findings)
-    if any(check.law is None and configuration.axes[i].controller for i, check in enumerate(checks)):
-        raise ConfigError(str(config), findings.faults)
-    verifications = {check.name: verify_axis(configuration, check, spec) for check in checks if check.law}
-    if not verifications:
-        raise ConfigError(str(config), ["axis: no axis has a controller; verification needs [axis.controller]"])
-    _require_second_opinion(configuration, checks, verifications)
-    verifications = add_simulation(configuration, verifications)
+        configuration = load(config)
+        findings = Findings()
+        checks = check_axes(configuration, findings)
+        if any(check.law is None and configuration.axes[i].controller for i, check in enumerate(checks)):
+            raise ConfigError(str(config), findings.faults)
+        verifications = {check.name: verify_axis(configuration, check, spec) for check in checks if check.law}
+        if not verifications:
+            raise ConfigError(str(config), ["axis: no axis has a controller; verification needs [axis.controller]"])
+        _require_second_opinion(configuration, checks, verifications)
+        status.update("simulating steps")
+        verifications = add_simulation(configuration, verifications)
     meets_all = all(verification.meets_specification for verification, _ in verifications.values())
     report: dict[str, object] = {
         "name": configuration.name,

@@ -41,20 +41,19 @@ def paper() -> Starter:
 
 
 def stage(figures: StageFigures) -> Starter:
-    """Return files and first commands: a simulated stage with its controller, its two excitations, a specification.
+    """Return files and first commands: a simulated stage with controller, two excitations, specification, campaign.
 
     The constructor of StageFigures has checked the ranges of `figures`.
     """
     texts = stage_files(figures)
-    excitations = [_first_command(texts[name]) for name in ("stage-sine.toml", "stage-step.toml")]
     commands = (
         "rtloop check stage.toml",
-        "rtloop run stage.toml --duration 2",
-        *excitations,
+        *(_first_run(texts[name]) for name in ("stage.toml", "stage-sine.toml", "stage-step.toml")),
         "rtloop design auto sine/*.mcap step/*.mcap --specs stage-spec.toml --out designed.toml",
         "rtloop design auto sine/*.mcap step/*.mcap --specs stage-spec.toml --robust --out robust.toml"
         "  # with integral action",
         "rtloop run designed.toml --duration 2",
+        "rtloop campaign run stage-campaign.toml --config robust.toml",
     )
     return Starter(texts, commands)
 
@@ -99,9 +98,9 @@ def _test_commands(name: str) -> tuple[str, str]:
     return "pip install pytest", f"python -m pytest test_{name}.py"
 
 
-def _first_command(text: str) -> str:
-    """Return the first `rtloop` command in the comments of a configuration, which must have one."""
-    return next(line.removeprefix("#").strip() for line in text.splitlines() if line.startswith("#   rtloop "))
+def _first_run(text: str) -> str:
+    """Return the first `rtloop run` in the comments of a configuration, which must have one."""
+    return next(line.removeprefix("#").strip() for line in text.splitlines() if line.startswith("#   rtloop run "))
 
 
 def _add_schema_line(name: str, text: str) -> str:

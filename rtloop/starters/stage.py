@@ -1,4 +1,4 @@
-"""A simulated stage with one resonance, from a few figures: configuration, specification and two excitations.
+"""A simulated stage with one resonance, from a few figures: configuration, specification, excitations and campaign.
 
     D(s) = ω²/(s² + 2ζω s + ω²)        C(s) = ki/s,  ki = min(2ζω/3, 0.1 rate)
 
@@ -11,12 +11,14 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 
+import numpy as np
+
 from rtloop.starters.stage_actuator import Actuator, make_actuator
 from rtloop.starters.stage_excitation import excitation_values
 from rtloop.starters.stage_figures import RATES_HZ, SAMPLES_PER_PERIOD, TRAVEL_V, StageFigures
 from rtloop.starters.templates import fill_template
 
-FILES = ("stage.toml", "stage-spec.toml", "stage-sine.toml", "stage-step.toml")
+FILES = ("stage.toml", "stage-spec.toml", "stage-sine.toml", "stage-step.toml", "stage-campaign.toml")
 DELAY_TICKS = 1
 """Delay of the simulated board: written in tick k, seen in tick k + 2."""
 GAIN_MARGIN, LARGEST_GAIN_PER_TICK = 3.0, 0.1
@@ -30,12 +32,19 @@ sensor's range trips at 9.99 V.
 """
 SENSOR_MARGIN_V, NOISE_DEVIATIONS = 0.01, 10.0
 """Distance of the interlock from the sensor's lowest reading, and from 0 V in standard deviations of the noise."""
+LEAST_DWELL_S, DWELL_DECAYS, RUN_LEVELS = 0.1, 16.0, 5
+"""Duration of a level of the reference: at least LEAST_DWELL_S, and so many time constants of the loop's slowest pole,
+of which a step takes about three to settle to 5 %; levels in the first run, with the one at which it begins.
+"""
+SHORTEST_RUN_S, LONGEST_CAMPAIGN_DWELL_S = 2, 10.0
 SETTLING_PERIODS, RESPONSE_PER_OMEGA = 4.8, 0.15
 """Settling time to specify, in periods of the resonance; pole of the tracking weight relative to ω."""
 
 
 def stage_files(figures: StageFigures) -> dict[str, str]:
-    """Return the texts of FILES by name: the loop, its specification, and a slow sine and a step without controller."""
+    """Return the texts of FILES by name: the loop, its specification, a slow sine and a step without controller, and a
+    campaign.
+    """
     values = _values(figures)
     values["rig"] = fill_template("stage-rig.toml", **values).rstrip("\n")
     return {name: fill_template(name, **values) for name in FILES}
@@ -53,12 +62,13 @@ def _values(figures: StageFigures) -> dict[str, object]:
     um_per_v = figures.sensor_um_per_v or figures.range_um / TRAVEL_V
     noise_um, resolution_um = _sensor_um(figures)
     position_um = min(INTERLOCK_TRAVELS * figures.range_um, INTERLOCK_V * um_per_v)
+    loop_numbers = _loop_numbers(figures, actuator)
     numbers = {
         "sensor_um_per_v": um_per_v,
         "noise_um": noise_um,
         "resolution_um": resolution_um,
         "position_um": position_um,
-        **_loop_numbers(figures, actuator),
+        **loop_numbers,
         **_travel_numbers(figures.range_um, min(figures.range_um, position_um), max(actuator.lowest_um, 0.0)),
     }
     rate_hz = _rate_hz(figures)
@@ -73,6 +83,7 @@ def _values(figures: StageFigures) -> dict[str, object]:
         "levels": _numbers(_levels_um(actuator, position_um)),
         **_sensor_min_lines(figures.sensor_min_v, noise_um / um_per_v),
         "delay_ticks": DELAY_TICKS,
+        "run_duration_s": max(SHORTEST_RUN_S, math.ceil(RUN_LEVELS * loop_numbers["dwell_s"])),
         "swing_ticks": math.ceil(1.5 * period_ticks),
         "frozen_ticks": max(50, math.ceil(period_ticks / 2)),
         **excitation_values(figures, actuator, position_um, noise_um, rate_hz),
@@ -83,13 +94,16 @@ def _loop_numbers(figures: StageFigures, actuator: Actuator) -> dict[str, float]
     """Return the numbers of the templates that depend on resonance and drive, by name."""
     omega, rate_hz = 2 * math.pi * figures.resonance_hz, _rate_hz(figures)
     ki_per_s, pole = _integral_gain(figures, rate_hz), RESPONSE_PER_OMEGA * omega
+    poles = np.roots([1.0, 2 * figures.damping * omega, omega**2, ki_per_s * omega**2])
+    dwell_s = max(LEAST_DWELL_S, DWELL_DECAYS / float(np.min(-poles.real)))
     return {
         "drive_v": actuator.highest_v,
         "drive_min_v": actuator.lowest_v,
         "omega_squared": omega**2,
         "damping_term": 2 * figures.damping * omega,
         "ki_per_s": ki_per_s,
-        "dwell_s": max(0.1, 5 / ki_per_s),
+        "dwell_s": dwell_s,
+        "campaign_dwell_s": min(dwell_s, LONGEST_CAMPAIGN_DWELL_S),
         "trip_slew_v_per_s": figures.drive_v * min(100.0, figures.resonance_hz),
         "frozen_drive_v": figures.drive_v / 20,
         "settling_ms": 1e3 * SETTLING_PERIODS / figures.resonance_hz,

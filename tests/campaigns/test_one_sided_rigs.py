@@ -5,11 +5,13 @@ from __future__ import annotations
 import math
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from rtloop.campaigns.campaign_file import load_campaign
 from rtloop.campaigns.case import CaseRunner
 from rtloop.campaigns.recorded_case import has_ticks, record_rig
+from rtloop.campaigns.rig_experiments import POINTS, Motion
 from rtloop.configuration.reference_options import HoldOptions, WaveOptions
 from rtloop.errors import ConfigError
 from rtloop.starters.stage import stage_files
@@ -67,6 +69,21 @@ def test_a_reference_beyond_reach_is_refused_before_it_runs(tmp_path: Path, expe
 def test_the_rest_before_the_first_step_is_no_level_to_come_back_to(tmp_path: Path) -> None:
     runner = campaign(tmp_path, '[[experiment]]\nkind = "steps"\nlevels_um = [40.0, 20.0]\ndwell_s = 1.0\n')
     assert runner.run(0).figures["steps.static_error_percent"] < 0.1
+
+
+@pytest.mark.parametrize(
+    ("line", "configuration", "overshoot_percent"),
+    [("", None, 5.0), ("first_step = true\n", None, 20.0), ("", PAPER, 20.0), ("first_step = false\n", PAPER, 5.0)],
+)
+def test_the_step_from_the_end_of_a_drive_counts_on_request_alone(
+    tmp_path: Path, line: str, configuration: Path | None, overshoot_percent: float
+) -> None:
+    """The first step, of 10 µm, swings over by 2 µm; the second, of 4 µm, by 0.2 µm."""
+    steps = f'[[experiment]]\nkind = "steps"\nlevels_um = [10.0, 6.0]\ndwell_s = 0.01\n{line}'
+    (experiment,) = campaign(tmp_path, steps, configuration).options.experiment
+    position_um = np.repeat([0.0, 12.0, 10.0, 5.8, 6.0], [100, 20, 80, 20, 80])
+    motion = Motion(np.repeat([0.0, 10.0, 6.0], 100), np.tile(position_um[:, None], POINTS), 10_000.0)
+    assert experiment.measure(motion)[0] == pytest.approx(overshoot_percent)
 
 
 def test_a_scan_of_both_signs_stays_about_0(tmp_path: Path) -> None:

@@ -138,6 +138,21 @@ def test_a_law_takes_a_stage_of_ones_own(tmp_path: Path) -> None:
     assert running.stable
 
 
+def test_law_new_takes_a_stage_too_in_the_folder_of_the_law_alone(tmp_path: Path) -> None:
+    init(tmp_path, "--kind", "stage", "--drive-min-v", -2, "--resonance-hz", 400)
+    arguments = ["law", "new", "damping", "--config", str(tmp_path / "stage.toml")]
+    elsewhere = CliRunner().invoke(main, [*arguments, "--out", str(tmp_path / "other")])
+    assert elsewhere.exit_code == 2
+    assert "allowed: a file directly in this folder" in elsewhere.output
+    assert not (tmp_path / "other").exists()
+    result = CliRunner().invoke(main, [*arguments, "--out", str(tmp_path)])
+    assert result.exit_code == 0, result.output
+    stage, law = (tomllib.loads((tmp_path / f"{name}.toml").read_text()) for name in ("stage", "damping"))
+    assert law["driver"] == stage["driver"]
+    assert law["axis"][0]["limits"] == stage["axis"][0]["limits"]
+    assert law["axis"][0]["controller"]["file"] == "damping.py"
+
+
 def test_a_law_on_another_controllers_stage_begins_slowly_and_without_its_prefilter(tmp_path: Path) -> None:
     init(tmp_path)
     assert init(tmp_path, "--kind", "law", "--config", tmp_path / "robust.toml").exit_code == 0

@@ -11,9 +11,12 @@ import numpy as np
 import pytest
 from scipy.signal import cont2discrete
 
+from rtloop.campaigns.campaign_file import load_campaign
+from rtloop.campaigns.case import CaseRunner
 from rtloop.configuration.cautions import cautions
 from rtloop.configuration.file import parse
 from rtloop.configuration.prepare import prepare
+from rtloop.starters import folder
 from rtloop.starters.stage import stage_files
 from rtloop.starters.stage_figures import StageFigures, stage_figures
 
@@ -39,6 +42,26 @@ def largest_pole(stage: dict, gain_factor: float = 1.0) -> float:
     return float(np.max(np.abs(np.roots(np.polyadd(open_loop, gain * numerator.ravel())))))
 
 
+def settling_s(stage: dict, points: int = 2000) -> float:
+    """Return the time in s after which a step of the closed loop stays within 5 %, judged at `points` of a dwell."""
+    axis, period_s = stage["axis"][0], 1 / stage["loop"]["rate_hz"]
+    (_, damping_term, stiffness) = axis["model"]["denominator"][0]
+    matrices = np.array([[0.0, 1.0], [-stiffness, -damping_term]]), np.array([[0.0], [stiffness]])
+    a, b, *_ = cont2discrete((*matrices, np.array([[1.0, 0.0]]), np.zeros((1, 1))), period_s, "zoh")
+    assert axis["model"]["delay_ticks"] == 1
+    gain = axis["controller"]["ki_per_s"] * period_s
+    loop = np.zeros((5, 5))  # position, speed, delayed command, integral, reference of 1
+    loop[:2, :2], loop[:2, 2:3], loop[2, 3], loop[4, 4] = a, b, 1.0, 1.0
+    loop[3, [0, 3, 4]] = -gain, 1.0, gain
+    ticks = max(1, round(axis["reference"]["dwell_s"] / period_s / points))
+    several, state, last = np.linalg.matrix_power(loop, ticks), np.array([0.0, 0.0, 0.0, 0.0, 1.0]), 0
+    for point in range(1, points + 1):
+        state = several @ state
+        if abs(state[0] - 1) > 0.05:
+            last = point
+    return last * ticks * period_s
+
+
 def one_sided_figures(resonance_hz: float, damping: float, range_um: float, sides: dict[str, float]) -> StageFigures:
     """Return the figures of a stage with an entry of ONE_SIDED."""
     values = {name: value for name, value in sides.items() if name != "sensor_share"}
@@ -61,6 +84,36 @@ def test_the_loop_is_stable_with_twice_its_gain(rate_samples: float | None) -> N
         for sides in ONE_SIDED:
             stage = stage_values(one_sided_figures(resonance_hz, damping, range_um, sides))
             assert largest_pole(stage, 2.0) < 1, (resonance_hz, damping, sides)
+
+
+@pytest.mark.parametrize("figures", [*GRID[::3], (310.0, 0.012, 80.0), (1.0, 0.9, 20.0)], ids=str)
+def test_a_level_of_the_reference_lasts_five_settling_times_and_the_run_five_levels(
+    figures: tuple[float, float, float],
+) -> None:
+    starter = folder.stage(StageFigures(*figures))
+    values = tomllib.loads(starter.texts["stage.toml"])
+    dwell_s, settled_s = values["axis"][0]["reference"]["dwell_s"], settling_s(values)
+    assert 5 * settled_s < dwell_s < max(0.11, 10 * settled_s)
+    (duration_s,) = (float(command.split()[-1]) for command in starter.commands if "run stage.toml" in command)
+    assert duration_s >= 5 * dwell_s
+    assert f"rtloop run stage.toml --duration {duration_s:g}" in starter.texts["stage.toml"]
+
+
+def test_the_campaign_is_of_the_stage_and_of_a_designed_loop(tmp_path: Path) -> None:
+    """A configuration with a specification is judged by it; the levels and the loop of stage.toml are the stage's."""
+    texts = stage_files(StageFigures(310.0, 0.012, 80.0, drive_min_v=0.0, sensor_um_per_v=8.0, sensor_min_v=0.0))
+    for name, text in texts.items():
+        (tmp_path / name).write_text(text)
+    (tmp_path / "designed.toml").write_text(texts["stage.toml"].replace("# specification =", "specification ="))
+    own = load_campaign(tmp_path / "stage-campaign.toml")
+    assert own.limits == {}
+    designed = load_campaign(tmp_path / "stage-campaign.toml", configuration=tmp_path / "designed.toml")
+    specified = tomllib.loads(texts["stage-spec.toml"])["specification"]
+    assert designed.limits["steps.overshoot_percent"] == specified["overshoot_percent"]
+    assert designed.limits["steps.settling_ms"] == specified["settling_ms"]
+    case = CaseRunner(own).run(1)
+    assert case.missed == ()
+    assert case.figures["steps.static_error_percent"] < 0.01
 
 
 def test_a_light_resonance_limits_the_gain() -> None:
@@ -103,7 +156,7 @@ def test_the_largest_drive_moves_the_stage_by_its_range(range_um: float) -> None
 
 def test_figures_appear_in_the_files() -> None:
     texts = stage_files(StageFigures(1234.5, 0.01, 7.0, 8.0, 0.002, 0.001, 25_000.0))
-    stage, specification, sine, step = (tomllib.loads(text) for text in texts.values())
+    stage, specification, sine, step, _ = (tomllib.loads(text) for text in texts.values())
     sensor = {"noise_um": 0.002, "resolution_um": 0.001}
     assert stage["driver"]["plant"]["sensor"].items() >= sensor.items()
     assert specification["sensor"] == sensor
