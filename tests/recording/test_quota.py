@@ -7,6 +7,7 @@ import json
 import os
 import queue
 import time
+from collections.abc import Sequence
 from itertools import count
 from pathlib import Path
 from types import SimpleNamespace
@@ -38,13 +39,13 @@ AROUND = {"before_s": 0.1, "after_s": 0.2, "every_s": 1.0, "on": ["trip"]}
 
 
 def write_file(
-    folder: Path, stem: str, number: int = 1, trip: int | None = None, kind: Kind = Kind.TRIPPED, **header: object
+    folder: Path, stem: str, number: int = 1, trips: Sequence[int] = (), kind: Kind = Kind.TRIPPED, **header: object
 ) -> Path:
-    """Write file `number` of a run, with an event of `kind` at the tick `trip`. Returns its path."""
+    """Write file `number` of a run, with an event of `kind` at each of the ticks `trips`. Returns its path."""
     first = (number - 1) * PART_TICKS
     header = make_header(sequence=number, first_tick=first, format=2, around=AROUND, **header)
     writer = Writer(folder / f"{stem}.mcap", header, START_UNIX_NS)
-    if trip is not None:
+    for trip in trips:
         record = message(kind, tick=trip, axis=0, values=[Flag.TRIP_POSITION])[0]
         writer.write_messages([event_message(event_from_message(record, AXES, 0), START_UNIX_NS)])
     writer.write_ticks(make_rows(1_000, first=first))
@@ -53,14 +54,19 @@ def write_file(
 
 
 def write_run(
-    folder: Path, stamp: str, files: int, trip: int | None = None, name: str = "test", kind: Kind = Kind.TRIPPED
+    folder: Path, stamp: str, files: int, *trips: int, name: str = "test", kind: Kind = Kind.TRIPPED
 ) -> list[Path]:
-    """Write the files of one run, with an event of `kind` at the tick `trip`. Returns their paths."""
-    trips = {} if trip is None else {trip // PART_TICKS + 1: trip}
+    """Write the files of one run, with an event of `kind` at each of the ticks `trips`. Returns their paths."""
     created = START_UNIX_NS + int(stamp[-1]) * 10**9
     return [
         write_file(
-            folder, f"{name}-{stamp}-{number:04d}", number, trips.get(number), kind, created_unix_ns=created, name=name
+            folder,
+            f"{name}-{stamp}-{number:04d}",
+            number,
+            [trip for trip in trips if trip // PART_TICKS + 1 == number],
+            kind,
+            created_unix_ns=created,
+            name=name,
         )
         for number in range(1, files + 1)
     ]
@@ -100,11 +106,12 @@ def test_the_oldest_files_are_removed_first(tmp_path: Path):
 @pytest.mark.parametrize("kind", [Kind.TRIPPED, Kind.DRIVER_FAILED])
 def test_no_file_around_a_trip_is_removed_whatever_the_quota(tmp_path: Path, kind: Kind):
     """The neighbour with ticks around the trip is not removed either, nor is the newest file."""
-    # before_s reaches into the second file here, and after_s into the third file of the later run.
-    files = write_run(tmp_path, "20260101T000001", 7, trip=2 * PART_TICKS + 500, kind=kind)
-    later_files = write_run(tmp_path, "20260102T000002", 6, trip=2 * PART_TICKS - 500, kind=kind)
+    # before_s of the first trip reaches into the second file here, after_s of the second trip into the fourth one, and
+    # after_s into the third file of the later run.
+    files = write_run(tmp_path, "20260101T000001", 7, 2 * PART_TICKS + 500, 3 * PART_TICKS - 500, kind=kind)
+    later_files = write_run(tmp_path, "20260102T000002", 6, 2 * PART_TICKS - 500, kind=kind)
     apply_quota(tmp_path, 1)
-    require_files(tmp_path, *files[1:3], *later_files[1:3], later_files[-1])
+    require_files(tmp_path, *files[1:4], *later_files[1:3], later_files[-1])
 
 
 def test_other_files_are_not_removed(tmp_path: Path):
@@ -127,7 +134,7 @@ def test_other_files_are_not_removed(tmp_path: Path):
 
 
 def test_files_are_removed_when_the_disk_is_nearly_full(tmp_path: Path, disk_status: SimpleNamespace):
-    files = write_run(tmp_path, "20260101T000001", 4, trip=500)
+    files = write_run(tmp_path, "20260101T000001", 4, 500)
     quota = Quota(tmp_path, "test", 1 << 40, 10 << 20)
     assert quota.enforce() == []
     disk_status.f_bavail = (10 << 20) + SPARE_BYTES - 1
@@ -147,7 +154,7 @@ def test_an_unread_file_is_not_removed(tmp_path: Path):
 
 def test_no_file_is_removed_while_one_of_the_folder_has_no_status(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """The file may hold a trip whose first ticks are in an earlier file."""
-    files, lstat = write_run(tmp_path, "20260101T000001", 4, trip=PART_TICKS + 1), os.lstat
+    files, lstat = write_run(tmp_path, "20260101T000001", 4, PART_TICKS + 1), os.lstat
 
     def refuse(path: Any, *arguments: Any, **options: Any) -> os.stat_result:
         if Path(path) == files[1]:
@@ -206,13 +213,13 @@ def test_the_recorder_receives_removals_and_a_failure_is_listed_once(tmp_path: P
 
 
 def test_the_files_written_here_can_be_read(tmp_path: Path):
-    (path,) = write_run(tmp_path, "20260101T000001", 1, trip=20)
+    (path,) = write_run(tmp_path, "20260101T000001", 1, 20)
     assert np.array_equal(load(path)["tick"], np.arange(1_000))
 
 
 def test_no_file_of_a_run_is_removed_before_all_were_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """A trip in an unread file protects the file before it."""
-    files = write_run(tmp_path, "20260101T000001", 5, trip=2 * PART_TICKS + 500)
+    files = write_run(tmp_path, "20260101T000001", 5, 2 * PART_TICKS + 500)
     seconds = count()
     monkeypatch.setattr(timing, "source", timing.Source(monotonic_s=lambda: float(next(seconds))))
     quota = Quota(tmp_path, "test", 1, 0)
@@ -227,7 +234,7 @@ def test_a_run_with_an_unreadable_file_is_not_removed_as_it_may_hold_a_trip(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     write_run(tmp_path, "20260101T000001", 2)
-    tripped = write_run(tmp_path, "20260102T000002", 2, trip=PART_TICKS + 1)
+    tripped = write_run(tmp_path, "20260102T000002", 2, PART_TICKS + 1)
     write_run(tmp_path, "20260103T000003", 1)
     enter = quota_module.Reader.__init__
 
