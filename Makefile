@@ -4,6 +4,8 @@ BIN := $(VENV)/bin
 QUICK := tests/kernel tests/hil tests/engine/test_clock.py tests/engine/test_ring.py tests/laws/test_shipped.py tests/service/test_desk.py \
 	tests/service/test_requests.py tests/panel/feed tests/panel/spectrum tests/interchange/test_units.py tests/recording/test_verdict.py \
 	tests/test_config.py tests/test_kernels.py tests/test_opened_files.py tests/test_prepare.py tests/test_tree.py
+# Tests of `make test` and `make test-system` together.
+SHORT := not benchmark and not soak
 # As the command line does by itself: matrices here have tens of rows, and threads wait longer for each other than they compute.
 export OPENBLAS_NUM_THREADS ?= 1
 # As Python does by itself: a machine that forbids it has each process compile the whole package anew.
@@ -12,7 +14,7 @@ export PYTHONDONTWRITEBYTECODE :=
 READY := $(VENV)/.ready
 TESTED := $(VENV)/.tested
 
-.PHONY: help run demo campaign quick test tools bench faults soak mutants rig test-systemd test-deb dist deb site news install uninstall clean
+.PHONY: help run demo campaign quick test test-system tools bench faults soak mutants rig test-systemd test-deb dist deb site news install uninstall clean
 
 help: ## print this list
 	@sed -nE 's/^([a-z-]+)( [a-z]+)?:.*## (.*)/\1\2|\3/p' $(MAKEFILE_LIST) | awk -F'|' '{printf "make %-16s %s\n", $$1, $$2}'
@@ -37,12 +39,17 @@ quick: $(TESTED) ## checks of names, types of imports, and the tests that finish
 # Large arrays come and go by the thousand: asking the system for the memory of each costs a quarter of some tests' time.
 test: export MALLOC_MMAP_THRESHOLD_ := 268435456
 test: export MALLOC_TRIM_THRESHOLD_ := 536870912
-test: $(TESTED) ## all checks and tests: twelve minutes on two cores
+test: $(TESTED) ## all checks, and the tests that need no running service: WAS minutes on two cores
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/pyright --pythonpath $(BIN)/python & types=$$!; \
 		$(BIN)/lint-imports && $(BIN)/python -m rtloop.cli.warm && wait $$types
-	$(BIN)/pytest -n 3 --dist loadfile --no-loadscope-reorder
+	$(BIN)/pytest -n 3 --dist loadfile --no-loadscope-reorder -m '$(SHORT) and not system'
+
+# They keep real time and wait for processes, so that a third worker has work while two wait.
+test-system: $(TESTED) ## the tests of real services, boards, nodes and the panel in a browser
+	$(BIN)/python -m rtloop.cli.warm
+	$(BIN)/pytest -n 3 --dist loadfile --no-loadscope-reorder -m '$(SHORT) and system'
 
 tools: $(TESTED) ## what some tests need besides (as root): strace, Chromium, Playwright, axe, Foxglove's client, schemathesis, promtool
 	command -v strace >/dev/null || { apt-get update && apt-get install --yes strace; } || echo "strace: tests that need it are skipped"

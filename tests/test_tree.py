@@ -144,3 +144,12 @@ def test_names_in_docstrings_exist(room: tuple[str, str]):
         if name not in _known_names() | FOREIGN and not name.endswith(("_min", "_max", "_mean"))
     }
     assert not missing
+
+
+@pytest.mark.parametrize("bench", ["tests.faults.bench", "tests.panel.web.browser", "tests.epics.bench",
+                                   "tests.panel.page.station", "tests.node.node_process"])  # fmt: skip
+def test_what_starts_real_processes_has_the_mark_of_the_system(bench: str):
+    """Without the mark `make test` would run it, in real time."""
+    files = [file for file in (ROOT / "tests").rglob("test_*.py") if f"from {bench} import" in file.read_text()]
+    assert files
+    assert [file.name for file in files if "mark.system" not in file.read_text()] == []

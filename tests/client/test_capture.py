@@ -25,6 +25,8 @@ from rtloop.recording.replay.replay import replay
 from tests.faults.bench import Bench
 from tests.faults.evidence import wait_for
 
+pytestmark = pytest.mark.system
+
 NOTEBOOK = Path(__file__).parents[2] / "docs" / "notebooks" / "live.ipynb"
 Loop = tuple[Bench, Connection]
 

@@ -152,6 +152,7 @@ def test_wrong_names_and_a_block_that_others_may_write_are_refused(
         reader.read()
 
 
+@pytest.mark.system
 def test_ticks_from_the_reader_equal_the_recording(tmp_path: Path):
     """The ticks are compared byte by byte, from the first second to the end; the reader does not own the block."""
     with Bench(tmp_path) as bench:

@@ -27,6 +27,8 @@ from tests.faults.bench import Bench
 from tests.faults.configuration import on_a_board
 from tests.faults.evidence import wait_for
 
+pytestmark = pytest.mark.system
+
 LOOP_HZ = 4000.0
 LIMIT_TICKS = 400
 LIMIT_US = LIMIT_TICKS / LOOP_HZ * 1e6

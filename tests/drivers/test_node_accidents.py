@@ -26,6 +26,8 @@ from tests.drivers.processes import rtloop as start_rtloop
 from tests.faults.evidence import wait_for
 from tests.stage_text import one_axis
 
+pytestmark = pytest.mark.system
+
 PATIENT = {"watchdog_ms": 5000.0, "error_limit": 1_000_000, "hold_ticks": 1000}
 MASTERS = 8
 DEAD_MASTER = """

@@ -33,6 +33,8 @@ from tests.faults.evidence import wait_for
 from tests.node.frames import ANSWER, APPLY, OPEN, UNSEALED, Seal, cobs, drive
 from tests.users import ATTACKER, ROOT_ONLY, VICTIM, as_user
 
+pytestmark = pytest.mark.system
+
 PATIENT = {"watchdog_ms": 5000.0, "error_limit": 1_000_000, "hold_ticks": 1000, "wait_s": 60.0}
 LARGEST = 2**23 - 1
 """Code of the output's highest voltage."""

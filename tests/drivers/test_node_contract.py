@@ -19,6 +19,8 @@ from tests.drivers.bench_driver import open_driver
 from tests.drivers.node_bench import NodeProcess, make_key, make_options
 from tests.faults.evidence import wait_for
 
+pytestmark = pytest.mark.system
+
 PATIENT = {"watchdog_ms": 5000.0, "error_limit": 100_000, "hold_ticks": 1000}
 """Limits so wide that a short stall of this machine fails no test."""
 

@@ -33,6 +33,8 @@ from tests.node import frames
 from tests.stage_text import one_axis
 from tests.users import ATTACKER, ROOT_ONLY
 
+pytestmark = pytest.mark.system
+
 KEY = "0123456789abcdefFEDCBA9876543210"
 CONFIG = """
 [loop]

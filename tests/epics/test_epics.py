@@ -24,6 +24,8 @@ from tests.faults.bench import Bench  # noqa: E402
 from tests.faults.configuration import ROOT  # noqa: E402
 from tests.faults.evidence import wait_for  # noqa: E402
 
+pytestmark = pytest.mark.system
+
 REFUSED = caproto.ErrorResponseReceived
 AXIS_SUFFIXES = ("x:POSITION", "x:REFERENCE", "x:ERROR", "x:DRIVE", "x:SETPOINT")
 MODES = ("off", "raw", "feedforward", "closed_loop")

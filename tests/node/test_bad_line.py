@@ -32,6 +32,8 @@ from tests.faults.evidence import wait_for
 from tests.node.accounts import COUNTS, expected_counts
 from tests.node.frames import SAMPLE, cobs, uncobs
 
+pytestmark = pytest.mark.system
+
 TICKS, PERIOD_US = 300, 1000
 LONGEST_CODE = 2920
 """Length in bytes from which on the driver skips a frame on the line."""

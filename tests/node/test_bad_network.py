@@ -28,6 +28,8 @@ from tests.drivers.relay_frames import Arrival
 from tests.drivers.relayed_nodes import LibraryNode, PythonNode
 from tests.node.accounts import COUNTS, expected_counts
 
+pytestmark = pytest.mark.system
+
 TICKS = 400
 PATIENT = {"error_limit": 1_000_000, "watchdog_ms": 5000.0, "wait_s": 60.0}
 AnyNode = PythonNode | LibraryNode

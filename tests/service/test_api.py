@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 from prometheus_client.parser import text_string_to_metric_families
 from websockets.sync.client import unix_connect
 
@@ -21,6 +22,8 @@ from tests.faults.account import account, runs_in
 from tests.faults.bench import Bench
 from tests.faults.evidence import wait_for
 from tests.service.http import answer
+
+pytestmark = pytest.mark.system
 
 
 def events(bench: Bench, kind: str) -> list[dict[str, Any]]:

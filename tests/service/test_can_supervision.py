@@ -24,6 +24,8 @@ from tests.drivers.can_bench import free_port
 from tests.faults.bench import Bench
 from tests.faults.evidence import wait_for
 
+pytestmark = pytest.mark.system
+
 DBC_FILE = Path(__file__).resolve().parents[2] / "deploy" / "rtloop.dbc"
 DBC: Any = cantools.database.load_file(DBC_FILE)
 GROUP = "239.74.163.78"

@@ -19,6 +19,8 @@ from rtloop.service.api.requests import REQUESTS
 from tests.faults.bench import Bench
 from tests.service.http import exchange
 
+pytestmark = pytest.mark.system
+
 CONFIGURATION = Path(__file__).with_name("schemathesis.toml")
 CASES = 5
 """Random cases of each operation, in addition to those at the bounds of its schema."""

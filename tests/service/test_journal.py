@@ -14,6 +14,8 @@ from rtloop.service.journal import Journal
 from tests.faults.bench import Bench
 from tests.full_pipe import fill
 
+pytestmark = pytest.mark.system
+
 
 @pytest.fixture
 def pipe():

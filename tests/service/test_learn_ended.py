@@ -16,6 +16,8 @@ from tests.service.http import answer
 from tests.service.test_learn import LONG_CYCLES, MODEL, REQUEST, SCAN_UM, TICKS
 from tests.service.test_response import CONFIGURATION, SETPOINT_UM
 
+pytestmark = pytest.mark.system
+
 JUDGED_TICKS = 5000
 RETURN_S = 10.0
 

@@ -23,6 +23,8 @@ from tests.faults.bench import Bench
 from tests.faults.evidence import wait_for
 from tests.service.http import answer, exchange
 
+pytestmark = pytest.mark.system
+
 KEY = "brass-otter-seven"
 DIGEST = hashlib.sha256(KEY.encode()).hexdigest()
 TUNE = {"axis": "x", "section": "limits", "values": {"bump_s": 0.02}}

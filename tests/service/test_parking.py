@@ -528,6 +528,7 @@ def test_whatever_a_card_raises_is_an_error_of_that_driver(dead_service, verb):
     assert hardware.volts in (0.0, DRIVE_V)
 
 
+@pytest.mark.system
 def test_a_service_that_died_is_parked_while_its_file_is_being_edited(tmp_path):
     """The service and its loop are killed; the board's process keeps the evidence of the output."""
     with Bench(tmp_path, WITHOUT_RESTART) as bench:

@@ -50,6 +50,7 @@ def test_the_sweep_begins_and_ends_at_rest():
     assert abs(sweep[-1]) < 1e-12
 
 
+@pytest.mark.system
 def test_the_tare_survives_the_loop(tmp_path):
     """The sensor is 3 µm off. The offsets are read from the recordings of the tared loop and of the next loop."""
     changes = (

@@ -17,6 +17,8 @@ from rtloop.recording.replay.replay import replay
 from tests.faults.bench import Bench
 from tests.faults.recovery import QUICK, await_recovered, board_sleeps, narrow, stays_safe
 
+pytestmark = pytest.mark.system
+
 RATE_HZ, TRIP_SLEW_V_PER_S = 4000.0, 100.0
 LEVELS_UM, DWELL_TICKS = [15.0, 25.0], 8000
 CHANGES = (

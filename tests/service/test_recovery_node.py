@@ -19,6 +19,8 @@ from tests.faults.configuration import on_a_card
 from tests.faults.evidence import wait_for
 from tests.faults.recovery import QUICK
 
+pytestmark = pytest.mark.system
+
 SILENT_S = 2.5
 """Longer than the node's watchdog, hold_ticks and error_limit together."""
 CODE_V = 20.0 / (1 << 24)

@@ -26,6 +26,8 @@ from tests.faults.evidence import wait_for
 from tests.service.http import answer
 from tests.service.test_response import CONFIGURATION, QUICK_REQUEST, RATE_HZ, SETPOINT_UM
 
+pytestmark = pytest.mark.system
+
 METRIC = re.compile(r"\brtloop_\w+")
 DASHBOARD = ROOT / "deploy" / "grafana" / "rtloop.json"
 

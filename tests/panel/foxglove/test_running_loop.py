@@ -20,6 +20,8 @@ from tests.faults.bench import Bench
 from tests.faults.evidence import wait_for
 from tests.panel.foxglove.test_foxglove import decode_message, read_channels, subscribe
 
+pytestmark = pytest.mark.system
+
 Panel = tuple[Bench, str]
 OFFERED_PROTOCOLS = [Subprotocol("foxglove.websocket.v1")]
 

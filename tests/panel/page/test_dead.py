@@ -20,6 +20,8 @@ from tests.panel.page.browser import (
     stop_by_keyboard,
 )
 
+pytestmark = pytest.mark.system
+
 DESK_CONTROLS = ("#go", "#set-mode button", "#setpoint", "#tune-value", "#undo")
 
 COUNT_GREY_FILTERS = """(at) => {

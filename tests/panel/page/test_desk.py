@@ -25,6 +25,8 @@ from tests.panel.page.browser import (
     stop_by_keyboard,
 )
 
+pytestmark = pytest.mark.system
+
 
 def trace_figure(page: Any, name: str, figure: int) -> float:
     """Return a figure of a trace from the table beneath the plot: 1 low, 2 high, 3 mean."""

@@ -16,6 +16,8 @@ import pytest
 from tests.faults.bench import Bench
 from tests.panel.page.browser import AXE, TIMEOUT_S, await_text, open_panel, start_by_client, stop_by_keyboard
 
+pytestmark = pytest.mark.system
+
 MOVING = "[...document.querySelectorAll('*')].filter((e) => parseFloat(getComputedStyle(e).transitionDuration))"
 """Script: the elements with a transition."""
 VIEWS = ("scope", "xy", "spectrum", "timing", "recordings", "measure")

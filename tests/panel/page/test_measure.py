@@ -17,6 +17,8 @@ from tests.panel.measurement_rig import MODEL_HZ, SCAN_UM, make_configuration
 from tests.panel.page.browser import TIMEOUT_S, await_text, chromium_path, open_panel, start_panel
 from tests.service.test_response import LOOP, SETPOINT_UM
 
+pytestmark = pytest.mark.system
+
 COUNT_COLOURS = """(at) => {
   const canvas = document.querySelector(at);
   const {data} = canvas.getContext("2d").getImageData(0, 0, canvas.width, canvas.height);

@@ -11,10 +11,14 @@ from http.server import BaseHTTPRequestHandler, HTTPServer
 from typing import IO, Any
 from urllib.parse import urlsplit
 
+import pytest
+
 from tests.faults.bench import Bench
 from tests.panel.page.browser import await_text, open_panel, start_by_client, start_panel, stop_by_keyboard
 from tests.panel.route_server import exchange
 from tests.users import ATTACKER, as_user
+
+pytestmark = pytest.mark.system
 
 
 @contextmanager

@@ -10,6 +10,8 @@ import pytest
 
 from tests.panel.page.parts import await_exact_text
 
+pytestmark = pytest.mark.system
+
 ALARM = "Tripped: x: frozen 2000 ticks, its limit 2000 ticks; also stale. Reset to go on."
 IS_CLICKABLE = """(at) => {
   const {left, top, right, bottom} = document.querySelector(at).getBoundingClientRect();

@@ -8,6 +8,8 @@ import pytest
 
 from tests.panel.page.parts import await_exact_text, choose
 
+pytestmark = pytest.mark.system
+
 
 def test_holding_arm_does_not_start_a_loop_that_another_client_armed(parts: Any) -> None:
     is_held = "document.getElementById('go').classList.contains('holding')"

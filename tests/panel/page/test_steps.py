@@ -11,6 +11,8 @@ import pytest
 from tests.panel.page.parts import await_exact_text, choose, write_configuration
 from tests.panel.page.station import Stations
 
+pytestmark = pytest.mark.system
+
 NANO: dict[str, Any] = {
     "name": "x",
     "feedforward": {"thresholds_v": [0.0, 2.0], "weights_um_per_v": [0.009, 0.00125]},

@@ -20,6 +20,8 @@ from tests.faults.bench import Bench
 from tests.panel.route_server import Response, RouteServer
 from tests.panel.web.browser import unpack_message
 
+pytestmark = pytest.mark.system
+
 RUN = 3
 """Number of the run that the panel shows."""
 

@@ -14,6 +14,8 @@ from rtloop.panel.protocol.subscriptions import validate_field
 from rtloop.panel.views.analyser import Analyser
 from tests.panel.web.browser import unpack_message
 
+pytestmark = pytest.mark.system
+
 RATE_HZ = 1000.0
 LOOP: Any = SimpleNamespace(rate_hz=RATE_HZ, unit=lambda _: "V", axes={"x": {}})
 NAMES = (DEADLINE_NS, "x_drive_v", "x_reference_um", "mode")

@@ -21,6 +21,8 @@ from rtloop.panel.views.xy_plot import extreme_indices
 from rtloop.signals import Signal, column_names
 from tests.panel.web.browser import unpack_message
 
+pytestmark = pytest.mark.system
+
 NAMES = column_names(["x"], [])
 LOOP = Description(
     "lab", 1000.0, tuple(Signal(name, "", "") for name in NAMES), Path("b"), Path("r"), {"axis": [{"name": "x"}]}

@@ -16,6 +16,8 @@ from rtloop.panel.views.xy_plot import MODEL_BINS, XyPlot, extreme_indices, orde
 from rtloop.signals import Signal
 from tests.panel.web.browser import unpack_message
 
+pytestmark = pytest.mark.system
+
 RATE_HZ, THRESHOLDS_V, WEIGHTS = 4000, (0.0, 1.0, 3.0, 5.0), (2.0, 1.0, 0.6, 0.4)
 NAMES = ("tick", "deadline_ns", "x_drive_v", "x_position_um", "x_reference_um", "mode")
 AXIS = {"name": "x", "feedforward": {"thresholds_v": THRESHOLDS_V, "weights_um_per_v": WEIGHTS}}

@@ -14,6 +14,8 @@ from tests.faults.bench import Bench
 from tests.faults.evidence import wait_for
 from tests.panel.web.browser import Browser
 
+pytestmark = pytest.mark.system
+
 EDGE = {"mode": "normal", "kind": "edge", "source": "x_reference_um", "level": 20.0, "pre_percent": 25}
 VIEW = {"signals": ["x_reference_um", "x_position_um", "tick"], "seconds": 0.05, "pixels": 1000, "trigger": EDGE}
 

@@ -20,6 +20,8 @@ from tests.faults.configuration import ROOT
 from tests.faults.evidence import wait_for
 from tests.paper_configuration import RATE, TEXT
 
+pytestmark = pytest.mark.system
+
 ADDRESS = re.compile(r"http://(127\.[\d.]+:\d+)/#token=\S+")
 
 

@@ -36,6 +36,8 @@ from tests.panel.route_server import exchange
 from tests.panel.web.browser import Browser, unpack_message
 from tests.users import ATTACKER, ROOT_ONLY, VICTIM, Raised, as_user
 
+pytestmark = pytest.mark.system
+
 STOP = ("POST", "/api/stop")
 FORWARDED, REFUSED, UNKNOWN = 503, 403, 401
 
