@@ -7,7 +7,6 @@ import io
 import re
 import tokenize
 from collections import defaultdict
-from collections.abc import Iterator
 from functools import cache
 from importlib import import_module
 from pathlib import Path
@@ -52,11 +51,14 @@ def test_no_files_import_each_other_in_a_circle():
     assert [circle for circle in circles.values() if len(circle) > 1] == []
 
 
-def _docstrings(path: Path) -> Iterator[tuple[str, str]]:
-    """Yield (place, text) of each docstring and of each string below a constant or a field."""
-    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-        if isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant) and isinstance(node.value.value, str):
-            yield f"{path.relative_to(ROOT)}:{node.lineno}", node.value.value
+@cache
+def _docstrings(path: Path) -> list[tuple[str, str]]:
+    """Return (place, text) of each docstring and of each string below a constant or a field."""
+    return [
+        (f"{path.relative_to(ROOT)}:{node.lineno}", node.value.value)
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+        if isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant) and isinstance(node.value.value, str)
+    ]
 
 
 def _texts() -> list[tuple[str, str]]:

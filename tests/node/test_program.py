@@ -45,6 +45,8 @@ from tests.node.node_process import (
     wait_until,
 )
 
+pytestmark = pytest.mark.system
+
 LONG_US = 4_000_000
 """Hold time of the watchdog that a busy machine does not exceed between two frames."""
 
