@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+import rtloop
 from rtloop.cli import main
 from rtloop.client import Client
 from rtloop.client.connection import Connection, read_controller
@@ -161,3 +162,10 @@ def test_the_documentation_tells_properties_from_methods():
     public = {name: value for name, value in vars(Connection).items() if not name.startswith("_")}
     assert {"status", "configuration", "metrics", "watch", "swap"} <= is_property.keys() <= public.keys()
     assert is_property == {name: isinstance(public[name], property) for name in is_property}
+
+
+def test_nobody_answers(tmp_path: Path):
+    with pytest.raises(UnavailableError, match=r"nobody\.sock: no service answers at this socket"):
+        rtloop.connect(tmp_path / "nobody.sock", as_="ada")
+    with pytest.raises(UnavailableError, match="no service 'nowhere' has a control socket"):
+        rtloop.connect("nowhere")

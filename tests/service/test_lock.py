@@ -1,29 +1,22 @@
-"""The lock of a service: one client drives, every client may read and stop, and the recording has the client's name."""
+"""The lock of a service: one client drives, every client may read and stop, and the events have the client's name."""
 
 from __future__ import annotations
 
 import hashlib
 import json
-import os
-import signal
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
 import pytest
 from click.testing import CliRunner
-from websockets.sync.client import unix_connect
 
 import rtloop
 from rtloop.cli import main
 from rtloop.client import Client
-from rtloop.errors import RtloopError, UnavailableError
-from tests.faults.bench import Bench
-from tests.faults.evidence import wait_for
-from tests.service.http import answer, exchange
-
-pytestmark = pytest.mark.system
+from rtloop.errors import RtloopError
+from tests.faults.configuration import on_a_rig
+from tests.virtual.bench import VirtualBench
 
 KEY = "brass-otter-seven"
 DIGEST = hashlib.sha256(KEY.encode()).hexdigest()
@@ -42,15 +35,19 @@ VALID_NAMES = ["ada", "Ada Lovelace", "李小龍", "Zoë Ångström", "x.y-z_1",
 
 
 @pytest.fixture(scope="module")
-def bench(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
-    """Yield a service on a board, armed on command, with an emergency key."""
+def bench(tmp_path_factory: pytest.TempPathFactory) -> Iterator[VirtualBench]:
+    """Yield a service on the simulated rig, armed on command, with an emergency key."""
     section = f'[service]\narm = true\nemergency_key_sha256 = "{DIGEST}"\n[recording]'
-    with Bench(tmp_path_factory.mktemp("lock"), ("[recording]", section)) as bench:
+    folder = tmp_path_factory.mktemp("lock")
+    with pytest.MonkeyPatch.context() as patch:
+        bench = VirtualBench(folder, patch, on_a_rig(folder, ("[recording]", section)))
+        bench.await_state("stopped")
         yield bench
+        bench.end()
 
 
 @pytest.fixture
-def ada(bench: Bench) -> Iterator[Client]:
+def ada(bench: VirtualBench) -> Iterator[Client]:
     """Yield a client that holds the lock and drives in closed loop; stop the loop and release the lock afterwards."""
     client = Client(bench.client.path, "ada")
     client.post("/arm")
@@ -65,41 +62,20 @@ def ada(bench: Bench) -> Iterator[Client]:
 
 
 @pytest.fixture
-def bob(bench: Bench) -> Client:
+def bob(bench: VirtualBench) -> Client:
     """Return a second client."""
     return Client(bench.client.path, "bob")
 
 
-def requester(bench: Bench, kind: str, tick: int) -> str:
-    """Return the name of the client whose command took effect at `tick`, as soon as the recording has its event."""
-
-    return requesters(bench, kind, [tick])[0]
-
-
-def requesters(bench: Bench, kind: str, ticks: list[int]) -> list[str]:
-    """Return the name of the client for each of `ticks`, as soon as the recording has all their events."""
-
-    def read_names() -> list[str]:
-        events = [event for part in (bench.folder / "recordings").glob("*.part") for event in rtloop.load(part).events]
-        names = {event["tick"]: event["who"] for event in reversed(events) if event["kind"] == kind}
-        return [names[tick] for tick in ticks] if names.keys() >= set(ticks) else []
-
-    return wait_for(read_names, f"{kind} at {ticks} in the file")
-
-
-def test_the_second_is_refused_with_who_drives_and_both_may_stop(bench: Bench, ada: Client, bob: Client):
+def test_the_second_is_refused_with_who_drives_and_both_may_stop(bench: VirtualBench, ada: Client, bob: Client):
     lock = bench.status()["lock"]
     assert lock["name"] == "ada"
     assert 0 < lock["until_unix_s"] - lock["since_unix_s"] < 120
     ada.post("/setpoint", {"axis": "x", "value": 7.0})
     for path, body in REQUESTS.items():
         for query in ("?as=bob", ""):
-            code, response = answer(bench, "POST", f"{path}{query}", body)
+            code, response = bench.answer("POST", f"{path}{query}", body)
             assert (code, response["error"][: len(ADA_HOLDS_LOCK)]) == (409, ADA_HOLDS_LOCK), path
-    with unix_connect(str(bench.client.path), "ws://localhost/setpoints?as=bob") as stream:
-        stream.send(json.dumps({"axis": "x", "value": 1.0}))
-        assert json.loads(stream.recv())["error"].startswith(ADA_HOLDS_LOCK)
-    assert next(iter(bob.watch()))["lock"]["name"] == "ada"
     assert "rtloop_state" in bob.get("/metrics")
     assert (bench.status()["axes"]["x"]["reference_um"], bench.status()["mode"]) == (7.0, "closed_loop")
     stopped = bob.post("/stop")["tick"]
@@ -108,22 +84,24 @@ def test_the_second_is_refused_with_who_drives_and_both_may_stop(bench: Bench, a
     ada.post("/arm")
     started, off = ada.post("/start")["tick"], bob.post("/mode", {"mode": "off"})["tick"]
     end = ada.post("/stop")["tick"]
-    assert [requester(bench, "set_mode", tick) for tick in (stopped, started, off, end)] == ["bob", "ada", "bob", "ada"]
+    for tick, who in ((stopped, "bob"), (started, "ada"), (off, "bob"), (end, "ada")):
+        bench.event("set_mode", tick, who)
 
 
-def test_what_was_changed_is_recorded_under_the_name(bench: Bench, ada: Client):
+def test_what_was_changed_is_recorded_under_the_name(bench: VirtualBench, ada: Client):
     changed, loaded = ada.post("/setpoint", REQUESTS["/setpoint"])["tick"], ada.post("/tune", TUNE)["tick"]
-    assert (requester(bench, "set_reference", changed), requester(bench, "load_law", loaded)) == ("ada", "ada")
+    bench.event("set_reference", changed, "ada")
+    bench.event("load_law", loaded, "ada")
     ada.delete("/lock")
     unnamed = bench.client.post("/setpoint", REQUESTS["/setpoint"])["tick"]
-    assert requester(bench, "set_reference", unnamed) == "operator"
+    bench.event("set_reference", unnamed)
     assert bench.status()["lock"]["name"] == "operator"
     bench.client.post("/setpoint", REQUESTS["/setpoint"])  # clients without a name count as one
     with pytest.raises(RtloopError, match=r"^operator \(a client without a name\) has held the lock since "):
         ada.post("/setpoint", REQUESTS["/setpoint"])
 
 
-def test_only_the_emergency_key_breaks_it(bench: Bench, ada: Client, bob: Client):
+def test_only_the_emergency_key_breaks_it(bench: VirtualBench, ada: Client, bob: Client):
     for key in ("", "brass-otter-six", DIGEST, "ä\0"):
         with pytest.raises(RtloopError, match=r"^the given emergency key is wrong; "):
             bob.lock(key)
@@ -136,35 +114,33 @@ def test_only_the_emergency_key_breaks_it(bench: Bench, ada: Client, bob: Client
         ada.post("/setpoint", REQUESTS["/setpoint"])
     assert bob.delete("/lock") == {}
     assert bench.status()["lock"] is None
-    wait_for(lambda: "bob takes the lock from ada" in bench.log(), "the line in the log")  # a thread writes it
-    assert KEY not in bench.log()
     assert KEY not in json.dumps(bench.client.get("/configuration"))
 
 
-def test_what_is_no_name_is_refused_but_stops(bench: Bench):
+def test_what_is_no_name_is_refused_but_stops(bench: VirtualBench):
     stopped: dict[str, int] = {}
     for name in INVALID_NAMES:
         before = bench.status()["lock"]
         query = f"?as={quote(name, safe='')}"
         for path in ("/arm", "/lock"):
-            code, response = answer(bench, "POST", f"{path}{query}")
+            code, response = bench.answer("POST", f"{path}{query}")
             refused = (code, response["error"][:4], response["error"].replace("…", "").isascii())
             assert refused == (422, "as: ", True), name
         assert bench.status()["lock"] == before, name
-        stopped[name] = answer(bench, "POST", f"/stop{query}")[1]["tick"]
-    requesters_by_name = dict(zip(INVALID_NAMES, requesters(bench, "set_mode", [*stopped.values()]), strict=True))
-    assert requesters_by_name == dict.fromkeys(INVALID_NAMES, "operator")
+        stopped[name] = bench.answer("POST", f"/stop{query}")[1]["tick"]
+    for tick in stopped.values():
+        bench.event("set_mode", tick)
 
 
 @pytest.mark.parametrize("query", ["as=%ff", "as=a&as=b", "as=%", "as=" + 60_000 * "a"])
-def test_a_query_that_is_none(bench: Bench, query: str):
-    code, response = exchange(bench.client.path, "POST", f"/arm?{query}")
+def test_a_query_that_is_none(bench: VirtualBench, query: str):
+    code, _, response = bench.client.exchange("POST", f"/arm?{query}", "")
     assert code == 422
     assert len(response) < 300
     assert bench.status()["state"] == "stopped"
 
 
-def test_names_of_people(bench: Bench):
+def test_names_of_people(bench: VirtualBench):
     stopped: dict[str, int] = {}
     for name in VALID_NAMES:
         with rtloop.connect(bench.client.path, as_=name) as loop:
@@ -173,10 +149,11 @@ def test_names_of_people(bench: Bench):
             assert loop.status["lock"]["name"] == name
             loop.stop()
         assert bench.status()["lock"] is None, name
-    assert requesters(bench, "set_mode", [*stopped.values()]) == VALID_NAMES
+    for name, tick in stopped.items():
+        bench.event("set_mode", tick, name)
 
 
-def test_ctl_drives_under_a_name(bench: Bench, ada: Client):
+def test_ctl_drives_under_a_name(bench: VirtualBench, ada: Client):
     def ctl(*arguments: str, typed: str | None = None) -> Any:
         result = CliRunner().invoke(main, ["ctl", "--socket", str(bench.client.path), "--as", *arguments], input=typed)
         return result.exit_code, result.output
@@ -186,15 +163,16 @@ def test_ctl_drives_under_a_name(bench: Bench, ada: Client):
     assert ctl("bob", "lock")[0] == ctl("bob", "release")[0] == ctl("bob", "lock", "--break", typed="no\n")[0] == 1
     assert ctl("bob", "lock", "--break", typed=f"{KEY}\n")[0] == 0
     code, output = ctl("bob", "setpoint", "x", "3")
-    assert requester(bench, "set_reference", json.loads(output)["tick"]) == "bob"
+    bench.event("set_reference", json.loads(output)["tick"], "bob")
     assert json.loads(ctl("eve", "status")[1])["lock"]["name"] == "bob"
     assert ctl("bob", "release") == (0, "{}\n")
     assert ctl("a\x1bb", "arm") == (1, "rtloop: as: 'a\\x1bb'; allowed: 1 to 40 letters, digits, blanks and .-_@+', a "
                                        "letter or digit first, no blank last\n")  # fmt: skip
 
 
-def test_connect(bench: Bench, monkeypatch: pytest.MonkeyPatch):
+def test_connect(bench: VirtualBench, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr("rtloop.supervision.paths.client_folders", lambda: [bench.client.path.parent])
+    bench.client.path.touch()  # a service is found by the name of its socket
     with rtloop.connect("lab", as_="ada") as loop, rtloop.connect(str(bench.client.path), as_="bob") as bob:
         loop.arm()
         loop.setpoint("x", 20.0)
@@ -204,8 +182,8 @@ def test_connect(bench: Bench, monkeypatch: pytest.MonkeyPatch):
         assert loop.status["axes"]["x"]["reference_um"] == 12.5
         reference_tick = loop.reference("x", kind="sine", amplitude=2.0, frequency_hz=3.0)
         tune_tick = loop.tune("x", "controller", gain=0.012)
-        events = (("set_reference", reference_tick), ("load_law", tune_tick))
-        assert [requester(bench, *event) for event in events] == ["ada", "ada"]
+        bench.event("set_reference", reference_tick, "ada")
+        bench.event("load_law", tune_tick, "ada")
         for request in (bob.start, bob.reset, bob.take, bob.release, lambda: bob.setpoint("x", 1.0)):
             with pytest.raises(RtloopError, match=f"^{ADA_HOLDS_LOCK}"):
                 request()
@@ -218,30 +196,3 @@ def test_connect(bench: Bench, monkeypatch: pytest.MonkeyPatch):
         assert bob.take(emergency_key=KEY)["name"] == "bob"
     assert rtloop.connect().status["lock"] is None
     bench.await_state("stopped")
-
-
-def test_nobody_answers(tmp_path: Path):
-    with pytest.raises(UnavailableError, match=r"nobody\.sock: no service answers at this socket"):
-        rtloop.connect(tmp_path / "nobody.sock", as_="ada")
-    with pytest.raises(UnavailableError, match="no service 'nowhere' has a control socket"):
-        rtloop.connect("nowhere")
-
-
-def test_a_recorder_in_the_place_of_a_dead_one_knows_the_names(bench: Bench):
-    dead = bench.pid("recorder")
-    os.kill(dead, signal.SIGKILL)
-    wait_for(lambda: bench.pid("recorder") != dead, "another recorder")
-    with rtloop.connect(bench.client.path, as_="ada") as loop:
-        assert requester(bench, "set_reference", loop.setpoint("x", 2.0)) == "ada"
-
-
-def test_the_recording_shows_and_replays_it(bench: Bench):
-    """End the shared service. This test must be the last of the file."""
-    bench.client.post("/stop")
-    assert bench.stop() == 0
-    pattern = str(bench.folder / "recordings" / "lab*.mcap")
-    info = CliRunner().invoke(main, ["info", pattern, "--json"])
-    assert {"ada", "bob", "operator"} <= set(json.loads(info.output)["commands"])
-    result = CliRunner().invoke(main, ["replay", pattern, "--json"])
-    assert (result.exit_code, json.loads(result.output)["identical"]) == (0, True)
-    assert "Traceback" not in bench.log()

@@ -161,15 +161,17 @@ class VirtualBench(VirtualLoop):
     def events(self, kind: str) -> list[dict[str, Any]]:
         """Return the loop's events of a kind, as they would be recorded."""
         axes = [axis.name for axis in self.service.configuration.axes]
-        events = [event_from_message(message, axes, 0) for message in self._messages]
+        assert self.service.supervisor is not None
+        name = self.service.supervisor.names.requester
+        events = [event_from_message(m, axes, 0, name=name(int(m["identity"]))) for m in self._messages]
         return [dict(event) for event in events if event["kind"] == kind]
 
-    def event(self, kind: str, tick: int) -> dict[str, Any]:
-        """Return the event of an operator's change at `tick`, as soon as the loop has executed it."""
+    def event(self, kind: str, tick: int, who: str = "operator") -> dict[str, Any]:
+        """Return the event of the change at `tick` by the client `who`, as soon as the loop has executed it."""
         (event,) = self.wait_for(
             lambda: [event for event in self.events(kind) if event["tick"] == tick], f"{kind} at {tick}"
         )
-        assert event["who"] == "operator"
+        assert event["who"] == who
         return event
 
     def newest(self, signal: str) -> float:

@@ -15,6 +15,7 @@ from rtloop.configuration.prepare import prepare
 from rtloop.drivers.base import Driver
 from rtloop.engine.messages import MESSAGE
 from rtloop.foundation import timing
+from rtloop.recording.capture.requester_names import RequesterNames
 from rtloop.service import service
 from rtloop.service.changing.live import LiveLaw
 from rtloop.service.desk import Desk
@@ -38,7 +39,7 @@ class VirtualSupervisor:
     def __init__(self, loop: LoopBench, prepared: Any) -> None:
         self.block, self.prepared = loop.block, prepared
         self.recorder = SimpleNamespace(written_state={}, replacements=0, quota=None)
-        self.names = SimpleNamespace(identity=lambda _: 0, requester=lambda _: None)
+        self.names = RequesterNames.create()
 
     @property
     def ticks(self) -> int:
@@ -70,7 +71,7 @@ class VirtualLoop:
         prepared = replace(prepared, plan=plan)
         self.loop = LoopBench(plan, driver)
         supervisor: Any = VirtualSupervisor(self.loop, prepared)
-        self.service._desk = Desk(self.loop.block, plan.pacing.rate_hz)
+        self.service._desk = Desk(self.loop.block, plan.pacing.rate_hz, supervisor.names)
         self.service.live = LiveLaw(prepared, self.loop.block, self.service._desk, self.service._offsets_v)
         self.service.supervisor = supervisor
         return self.loop
