@@ -73,7 +73,8 @@ def auto(
         controller_percent, options = loop.design.scenarios.resonance_percent, loop.subject.options
         figures = (
             f"the controller damps resonances within ±{controller_percent:g} % of the model's; the pre-filter has "
-            f"{options.taps} taps in each row, for resonances within ±{options.scenarios.resonance_percent:g} %"
+            f"{options.taps} taps in each row, for resonances within ±{options.scenarios.resonance_percent:g} % and "
+            f"gains within ±{options.scenarios.gain_percent:g} % (shape.scenarios)"
         )
         stage = loop.stage
     else:

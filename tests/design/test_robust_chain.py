@@ -156,6 +156,44 @@ def test_a_controller_without_taps_is_written_all_the_same(recordings, tmp_path,
     assert check.running.stable
 
 
+def without_stated_ranges(text: str) -> str:
+    """Return the specification `text` without its [shape.scenarios]."""
+    ranges = "[shape.scenarios]\nresonance_percent = 1.0\ndamping = [1.0]\ngain_percent = 0.0\n"
+    assert ranges in text
+    return text.replace(ranges, "")
+
+
+def test_taps_are_first_tried_with_a_range_of_the_gain(recordings, tmp_path, monkeypatch) -> None:
+    """Ranges that the specification states are the only ones."""
+    design_taps = Mock(side_effect=NoDesign("shape: no taps settle within 2.7 ms"))
+    monkeypatch.setattr("rtloop.design.robust.chain.design_taps", design_taps)
+
+    def tried(text: str) -> list[tuple[float, float]]:
+        design_taps.reset_mock()
+        (tmp_path / "made.toml").unlink(missing_ok=True)
+        assert design_auto(recordings, tmp_path, text).exit_code == 1
+        scenarios = [call.args[0].options.scenarios for call in design_taps.call_args_list]
+        return [(ranges.resonance_percent, ranges.gain_percent) for ranges in scenarios]
+
+    stated = SPEC.format(percent=3.0)
+    assert tried(stated) == [(1.0, 0.0)]
+    assert tried(without_stated_ranges(stated)) == [(5.0, 1.5), (5.0, 0.0), (2.0, 0.0), (1.0, 0.0), (0.0, 0.0)]
+
+
+@pytest.mark.parametrize(("settling_ms", "gain_percent"), [(1.2, 1.5), (1.1, 0.0)])
+def test_taps_that_a_range_of_the_gain_makes_too_slow_are_not_taken(
+    recordings, tmp_path, monkeypatch, settling_ms: float, gain_percent: float
+) -> None:
+    monkeypatch.setattr("rtloop.design.robust.chain.design_taps", Mock(return_value=Mock(settling_ms=1.15)))
+    monkeypatch.setattr("rtloop.design.robust.chain.taps_provenance", lambda *_: [])
+    monkeypatch.setattr("rtloop.design.robust.chain.taps_values", lambda _: {"taps": [1.0]})
+    print_taps = Mock()
+    monkeypatch.setattr("rtloop.cli.auto.print_taps", print_taps)
+    text = without_stated_ranges(SPEC.format(percent=3.0))
+    design_auto(recordings, tmp_path, text.replace("[specification]", f"[specification]\nsettling_ms = {settling_ms}"))
+    assert print_taps.call_args.args[1].options.scenarios.gain_percent == gain_percent
+
+
 def modal_transfer(hz, damping, gain) -> Transfer:
     """Return Σ g ω²/(s² + 2ζω s + ω²), added by numpy's polynomials."""
     omega = 2 * np.pi * np.array(hz)

@@ -35,10 +35,10 @@ OPTIONS = ShapeOptions(
 SUBJECT = Subject(CONTROLLER, STAGE, 1, BOUNDS, 0.004, OPTIONS)
 
 
-def simulate(taps, command_taps, shift_percent: float, delay_ticks: int, ticks: int = 300):
+def simulate(taps, command_taps, shift_percent: float, delay_ticks: int, ticks: int = 300, gain: float = 1.0):
     """Return x at FINE points a tick and v at each tick after a unit step, from the loop's equations point by point."""
     omega = OMEGA * (1 + shift_percent / 100)
-    plant = signal.tf2ss([omega**2], [1.0, 2 * RATIO * omega, omega**2])
+    plant = signal.tf2ss([gain * omega**2], [1.0, 2 * RATIO * omega, omega**2])
     a, b, c, _, _ = signal.cont2discrete(plant, PERIOD_S / FINE, method="zoh")
     z, p, k = CONTROLLER.zeros, CONTROLLER.poles, CONTROLLER.gain
     numerator, denominator = k * np.real(np.poly(z)), np.real(np.poly(p))
@@ -112,6 +112,19 @@ def test_taps_keep_band_overshoot_undershoot_and_drive_wherever_the_resonance_is
     without_taps, _ = simulate([1.0], [0.0], 0.0, 1)
     settling_without_ms = time_ms[np.abs(without_taps - 1) > 0.05].max()
     assert settling_without_ms > 2 * design.settling_ms
+
+
+def test_taps_for_a_range_of_the_gain_keep_the_overshoot_wherever_gain_and_resonance_are() -> None:
+    """Taps for the model's gain overshoot by as much more as the gain is larger."""
+    subject = Subject(CONTROLLER, STAGE, 1, BOUNDS, 0.01, OPTIONS)
+
+    def largest(taps) -> float:
+        cases = [(shift, gain) for shift in np.linspace(-4, 4, 5) for gain in (0.985, 1.0, 1.015)]
+        steps = [simulate(taps.reference, taps.command, shift, 1, gain=gain)[0] for shift, gain in cases]
+        return max(float(x.max()) for x in steps) - 1
+
+    assert largest(design_taps(subject.restrict_resonance(4.0)).taps) > 0.02
+    assert largest(design_taps(subject.restrict_resonance(4.0, 1.5)).taps) <= 0.0102
 
 
 def test_nothing_faster_exists_and_less_overshoot_costs_time(design) -> None:

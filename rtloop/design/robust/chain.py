@@ -44,6 +44,10 @@ RANGES_PERCENT = (10.0, 5.0, 2.0)
 """Resonance ranges (±%) tried for the controller if the specification has no [scenarios]."""
 TAPS_RANGES_PERCENT = (5.0, 2.0, 1.0, 0.0)
 """Resonance ranges (±%) tried for the taps if the specification has no [shape.scenarios]."""
+TAPS_GAIN_PERCENT = 1.5
+"""Range of the gain (±%) tried first for the taps, with the widest range of the resonance: the slope that an identified
+hysteresis misses.
+"""
 TAP_PERIODS = 2.9
 """Default length of the taps, in periods of the slowest leading mode."""
 NARROW_PERCENT = 2.5
@@ -108,7 +112,7 @@ def design_robust_loop(
         raise NoDesign(f"axis.{axis_options.name}.{error}") from None
     subject = _limit_command(subject, final_design)
     try:
-        subject, taps = _find_taps(subject, "scenarios" in design.shape.model_fields_set, progress)
+        subject, taps = _find_taps(subject, design, progress)
     except NoDesign as error:
         comments += [
             "No taps were found for this controller, so that steps of the reference are not shaped:",
@@ -284,19 +288,29 @@ def _limit_command(subject: Subject, design: DesignOptions) -> Subject:
     return replace(subject, bounds=limited)
 
 
-def _find_taps(subject: Subject, is_range_fixed: bool, progress: Progress) -> tuple[Subject, TapDesign]:
-    """Return the subject with the widest range of TAPS_RANGES_PERCENT that has taps, and the taps; only the subject's
-    own range is tried if `is_range_fixed`.
+def _find_taps(subject: Subject, design: DesignOptions, progress: Progress) -> tuple[Subject, TapDesign]:
+    """Return the subject with the widest ranges of resonance and gain that has taps, and the taps: TAPS_GAIN_PERCENT if
+    they settle within `specification.settling_ms`, then TAPS_RANGES_PERCENT. Only the subject's own ranges are tried if
+    [shape.scenarios] states them.
 
-    Raises NoDesign if the last range has no taps either.
+    Raises NoDesign if the last ranges have no taps either.
     """
-    if is_range_fixed:
+    if "scenarios" in design.shape.model_fields_set:
         return subject, design_taps(subject, progress=progress)
-    *wider, last = [subject.restrict_resonance(percent) for percent in TAPS_RANGES_PERCENT]
-    for narrowed in wider:
+    settling_ms = design.specification.settling_ms or math.inf
+    narrower = [subject.restrict_resonance(percent) for percent in TAPS_RANGES_PERCENT]
+    *wider, last = [subject.restrict_resonance(TAPS_RANGES_PERCENT[0], TAPS_GAIN_PERCENT), *narrower]
+    for candidate in wider:
+        scenarios = candidate.options.scenarios
         try:
-            return narrowed, design_taps(narrowed, progress=progress)
+            taps = design_taps(candidate, progress=progress)
+            if not scenarios.gain_percent or taps.settling_ms <= settling_ms:
+                return candidate, taps
+            cause = f"they settle in {taps.settling_ms:.4g} ms; specification.settling_ms is {settling_ms:g} ms"
         except NoDesign as error:
-            percent = narrowed.options.scenarios.resonance_percent
-            progress(f"no taps were found for resonances within ±{percent:g} % of the model's: {error}")
+            cause = str(error)
+        progress(
+            f"no taps were found for resonances within ±{scenarios.resonance_percent:g} % and gains within "
+            f"±{scenarios.gain_percent:g} % of the model's: {cause}"
+        )
     return last, design_taps(last, progress=progress)

@@ -83,8 +83,8 @@ def taps_provenance(tap_design: TapDesign, subject: Subject, source: str) -> lis
     """
     options, proof = subject.options.scenarios, tap_design.proof
     return [
-        f"Taps by rtloop {__version__} (`rtloop design shape`) for the controller of {source} and resonances within "
-        f"±{options.resonance_percent:g} % of the model's",
+        f"Taps by rtloop {__version__} (`rtloop design shape`) for the controller of {source}, resonances within "
+        f"±{options.resonance_percent:g} % and gains within ±{options.gain_percent:g} % of the model's",
         f"on {tap_design.proved_count} plants: settling time ≤ {proof.settling_ms:.4g} ms, overshoot ≤ "
         f"{100 * proof.overshoot:.3g} %, command v {proof.lowest_command:.4g} … {proof.highest_command:.4g} per unit "
         "step",

@@ -44,11 +44,11 @@ class Subject:
     overshoot: float
     options: ShapeOptions
 
-    def restrict_resonance(self, percent: float) -> Subject:
-        """Return a copy whose scenarios vary the resonance frequency by ±`percent` of the model's. They keep the delays
-        of the present scenarios, and vary neither damping nor gain.
+    def restrict_resonance(self, percent: float, gain_percent: float = 0.0) -> Subject:
+        """Return a copy whose scenarios vary the resonance frequency by ±`percent` of the model's, and the gain by
+        ±`gain_percent`. They keep the delays of the present scenarios, and do not vary the damping.
         """
-        varied = {"resonance_percent": percent, "damping": (1.0,), "gain_percent": 0.0}
+        varied = {"resonance_percent": percent, "damping": (1.0,), "gain_percent": gain_percent}
         scenarios = self.options.scenarios.model_copy(update=varied)
         return replace(self, options=self.options.model_copy(update={"scenarios": scenarios}))
 
