@@ -39,7 +39,7 @@ quick: $(TESTED) ## checks of names, types of imports, and the tests that finish
 # Large arrays come and go by the thousand: asking the system for the memory of each costs a quarter of some tests' time.
 test: export MALLOC_MMAP_THRESHOLD_ := 268435456
 test: export MALLOC_TRIM_THRESHOLD_ := 536870912
-test: $(TESTED) ## all checks, and the tests that need no running service: WAS minutes on two cores
+test: $(TESTED) ## all checks, and the tests that start no service, worker or browser
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/pyright --pythonpath $(BIN)/python & types=$$!; \
@@ -47,7 +47,7 @@ test: $(TESTED) ## all checks, and the tests that need no running service: WAS m
 	$(BIN)/pytest -n 3 --dist loadfile --no-loadscope-reorder -m '$(SHORT) and not system'
 
 # They keep real time and wait for processes, so that a third worker has work while two wait.
-test-system: $(TESTED) ## the tests of real services, boards, nodes and the panel in a browser
+test-system: $(TESTED) ## the tests of real processes: services, boards, nodes, workers, builds, and the panel in a browser
 	$(BIN)/python -m rtloop.cli.warm
 	$(BIN)/pytest -n 3 --dist loadfile --no-loadscope-reorder -m '$(SHORT) and system'
 

@@ -17,7 +17,10 @@ from tests.campaigns.bad_recordings import dask_cluster
 from tests.campaigns.campaign_files import result_files, rtloop, write_campaign
 from tests.campaigns.test_workers import KILLING_RIG, killing_environment
 
-pytestmark = pytest.mark.skipif(find_spec("distributed") is None, reason="distributed is not installed")
+pytestmark = [
+    pytest.mark.system,
+    pytest.mark.skipif(find_spec("distributed") is None, reason="distributed is not installed"),
+]
 
 
 @pytest.fixture(scope="module")

@@ -30,6 +30,8 @@ from tests.engine.harness import AXIS, CONTROLLER, IDEAL, make_plan, text
 from tests.engine.test_late_clock import simulate
 from tests.paper_dynamics import paper_dynamics
 
+pytestmark = pytest.mark.system
+
 SINE = '[axis.reference]\nkind = "sine"\namplitude = 10.0\nfrequency_hz = 50.0\n'
 LATE_US = (0.0, 30.0, 60.0, 90.0, 120.0, 250.0)
 PUSH = "[driver.plant.disturbance]\nstep_um = 2.0\nsine_um = 1.0\nsine_hz = 30.0\nstart_s = 0.02\n"

@@ -9,6 +9,8 @@ import pytest
 
 from tests.campaigns.campaign_files import ROOT
 
+pytestmark = pytest.mark.system
+
 NOTEBOOK = ROOT / "docs/notebooks/campaign.ipynb"
 
 

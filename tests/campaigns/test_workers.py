@@ -19,6 +19,8 @@ from tests.campaigns.campaign_files import result_files, rtloop, write_campaign
 from tests.command_line import run
 from tests.users import ROOT_ONLY
 
+pytestmark = pytest.mark.system
+
 KILLING_RIG = 7
 DYING_WORKER_HOOK = f"""
 import os, sys

@@ -27,6 +27,8 @@ from rtloop.linear.transfer import Transfer
 from tests.doctor.hosts import host
 from tests.recording.real_loop import ROOT, changed_configuration
 
+pytestmark = pytest.mark.system
+
 CAP_IPC_LOCK, CAP_SYS_NICE, PR_CAPBSET_DROP = 14, 23, 24
 
 

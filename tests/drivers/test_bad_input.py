@@ -21,6 +21,8 @@ from tests.drivers.processes import board_memory, completed
 from tests.drivers.test_comedi_contract import comedi
 from tests.stage_text import one_axis, wired
 
+pytestmark = pytest.mark.system
+
 CONFIG = """
 [loop]
 rate_hz = 1000

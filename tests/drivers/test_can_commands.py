@@ -22,6 +22,8 @@ from tests.command_line import answer, run
 from tests.drivers.can_bench import configuration, free_port
 from tests.drivers.processes import completed, rtloop
 
+pytestmark = pytest.mark.system
+
 TIMEOUT_S = 120
 
 

@@ -14,6 +14,8 @@ import pytest
 from tests.drivers.installing import built_modules
 from tests.drivers.processes import ROOT, completed
 
+pytestmark = pytest.mark.system
+
 FILE = re.compile(r"^    (?:# |/\* )(\w+\.(?:py|c))(?: \*/)?\n((?:    .*\n|\n)+)", re.MULTILINE)
 
 

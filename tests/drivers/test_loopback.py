@@ -14,6 +14,8 @@ from rtloop.doctor.loopback import measure_pair
 from tests.drivers.comedi_board import new_board, output_v, stub_library
 from tests.stage_text import one_axis, wired
 
+pytestmark = pytest.mark.system
+
 DWELL, SETTLING = 100, 50
 LSB_V = 20.0 / 65535
 CONFIG = f"""

@@ -11,6 +11,8 @@ import pytest
 
 from tests.drivers.processes import ENVIRONMENT
 
+pytestmark = pytest.mark.system
+
 SOAK = pytest.mark.soak
 
 

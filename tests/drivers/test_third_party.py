@@ -18,6 +18,8 @@ from tests.drivers.installing import install
 from tests.drivers.processes import completed
 from tests.stage_text import one_axis
 
+pytestmark = pytest.mark.system
+
 CONFIG = """
 [loop]
 rate_hz = {rate_hz}

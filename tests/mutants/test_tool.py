@@ -26,6 +26,8 @@ from tests.mutants.rooms import MIN_PER_ROOM, ROOMS, ROOT, room_sources, room_te
 from tests.mutants.trees import Tree
 from tests.mutants.trial import Trial
 
+pytestmark = pytest.mark.system
+
 SOURCE = """def limited(value, limit):
     if value > limit:
         return limit

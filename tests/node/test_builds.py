@@ -10,6 +10,8 @@ import pytest
 
 from tests.node.conftest import NODE
 
+pytestmark = pytest.mark.system
+
 
 def test_the_library_needs_no_more_of_the_c_library_than_copying(compiler: str, tmp_path: Path):
     if (nm := shutil.which("nm")) is None:

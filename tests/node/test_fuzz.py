@@ -10,6 +10,8 @@ import pytest
 
 from tests.node.conftest import NODE
 
+pytestmark = pytest.mark.system
+
 
 @pytest.fixture(scope="module")
 def fuzz(compiler: str, tmp_path_factory: pytest.TempPathFactory) -> list[str]:

@@ -11,6 +11,8 @@ from pathlib import Path
 
 import pytest
 
+pytestmark = pytest.mark.system
+
 pytest.importorskip("cyclonedx_py", reason="cyclonedx-bom is missing: `make dist` installs it")
 
 

@@ -18,7 +18,10 @@ import pytest
 import rtloop
 from tests.packaging.distribution import ROOT, build, can_build, copy_tree, unpack_sdist, wheel_files
 
-pytestmark = pytest.mark.skipif(not can_build(), reason="setuptools is missing or too old to build rtloop")
+pytestmark = [
+    pytest.mark.system,
+    pytest.mark.skipif(not can_build(), reason="setuptools is missing or too old to build rtloop"),
+]
 
 LINKED = ("drivers", "hil")
 """Folders of rtloop that are links to top-level folders."""

@@ -13,6 +13,8 @@ import rtloop
 from tests.packaging.distribution import ROOT
 from tests.recording.real_loop import eventful_configuration, record
 
+pytestmark = pytest.mark.system
+
 TICKS = 300
 
 

@@ -27,7 +27,11 @@ from rtloop.supervision.paths import block_path, create_file, runtime_folder, so
 from tests.paper_configuration import PAPER
 from tests.users import ATTACKER, ROOT_ONLY, VICTIM, Raised, as_user, clean_places
 
-pytestmark = [ROOT_ONLY, pytest.mark.skipif(os.stat("/tmp").st_mode & 0o1777 != 0o1777, reason="/tmp is not shared")]
+pytestmark = [
+    pytest.mark.system,
+    ROOT_ONLY,
+    pytest.mark.skipif(os.stat("/tmp").st_mode & 0o1777 != 0o1777, reason="/tmp is not shared"),
+]
 SIZES = Sizes(columns=1, axes=1, rate_hz=1000.0, snapshot_bytes=8, table_samples=1)
 FORGED_V = 9.9
 

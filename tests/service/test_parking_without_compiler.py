@@ -25,6 +25,8 @@ from tests.drivers.comedi_board import new_board, output_v, stub_library
 from tests.faults.configuration import on_a_board
 from tests.service.fake_board import FakeBoard
 
+pytestmark = pytest.mark.system
+
 START_V = 6.66
 PROGRAM = """
 import sys

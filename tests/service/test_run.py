@@ -26,6 +26,8 @@ from rtloop.supervision import supervisor
 from rtloop.supervision.child import Child
 from tests.recording.real_loop import read_rows, record
 
+pytestmark = pytest.mark.system
+
 ROOT = Path(__file__).resolve().parents[2]
 PAPER = ROOT / "deploy" / "paper.toml"
 TIMEOUT_S = 120

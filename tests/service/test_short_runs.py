@@ -29,6 +29,8 @@ from tests.recording.real_loop import PAPER, RealLoop, changed_configuration
 from tests.service.test_python_driver import DRIVER, install
 from tests.service.test_run import ROOT, start
 
+pytestmark = pytest.mark.system
+
 NOT_THERE = 66
 TRIPPING = ("position_um = 60.0", "position_um = 0.001")
 FAILING = ("    def read(self):\n", '    def read(self):\n        raise OSError("cable [off]\\n\\x1b[31m")\n')

@@ -13,8 +13,12 @@ import tomllib
 import urllib.request
 from pathlib import Path
 
+import pytest
+
 from rtloop.configuration.file import parse
 from rtloop.starters.demonstration import PREFIX, demonstration_text
+
+pytestmark = pytest.mark.system
 
 ROOT = Path(__file__).resolve().parents[2]
 MEMORY = Path("/dev/shm")

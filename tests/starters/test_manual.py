@@ -14,6 +14,8 @@ import pytest
 from rtloop.cli import main, manual
 from tests.test_help import groups
 
+pytestmark = pytest.mark.system
+
 ROOT = Path(__file__).resolve().parents[2]
 
 

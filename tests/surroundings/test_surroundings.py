@@ -25,6 +25,8 @@ from tests.surroundings.commands import PROGRAM, ROOT, Command, clean_environmen
 from tests.surroundings.planted import plant
 from tests.surroundings.surroundings import SURROUNDINGS, Surrounding
 
+pytestmark = pytest.mark.system
+
 STARTS_CHILDREN = {
     "import {stock}/short.csv --rate 1000 --all --out made.mcap": 0,
     "run {stock}/paper.toml --duration 0.01 --unpaced": 0,

@@ -24,7 +24,7 @@ MISSED = 10
 SAMPLED = [component for component in COMPONENTS.values() if component.share]
 QUICK_MUTANTS = [mutant for mutant in MUTANTS if not mutant.component.startswith("service")]
 SHARES = sum(component.share for component in SAMPLED)
-pytestmark = pytest.mark.skipif(bool(unavailable()), reason=unavailable())
+pytestmark = [pytest.mark.system, pytest.mark.skipif(bool(unavailable()), reason=unavailable())]
 
 
 @pytest.fixture(scope="module", autouse=True)

@@ -22,6 +22,8 @@ from rtloop.workbench.hysteresis import fit_hysteresis
 from tests.workbench.notebook import ROOT, Names, execute_notebook
 from tests.workbench.test_documented import EXAMPLES
 
+pytestmark = pytest.mark.system
+
 RESONANCE_HZ, DAMPING = 595.5, 0.0073
 """The second mode of eq (5) of the paper, which the rig has: 3741.7 rad/s."""
 

@@ -4,7 +4,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import pytest
+
 from tests.soak.panel_triggers import play_pulses
+
+pytestmark = pytest.mark.system
 
 PULSES = 150
 """Pulses of this test; `make soak NAME=panel-triggers` has 10,000."""
