@@ -11,10 +11,12 @@ import time
 from contextlib import suppress
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from rtloop.client import Client
 from rtloop.errors import RtloopError
+from tests.engine.harness import LoopBench, make_plan
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGE = (ROOT / "docs" / "laws.md").read_text()
@@ -118,7 +120,7 @@ def test_the_documented_test_of_the_notch_passes_and_finds_a_wrong_notch(folder:
 def test_the_pages_conditional_integration_passes_and_an_unconditional_one_winds_up(folder: Path):
     (page_law,) = [text for name, text in FILE.findall(PAGE) if name == "conditional.py"]
     right = "\n".join(line[4:] for line in page_law.splitlines())
-    condition = "if step_um * (told.applied_um - told.command_um) >= 0.0:"
+    condition = "if abs(missing_um) < 1e-9 or step_um * missing_um >= 0.0:"
     assert right.count(condition) == 1
     for name, text in (("conditional", right), ("wrong", right.replace(condition, "if True:"))):
         (folder / f"{name}.py").write_text(text)
@@ -132,6 +134,17 @@ def test_the_pages_conditional_integration_passes_and_an_unconditional_one_winds
     assert "1 failed, 7 passed" in report, report
     assert "FAILED test_wrong.py" in report, report
     assert "the law winds up" in report, report
+
+
+def test_the_pages_conditional_integration_integrates_without_a_limit(folder: Path):
+    """The applied command comes back through hysteresis and inverse, with a rounding error that must not stop it."""
+    run_command(folder, "rtloop law new conditional")
+    (page_law,) = [text for name, text in FILE.findall(PAGE) if name == "conditional.py"]
+    (folder / "conditional.py").write_text("\n".join(line[4:] for line in page_law.splitlines()))
+    bench = LoopBench(make_plan((folder / "conditional.toml").read_text(), folder))
+    levels = bench.column(bench.run(20_000), "x_error_um").reshape(10, 2000)
+    assert np.abs(levels[:, :10]).max(axis=1).min() > 10.0
+    assert np.abs(levels[:, -200:]).max() < 0.2
 
 
 def pytest_report(folder: Path, *arguments: str) -> str:
