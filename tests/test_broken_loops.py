@@ -69,7 +69,7 @@ def test_a_working_loop_has_no_problems(tmp_path: Path) -> None:
     config = write_configuration(tmp_path)
     result = CliRunner().invoke(main, ["check", str(config), "--strict"])
     assert result.exit_code == 0, result.output
-    assert "the loop meets its specification" in result.stdout
+    assert "by its linear figures, the loop meets its specification; `rtloop design verify` simulates" in result.stdout
     assert loop_figures(prepare(load(config)), 0)["problems"] == []
     metrics, tripped = steps_of_a_run(load(config))
     assert (metrics.unreached, tripped) == (0, False)

@@ -64,8 +64,8 @@ def print_axis(out: Console, judgement: AxisJudgement, sensor: Channel) -> None:
     if judgement.spent is not None:
         out.print(judgement.spent.text)
     if judgement.verification is not None:
-        specification = escape(axis.specification)
-        out.print(f"{specification}: {answer(judgement.verification)}; `rtloop design verify` shows all figures")
+        sentence = answer(judgement.verification, "by its linear figures")
+        out.print(f"{escape(axis.specification)}: {sentence}; `rtloop design verify` simulates steps as well")
 
 
 def _command_text(axis: AxisOptions) -> str:
