@@ -1,0 +1,301 @@
+"""Facts that hold in every world, computed from records, outputs, events, answers and the configuration's text alone."""
+
+from __future__ import annotations
+
+import hashlib
+import tomllib
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import numpy as np
+
+from rtloop.engine.messages import Kind, Origin
+from rtloop.signals import COMMON_COUNT, DRIVE, FLAGS, MODE, PER_AXIS_COUNT, TICK, TRIP_MASK, Flag, Mode
+from tests.worlds.world import Request, Run, World
+
+PERIOD_S, ROUNDING_V = 1e-3, 1e-9
+ANSWER_S = {
+    "/status": 0.0, "/arm": 0.0, "/lock": 0.0, "/stop": 2.1, "/reset": 2.1, "/start": 5.0, "/mode": 5.0,
+    "/response": 60.0, "/learn": 60.0,
+}  # fmt: skip
+"""Longest time to an answer, s, of a host that delays no thread; other requests wait for others: OTHER_S."""
+OTHER_S = 20.0
+UNHURRIED_S = 1.0
+"""Time that delays of threads may add to it."""
+TICK_KINDS = {
+    "/start": Kind.SET_MODE, "/mode": Kind.SET_MODE, "/stop": Kind.SET_MODE, "/reset": Kind.RESET_TRIP,
+    "/setpoint": Kind.SET_REFERENCE, "/reference": Kind.SET_REFERENCE, "/waveform": Kind.SET_REFERENCE,
+    "/tune": Kind.LOAD_LAW, "/controller": Kind.LOAD_LAW, "/undo": Kind.LOAD_LAW,
+}  # fmt: skip
+"""Requests that are answered by a tick, and the event of their effect at it."""
+MAY_HALF_SUCCEED = ("/response", "/learn", "/reload", "/start", "/mode")
+"""Requests that send several commands, of which some may take effect before a refusal."""
+FREE = ("/status", "/stop", "/lock")
+TRANSITIONS = {
+    "starting": ("stopped", "armed", "running", "tripped"),
+    "stopped": ("armed", "tripped", "starting", "running", "ramping"),
+    "armed": ("stopped", "running", "ramping", "tripped", "starting"),
+    "running": ("ramping", "armed", "stopped", "tripped", "starting"),
+    "ramping": ("armed", "stopped", "running", "tripped", "starting"),
+    "tripped": ("stopped", "armed", "ramping"),
+}
+"""States that may follow each state, from one stretch to the next; with a recovery, `running` may follow `tripped`."""
+
+
+class Violation(AssertionError):
+    """An invariant does not hold."""
+
+
+def require(condition: object, text: str) -> None:
+    """Raise Violation with a text unless a condition holds."""
+    if not condition:
+        raise Violation(text)
+
+
+class Invariants:
+    """The invariants of one world; `on_stretch` is called at each stretch of ticks, `on_answer` at each answer."""
+
+    def __init__(self, world: World, text: str, lock_timeout_s: float) -> None:
+        self._world, self._lock_timeout_s = world, lock_timeout_s
+        configuration = tomllib.loads(text)
+        limits = [axis["limits"] for axis in configuration["axis"]]
+        self._highest_v = np.array([limit["drive_v"] for limit in limits])
+        self._step_v = PERIOD_S * np.array([limit["slew_v_per_s"] for limit in limits])
+        self._ramp_v = PERIOD_S * np.array([limit["trip_slew_v_per_s"] for limit in limits])
+        self._arm = configuration["service"]["arm"]
+        self._stall_s = configuration["service"]["stall_ms"] / 1000.0
+        self.recovers = "recover" in configuration["service"]
+        self._drives = COMMON_COUNT + DRIVE + PER_AXIS_COUNT * np.arange(len(limits))
+        self._run: Run | None = None
+        self._mode, self._is_tripped = Mode.OFF, False
+        self._last_v = np.zeros(len(limits))
+        self._state = "starting"
+        self.ticks = self.answers = 0
+        self._quiet_since_s: float | None = None
+
+    # At each stretch
+
+    def on_stretch(self, run: Run, rows: np.ndarray[Any, Any], events: np.ndarray[Any, Any]) -> None:
+        """Check the new ticks of a loop."""
+        if run is not self._run:
+            self._run, self._mode, self._is_tripped, self._seen = run, Mode.OFF, False, 0
+        self._check_outputs(rows, events)
+        self._check_state()
+        self.ticks += len(rows)
+
+    def _check_outputs(self, rows: np.ndarray[Any, Any], events: np.ndarray[Any, Any]) -> None:
+        """Check mode, limits, steps and ramps of the outputs that the board received."""
+        written = iter([np.array(volts) for volts in self._world.board.written])
+        events_of_tick: dict[int, list[Any]] = {}
+        for event in events:
+            events_of_tick.setdefault(int(event["tick"]), []).append(event)
+        for row in rows:
+            tick, is_new_trip = int(row[TICK]), False
+            for event in events_of_tick.get(tick, ()):
+                is_new_trip |= self._follow(event)
+            has_failed = int(row[FLAGS]) & Flag.WRITE_FAILED
+            drive_v = self._last_v if has_failed else next(written)
+            place = f"tick {tick} of loop {len(self._world.runs)}"
+            require(has_failed or np.array_equal(drive_v, row[self._drives]), f"{place}: the record has another drive")
+            require(row[MODE] == self._mode, f"{place}: mode {row[MODE]:g}, by the events {self._mode:g}")
+            is_tripped = bool(int(row[FLAGS]) & TRIP_MASK)
+            require(is_tripped == self._is_tripped, f"{place}: flags {int(row[FLAGS]):#x}, by the events "
+                    f"{'tripped' if self._is_tripped else 'not tripped'}")  # fmt: skip
+            self._check_step(drive_v, place)
+            if self._mode == Mode.OFF and not has_failed and not is_new_trip:
+                ramp_v = np.maximum(np.abs(self._last_v) - self._ramp_v, 0.0) + ROUNDING_V
+                require(np.all(np.abs(drive_v) <= ramp_v), f"{place}: mode off, {self._last_v} V -> {drive_v} V")
+            self._last_v = drive_v
+        for volts in written:
+            self._check_step(volts, "outside ticks")
+            self._last_v = volts
+
+    def _check_step(self, drive_v: np.ndarray[Any, Any], place: str) -> None:
+        require(np.all(np.abs(drive_v) <= self._highest_v + ROUNDING_V), f"{place}: {drive_v} V is beyond the limits")
+        step_v = np.abs(drive_v - self._last_v)
+        most_v = np.maximum(self._step_v, self._ramp_v) + ROUNDING_V
+        require(np.all(step_v <= most_v), f"{place}: {self._last_v} V -> {drive_v} V is faster than allowed")
+
+    def _follow(self, event: Any) -> bool:
+        """Apply an event to mode and trip; return whether it is a trip."""
+        kind = int(event["kind"])
+        if kind == Kind.SET_MODE:
+            require(not self._is_tripped, "a mode was set in a tripped loop")
+            self._mode = Mode(int(event["values"][0]))
+            if self._mode != Mode.OFF:
+                self._check_cause(event)
+        elif kind == Kind.TRIPPED:
+            is_new, self._is_tripped, self._mode = not self._is_tripped, True, Mode.OFF
+            return is_new
+        elif kind == Kind.RESET_TRIP:
+            self._is_tripped, self._mode = False, Mode.OFF
+        elif kind == Kind.STOP:
+            self._mode = Mode.OFF
+        return False
+
+    def _check_cause(self, event: Any) -> None:
+        """Require that a mode that drives was requested, by a client that may, or comes from recovery or preparation."""
+        requests, now_s = self._world.requests, self._world.turns.now_s
+        requester = self.request_of(event)
+        if requester is None:
+            done = [other for other in requests if is_stop(other) and has_sent_or_refused(other)]
+            if event["origin"] == Origin.SUPERVISOR:
+                require(self.recovers, "the service returned without a policy")
+                trip_s = self._newest_s(Kind.TRIPPED)
+                late = [other for other in done if trip_s < other.sent_s and other.answered_s < now_s - 0.01]
+                starts = [other for other in requests if is_drive(other) and other.answered_s > trip_s]
+                require(not late or starts, "the service returned after a client's stop")
+            else:
+                require(not self._arm, "a loop that needs arming started by itself")
+                require(len(self._world.runs) == 1, "a later loop started by itself")
+                late = [other for other in done if other.answered_s < now_s - 0.01]
+                require(not late, "the preparation drove after a client's stop")
+            return
+        require(is_drive(requester), f"{requester.path} set mode {event['values'][0]:g}")
+        if self._arm:
+            stops = [other for other in requests if other.path in ("/stop", "/reset") and other.code == 200]
+            arms = [other for other in requests if other.path == "/arm" and other.code == 200]
+            is_armed = any(
+                not any(arm.answered_s < stop.sent_s and stop.answered_s < requester.sent_s for stop in stops)
+                for arm in arms if arm.sent_s <= now_s
+            )  # fmt: skip
+            require(is_armed, f"request {requester.number} drove outputs that were not armed")
+
+    def _newest_s(self, kind: Kind) -> float:
+        """Return the time of the newest event of a kind in any loop."""
+        for run in reversed(self._world.runs):
+            events = [event for part in run.events for event in part]
+            for event, time_s in zip(reversed(events), reversed(run.event_times_s), strict=False):
+                if event["kind"] == kind:
+                    return time_s
+        return 0.0
+
+    def request_of(self, event: Any) -> Request | None:
+        """Return the request for which the command of an event was sent, None for none."""
+        key, begin_s = (int(event["kind"]), int(event["identity"])), self._world.runs[-1].began_s
+        for request in reversed(self._world.requests):
+            if key in request.commands[-64:] and request.answered_s >= begin_s and request.run is self._world.runs[-1]:
+                return request
+        return None
+
+    def _check_state(self) -> None:
+        state = self._world.service.state.value
+        if state != self._state:
+            allowed = TRANSITIONS[self._state] + (("running",) if self.recovers and self._state == "tripped" else ())
+            require(state in allowed, f"state {self._state} -> {state}")
+            self._state = state
+
+    def check_quiet(self, death_s: float) -> None:
+        """Require that the outputs are safe once a loop that died, or stands still, has been parked."""
+
+    # At each answer
+
+    def on_answer(self, request: Request) -> None:
+        """Check an answer."""
+        self.answers += 1
+        require(request.code is not None and request.code < 500 or request.code in (503, 504),
+                f"request {request.number} {request.path}: {request.code} {request.answer}")  # fmt: skip
+        wait_s = request.answered_s - request.sent_s
+        limit_s = ANSWER_S.get(request.path, OTHER_S) + UNHURRIED_S
+        require(wait_s <= limit_s, f"request {request.number} {request.path}: answered after {wait_s:.3f} s")
+        self._check_effect(request)
+        self._check_lock(request)
+
+    def _check_effect(self, request: Request) -> None:
+        """Require that an answer tells what the loop did."""
+        effects = self._effects(request)
+        text = f"request {request.number} {request.method} {request.path} {request.body}: {request.code} {request.answer}"
+        if request.code == 200 and request.path in TICK_KINDS:
+            tick, kind = request.answer["tick"], TICK_KINDS[request.path]
+            kinds = [int(event["kind"]) for event in effects if event["tick"] == tick]
+            is_refused_stop = is_stop(request) and int(Kind.REFUSED) in kinds
+            require(int(kind) in kinds or is_refused_stop, f"{text}: at this tick {kinds}")
+        elif request.code == 422:
+            require(not request.commands or request.path in MAY_HALF_SUCCEED, f"{text}: sent {request.commands}")
+        elif request.code in (409, 503) and request.path not in MAY_HALF_SUCCEED:
+            kinds = [int(event["kind"]) for event in effects if event["kind"] != Kind.REFUSED]
+            require(not kinds, f"{text}: took effect by {kinds}")
+
+    def _effects(self, request: Request) -> list[Any]:
+        """Return the events of the commands that were sent for a request."""
+        identities = {identity for _, identity in request.commands}
+        if not identities or request.run is None:
+            return []
+        events = (event for part in request.run.events for event in part)
+        return [event for event in events if int(event["identity"]) in identities and event["kind"] != Kind.TRIPPED]
+
+    def _check_lock(self, request: Request) -> None:
+        """Require that a command of another client was refused while its holder's lock was in force."""
+        if is_stop(request) or request.path in FREE or not (request.code == 200 or request.commands):
+            return
+        for held in self._world.requests:
+            if held.client == request.client or is_stop(held) or held.code != 200 or held.path in ("/status", "/lock"):
+                if not (held.path == "/lock" and held.method == "POST" and held.code == 200
+                        and held.client != request.client):  # fmt: skip
+                    continue
+            in_force = held.answered_s <= request.sent_s and request.answered_s < held.answered_s + self._lock_timeout_s
+            if in_force and not self._may_have_left(held, request):
+                raise Violation(
+                    f"request {request.number} {request.path} of {request.client!r} was accepted while {held.client!r} "
+                    f"held the lock by request {held.number} {held.path}"
+                )
+
+    def _may_have_left(self, held: Request, request: Request) -> bool:
+        """Return whether the lock that `held` took may have changed its holder before `request` was answered."""
+        return any(
+            other.answered_s >= held.sent_s and other.sent_s <= request.answered_s and other.path == "/lock"
+            and (other.method == "DELETE" and other.client == held.client or other.body)
+            for other in self._world.requests
+        )  # fmt: skip
+
+    # At the end
+
+    def at_end(self) -> None:
+        """Check the recordings of all loops, and that the outputs are safe."""
+        require(not np.any(self._world.board.volts), f"the outputs end at {self._world.board.volts} V")
+        runs = [run for run in self._world.runs]
+        results = [result for result in self._world.service.results if result.recordings or result.recorder]
+        require(len(results) == len(runs), f"{len(runs)} loops and {len(results)} results")
+        for run, result in zip(runs, results, strict=True):
+            check_recording(run, result)
+
+    def digest(self) -> str:
+        return hashlib.sha256(self._world.digest().encode()).hexdigest()
+
+
+def check_recording(run: Run, result: Any) -> None:
+    """Require that each tick of a loop is in its files in equal bytes, or was counted as lost."""
+    from rtloop.recording.load import load
+
+    rows = np.concatenate([*run.rows, np.zeros((0, 1))]) if not run.rows else np.concatenate(run.rows)
+    recorded = [block for block in load(result.recordings).blocks()] if result.recordings else []
+    ticks = np.concatenate([block[:, TICK] for block in recorded]).astype(int) if recorded else np.zeros(0, int)
+    require(np.all(np.diff(ticks) > 0), "a tick is twice in the recording")
+    if len(ticks):
+        require(ticks[-1] < len(rows), "the recording has a tick that was not executed")
+        require(np.concatenate(recorded).tobytes() == rows[ticks].tobytes(), "the recording has other rows")
+    totals = result.recorder
+    if "ticks_lost" in totals:
+        lost = len(rows) - len(ticks)
+        require(totals["ticks_lost"] == lost, f"{lost} ticks are missing, and {totals['ticks_lost']} count as lost")
+        require(totals["complete"] <= (lost == 0), "the recording counts as complete, and lacks ticks")
+    else:
+        require(not totals["complete"], "a recording without counts is complete")
+
+
+def is_stop(request: Request) -> bool:
+    """Return whether a request is a stop: it needs no lock."""
+    return request.path == "/stop" or (request.path == "/mode" and request.body == {"mode": "off"})
+
+
+def is_drive(request: Request) -> bool:
+    """Return whether a request may let the outputs move."""
+    return request.path in ("/start", "/mode") and not is_stop(request)
+
+
+def has_sent_or_refused(request: Request) -> bool:
+    """Return whether a stop counts: it was answered, or holds for the next loop."""
+    return request.code in (200, 409, 504)
+
+
+_ = (Callable, Iterator)
