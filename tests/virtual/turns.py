@@ -84,6 +84,8 @@ class Turns:
             self._give_up_turn(self.now_s + delay_s, never)
 
     def _give_up_turn(self, until_s: float, condition: Callable[[], object]) -> None:
+        if self._turn is None:
+            raise EndOfTest
         me = threading.current_thread()
         self._waits[me] = until_s, condition
         self._pass_on()

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import hashlib
 import tomllib
-from collections.abc import Callable, Iterator
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -13,7 +12,7 @@ from rtloop.engine.messages import Kind, Origin
 from rtloop.signals import COMMON_COUNT, DRIVE, FLAGS, MODE, PER_AXIS_COUNT, TICK, TRIP_MASK, Flag, Mode
 from tests.worlds.world import Request, Run, World
 
-PERIOD_S, ROUNDING_V = 1e-3, 1e-9
+PERIOD_S, ROUNDING_V, BATCH_TICKS, STATE_TICKS = 1e-3, 1e-9, 200, 25
 ANSWER_S = {
     "/status": 0.0, "/arm": 0.0, "/lock": 0.0, "/stop": 2.1, "/reset": 2.1, "/start": 5.0, "/mode": 5.0,
     "/response": 60.0, "/learn": 60.0,
@@ -71,50 +70,77 @@ class Invariants:
         self._last_v = np.zeros(len(limits))
         self._state = "starting"
         self.ticks = self.answers = 0
-        self._quiet_since_s: float | None = None
+        self._rows: list[np.ndarray[Any, Any]] = []
+        self._row_count = 0
 
     # At each stretch
 
     def on_stretch(self, run: Run, rows: np.ndarray[Any, Any], events: np.ndarray[Any, Any]) -> None:
-        """Check the new ticks of a loop."""
+        """Check the new ticks of a loop: at once if there are events, else together with later ones."""
         if run is not self._run:
-            self._run, self._mode, self._is_tripped, self._seen = run, Mode.OFF, False, 0
-        self._check_outputs(rows, events)
-        self._check_state()
+            self._run, self._mode, self._is_tripped = run, Mode.OFF, False
+        self._rows.append(rows)
+        self._row_count += len(rows)
+        if len(events) or self._row_count >= BATCH_TICKS:
+            self._check_ticks(events)
+        if len(events) or self.ticks // STATE_TICKS != (self.ticks + len(rows)) // STATE_TICKS:
+            self._check_state()
         self.ticks += len(rows)
 
-    def _check_outputs(self, rows: np.ndarray[Any, Any], events: np.ndarray[Any, Any]) -> None:
-        """Check mode, limits, steps and ramps of the outputs that the board received."""
-        written = iter([np.array(volts) for volts in self._world.board.written])
-        events_of_tick: dict[int, list[Any]] = {}
-        for event in events:
-            events_of_tick.setdefault(int(event["tick"]), []).append(event)
-        for row in rows:
-            tick, is_new_trip = int(row[TICK]), False
-            for event in events_of_tick.get(tick, ()):
-                is_new_trip |= self._follow(event)
-            has_failed = int(row[FLAGS]) & Flag.WRITE_FAILED
-            drive_v = self._last_v if has_failed else next(written)
-            place = f"tick {tick} of loop {len(self._world.runs)}"
-            require(has_failed or np.array_equal(drive_v, row[self._drives]), f"{place}: the record has another drive")
-            require(row[MODE] == self._mode, f"{place}: mode {row[MODE]:g}, by the events {self._mode:g}")
-            is_tripped = bool(int(row[FLAGS]) & TRIP_MASK)
-            require(is_tripped == self._is_tripped, f"{place}: flags {int(row[FLAGS]):#x}, by the events "
-                    f"{'tripped' if self._is_tripped else 'not tripped'}")  # fmt: skip
-            self._check_step(drive_v, place)
-            if self._mode == Mode.OFF and not has_failed and not is_new_trip:
-                ramp_v = np.maximum(np.abs(self._last_v) - self._ramp_v, 0.0) + ROUNDING_V
-                require(np.all(np.abs(drive_v) <= ramp_v), f"{place}: mode off, {self._last_v} V -> {drive_v} V")
-            self._last_v = drive_v
-        for volts in written:
-            self._check_step(volts, "outside ticks")
-            self._last_v = volts
+    def flush(self) -> None:
+        """Check the ticks and outputs since the last check."""
+        self._check_ticks(())
 
-    def _check_step(self, drive_v: np.ndarray[Any, Any], place: str) -> None:
-        require(np.all(np.abs(drive_v) <= self._highest_v + ROUNDING_V), f"{place}: {drive_v} V is beyond the limits")
-        step_v = np.abs(drive_v - self._last_v)
+    def _check_ticks(self, events: Sequence[Any]) -> None:
+        """Check mode, limits, steps and ramps of the outputs that the board received."""
+        rows = np.concatenate([*self._rows, np.zeros((0, self._rows[0].shape[1]))]) if self._rows else None
+        written, self._rows, self._row_count = self._world.board.written[:], [], 0
+        self._world.board.written.clear()
+        if rows is not None:
+            drives_v = rows[:, self._drives]
+            has_failed = (rows[:, FLAGS].astype(int) & Flag.WRITE_FAILED) > 0
+            count = len(rows) - np.count_nonzero(has_failed)
+            received_v = np.array(written[:count]).reshape(-1, len(self._drives))
+            require(np.array_equal(received_v, drives_v[~has_failed]), "the record has other drives than the board")
+            drives_v[has_failed] = np.nan
+            written = written[count:]
+            self._check_segments(rows, drives_v, has_failed, events)
+        if written:
+            self._check_steps(np.array(written), "outside ticks")
+
+    def _check_segments(
+        self, rows: np.ndarray[Any, Any], drives_v: np.ndarray[Any, Any], failed: np.ndarray[Any, Any], events: Any
+    ) -> None:
+        """Check ticks between events, whose drives are NaN where the board refused them."""
+        first = int(rows[0, TICK])
+        events_at: dict[int, list[Any]] = {}
+        for event in events:
+            events_at.setdefault(int(event["tick"]) - first, []).append(event)
+        require(all(0 <= place < len(rows) for place in events_at), f"an event of another tick: {[*events_at]}")
+        places = sorted({0, *events_at})
+        for begin, end in zip(places, [*places[1:], len(rows)], strict=True):
+            is_new_trip = any([self._follow(event) for event in events_at.get(begin, ())])
+            segment, place = slice(begin, end), f"tick {first + begin} and later of loop {len(self._world.runs)}"
+            require(np.all(rows[segment, MODE] == self._mode), f"{place}: the mode is not {self._mode.name}")
+            is_tripped = (rows[segment, FLAGS].astype(int) & TRIP_MASK) > 0
+            require(np.all(is_tripped == self._is_tripped), f"{place}: tripped is not {self._is_tripped}")
+            before_v = self._check_steps(drives_v[segment], place)
+            if self._mode == Mode.OFF:
+                most_v = np.maximum(np.abs(before_v) - self._ramp_v, 0.0) + ROUNDING_V
+                is_slow = ~failed[segment] & np.any(np.abs(drives_v[segment]) > most_v, axis=1)
+                is_slow[0] &= not is_new_trip
+                require(not np.any(is_slow), f"{place}: mode off, and the outputs are not on the way to safe")
+
+    def _check_steps(self, drives_v: np.ndarray[Any, Any], place: str) -> np.ndarray[Any, Any]:
+        """Check limits and steps of successive drives, NaN where none was written; return the drive before each."""
+        levels_v = np.vstack([self._last_v, drives_v])
+        for k in np.flatnonzero(np.isnan(levels_v[:, 0])):
+            levels_v[k] = levels_v[k - 1]
+        self._last_v = levels_v[-1]
         most_v = np.maximum(self._step_v, self._ramp_v) + ROUNDING_V
-        require(np.all(step_v <= most_v), f"{place}: {self._last_v} V -> {drive_v} V is faster than allowed")
+        require(np.all(np.abs(levels_v) <= self._highest_v + ROUNDING_V), f"{place}: a drive beyond the limits")
+        require(np.all(np.abs(np.diff(levels_v, axis=0)) <= most_v), f"{place}: a drive faster than allowed")
+        return levels_v[:-1]
 
     def _follow(self, event: Any) -> bool:
         """Apply an event to mode and trip; return whether it is a trip."""
@@ -185,14 +211,12 @@ class Invariants:
             require(state in allowed, f"state {self._state} -> {state}")
             self._state = state
 
-    def check_quiet(self, death_s: float) -> None:
-        """Require that the outputs are safe once a loop that died, or stands still, has been parked."""
-
     # At each answer
 
     def on_answer(self, request: Request) -> None:
         """Check an answer."""
         self.answers += 1
+        self._check_state()
         require(request.code is not None and request.code < 500 or request.code in (503, 504),
                 f"request {request.number} {request.path}: {request.code} {request.answer}")  # fmt: skip
         wait_s = request.answered_s - request.sent_s
@@ -252,15 +276,13 @@ class Invariants:
 
     def at_end(self) -> None:
         """Check the recordings of all loops, and that the outputs are safe."""
+        self.flush()
         require(not np.any(self._world.board.volts), f"the outputs end at {self._world.board.volts} V")
         runs = [run for run in self._world.runs]
         results = [result for result in self._world.service.results if result.recordings or result.recorder]
         require(len(results) == len(runs), f"{len(runs)} loops and {len(results)} results")
         for run, result in zip(runs, results, strict=True):
             check_recording(run, result)
-
-    def digest(self) -> str:
-        return hashlib.sha256(self._world.digest().encode()).hexdigest()
 
 
 def check_recording(run: Run, result: Any) -> None:
@@ -296,6 +318,3 @@ def is_drive(request: Request) -> bool:
 def has_sent_or_refused(request: Request) -> bool:
     """Return whether a stop counts: it was answered, or holds for the next loop."""
     return request.code in (200, 409, 504)
-
-
-_ = (Callable, Iterator)

@@ -10,7 +10,7 @@ from functools import partial
 from typing import Any
 
 from tests.worlds.invariants import Invariants, Violation
-from tests.worlds.schedule import CLIENTS, DISK_ERRORS, UM_PER_V, Action, Draw, draw_world
+from tests.worlds.schedule import ACTORS, DISK_ERRORS, UM_PER_V, Action, Draw, draw_world
 from tests.worlds.world import Board, Request, World
 
 LAG = 0.18
@@ -39,8 +39,10 @@ def play(seed: int, actions: Sequence[Action] | None = None) -> Outcome:
     actions = draw.actions if actions is None else actions
     world = World(draw.text, seed, Board(UM_PER_V[: len(draw.axes)], LAG), draw.lock_timeout_s, draw.preemption)
     invariants, failure, begin_s = Invariants(world, draw.text, draw.lock_timeout_s), None, world.turns.now_s
-    world.on_stretch = invariants.on_stretch
-    actors = [partial(_act, world, draw, name, actions, invariants) for name in (*CLIENTS, "fault")]
+    world.on_stretch, world.on_begin = invariants.on_stretch, invariants.flush
+    actors = [
+        partial(_act, world, draw, name, actions, invariants) for name in (*ACTORS, "fault")
+    ]
     try:
         world.live(actors, draw.seconds)
         invariants.at_end()
@@ -61,7 +63,7 @@ def _act(world: World, draw: Draw, name: str, actions: Sequence[Action], invaria
     """Do the actions of one actor, each at its time or after the one before."""
     begin_s = world.turns.now_s
     for action in actions:
-        if action.actor == name:
+        if action.actor == name and world.error is None:
             world.turns.sleep(max(begin_s + action.at_s - world.turns.now_s, 0.0))
             if name == "fault":
                 _fail(world, action)
@@ -71,9 +73,13 @@ def _act(world: World, draw: Draw, name: str, actions: Sequence[Action], invaria
 
 def _request(world: World, draw: Draw, action: Action) -> Request:
     """Send the request of an action."""
-    send: Callable[..., Request] = partial(world.request, action.actor)
+    send: Callable[..., Request] = partial(world.request, action.actor.split("/")[0])
     match action.kind, action.values:
-        case "setpoint", (axis, value):
+        case "closed" | "raw", ():
+            return send("POST", "/mode", {"mode": {"closed": "closed_loop"}.get(action.kind, action.kind)})
+        case "trip", ():
+            return send("POST", "/tune", {"axis": "x", "section": "interlocks", "values": {"position_um": 0.1}})
+        case "setpoint" | "hold", (axis, value):
             return send("POST", "/setpoint", {"axis": axis, "value": value})
         case "reference", (axis, amplitude, hertz):
             reference = {"kind": "sine", "amplitude": amplitude, "offset": 2.0, "frequency_hz": hertz}

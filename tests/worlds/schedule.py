@@ -11,7 +11,8 @@ from typing import Any
 RATE_HZ = 1000.0
 KEY = "open sesame"
 CLIENTS = ("ann", "ben", "")
-"""Two clients with a name, and one without, as a page."""
+"""Two clients with a name, and one without, as a page; each has some threads, the actors NAME/NUMBER."""
+ACTORS = tuple(f"{client}/{number}" for client in CLIENTS for number in (1, 2, 3))
 HEAD = """
 [loop]
 rate_hz = 1000
@@ -84,7 +85,7 @@ class Action:
     values: tuple[Any, ...] = ()
 
     def __str__(self) -> str:
-        return f"{self.at_s:8.3f} s  {self.actor or 'page':6} {self.kind} {' '.join(map(repr, self.values))}"
+        return f"{self.at_s:8.3f} s  {self.actor:6} {self.kind} {' '.join(map(repr, self.values))}"
 
 
 @dataclass(frozen=True)
@@ -104,7 +105,7 @@ def draw_world(seed: int) -> Draw:
     draw = random.Random(f"{seed} world")
     axes = ("x",) if draw.random() < 0.6 else ("x", "y")
     text = _draw_text(draw, axes)
-    seconds = draw.choice((5.0, 10.0, 20.0))
+    seconds = draw.choice((4.0, 8.0, 16.0))
     actions = [*_draw_requests(draw, axes, seconds), *_draw_faults(draw, seconds)]
     actions.sort(key=lambda action: action.at_s)
     return Draw(text, axes, seconds, tuple(actions), draw.choice((1.0, 3.0, 60.0)), draw.choice((0.0, 0.002, 0.02)))
@@ -137,16 +138,28 @@ REQUESTS = {
 """Requests and their weights."""
 
 
+RECIPES = (
+    ("arm", "start"), ("arm", "start"), ("reset", "arm", "start"), ("arm", "closed", "hold", "response"),
+    ("arm", "closed", "hold", "learn"), ("start", "stop"), ("stop", "start"), ("tune", "undo"), ("tune", "tune", "undo"),
+    ("setpoint", "waveform", "waveform"), ("reload", "tune"), ("closed", "raw", "closed"), ("unlock", "key"),
+    ("hold", "setpoint", "reference"), ("stop", "stop"), ("arm", "start", "trip", "reset"),
+)  # fmt: skip
+"""Requests that follow each other, each at once, a little later, or from another thread of the client."""
+PAUSES_S = (0.0, 0.0, 0.001, 0.005, 0.02, 0.1, 0.3)
+
+
 def _draw_requests(draw: random.Random, axes: tuple[str, ...], seconds: float) -> list[Action]:
-    rate = draw.choice((1.0, 2.0, 6.0))
-    times_s = sorted(draw.uniform(0.0, seconds) for _ in range(round(seconds * rate)))
+    """Return requests one by one and by recipes; most come from one client, so that its lock refuses few."""
+    interval_s, at_s = draw.choice((0.15, 0.4, 1.0)), 0.0
     actions, busy_client = [], draw.choice(CLIENTS)
-    for at_s in times_s:
-        if draw.random() < 0.25 and actions:
-            at_s = actions[-1].at_s + draw.choice((0.0, 0.0, 0.001, 0.005))
-        client = busy_client if draw.random() < 0.7 else draw.choice(CLIENTS)
-        kind = draw.choices([*REQUESTS], [*REQUESTS.values()])[0]
-        actions.append(Action(at_s, client, kind, _values(draw, kind, draw.choice(axes))))
+    while (at_s := at_s + draw.expovariate(1.0 / interval_s)) < seconds:
+        client = busy_client if draw.random() < 0.85 else draw.choice(CLIENTS)
+        single = draw.choices([*REQUESTS], [*REQUESTS.values()])
+        kinds, begin_s = draw.choice(RECIPES) if draw.random() < 0.5 else single, at_s
+        for kind in kinds:
+            actor = f"{client}/{draw.choice((1, 1, 2, 3))}"
+            actions.append(Action(round(begin_s, 4), actor, kind, _values(draw, kind, draw.choice(axes))))
+            begin_s += draw.choice(PAUSES_S)
     return actions
 
 
@@ -173,6 +186,8 @@ def _values(draw: random.Random, kind: str, axis: str) -> tuple[Any, ...]:
             return (draw.choice(("same", "gain", "invalid", "no recover")),)
         case "key":
             return (draw.choice((KEY, KEY, "wrong")),)
+        case "hold":
+            return axis, draw.choice((2.0, 3.0))
         case "response":
             return axis, draw.choice((None, 0.3, 2.0))
         case "hostile":
@@ -185,7 +200,7 @@ FAULTS = ("old sample", "nan", "jump", "read error", "write error", "short hang"
 
 
 def _draw_faults(draw: random.Random, seconds: float) -> list[Action]:
-    count = draw.choice((0, 1, 2, 5))
+    count = draw.choice((0, 1, 3, 6))
     actions = []
     for _ in range(count):
         kind = draw.choice(FAULTS)

@@ -16,7 +16,7 @@ import tempfile
 import threading
 from collections.abc import Callable, Sequence
 from contextvars import ContextVar
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -173,7 +173,7 @@ class VirtualChild:
         else:
             self._work = self._drive
             world.loops.append(self)
-        self.thread = world.turns.start(self._run)
+        self.thread = world.start(self._run)
 
     def _run(self) -> None:
         try:
@@ -318,13 +318,15 @@ class World:
         self.random, self.preemption = random.Random(f"{seed} interleaving"), preemption
         self.turns = Turns(self._advance, choose=self.random.choice, delay=self._draw_delay)
         self.board, self.fds = board, set[int]()
+        self.error: Exception | None = None
         self.loops: list[VirtualChild] = []
         self.recorders: list[VirtualChild] = []
         self.running: VirtualChild | None = None
         self.runs: list[Run] = []
         self.requests: list[Request] = []
         self.hangs_until_s = 0.0
-        self.on_stretch: Callable[[Run | None, np.ndarray[Any, Any], np.ndarray[Any, Any]], None] = lambda *_: None
+        self.on_stretch: Callable[[Run, np.ndarray[Any, Any], np.ndarray[Any, Any]], None] = lambda *_: None
+        self.on_begin: Callable[[], None] = lambda: None
         self._undone_ticks = 0.0
         self.disk_error: int | None = None
         self.cut_write: tuple[float, bool] | None = None
@@ -332,14 +334,13 @@ class World:
         self._replace_processes(lock_timeout_s)
         self.service = Service(self.config)
         self._web = application(self.service)
-        self.error: BaseException | None = None
         self.exit_code: int | None = None
 
     # The replacements
 
     def _replace_processes(self, lock_timeout_s: float) -> None:
         patch, run_in_lane = self._patch, VirtualBench._run_in_lane
-        patch.setattr(timing, "source", virtual_time(self.turns))
+        patch.setattr(timing, "source", replace(virtual_time(self.turns), start_thread=self.start))
         patch.setenv("RUNTIME_DIRECTORY", str(self.folder / "run"))
         for module in (supervisor, recorder_keeper):
             patch.setattr(module, "Child", lambda *names, **files: VirtualChild(self, *names, **files))
@@ -429,6 +430,10 @@ class World:
     # Loops
 
     def begin_run(self, child: VirtualChild, block: SharedBlock) -> None:
+        try:
+            self.on_begin()
+        except Exception as error:
+            self.error = self.error or error
         self.running = child
         self._rings = {name: block.ring(name) for name in ("ticks", "events")}
         self._cursors = {"ticks": 0, "events": 0}
@@ -441,7 +446,7 @@ class World:
     def _advance(self, seconds: float) -> None:
         """Execute the ticks of a stretch of time."""
         child, rate_hz = self.running, 1000.0
-        if child is None or child.outcome is not Outcome.DONE or self.turns.now_s < self.hangs_until_s:
+        if child is None or self.error or child.outcome is not Outcome.DONE or self.turns.now_s < self.hangs_until_s:
             return
         self._undone_ticks += seconds * rate_hz
         if (ticks := int(self._undone_ticks + 1e-6)) > 0:
@@ -452,8 +457,10 @@ class World:
             run.rows.append(rows)
             run.events.append(events)
             run.event_times_s += [self.turns.now_s] * len(events)
-            self.on_stretch(run, rows, events)
-            self.board.written.clear()
+            try:
+                self.on_stretch(run, rows, events)
+            except Exception as error:  # The thread that passes its turn on is not at fault.
+                self.error = self.error or error
 
     def _drain(self, name: str) -> np.ndarray[Any, Any]:
         """Return a copy of the new slots of a ring, which is not full after a stretch."""
