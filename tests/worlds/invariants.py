@@ -139,7 +139,7 @@ class Invariants:
         self._last_v = levels_v[-1]
         most_v = np.maximum(self._step_v, self._ramp_v) + ROUNDING_V
         require(np.all(np.abs(levels_v) <= self._highest_v + ROUNDING_V), f"{place}: a drive beyond the limits")
-        require(np.all(np.abs(np.diff(levels_v, axis=0)) <= most_v), f"{place}: a drive faster than allowed")
+        require(np.all(np.abs(np.diff(levels_v, axis=0)) <= most_v), f"{place}: a drive faster than allowed: {levels_v[:6].tolist()}")
         return levels_v[:-1]
 
     def _follow(self, event: Any) -> bool:

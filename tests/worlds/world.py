@@ -145,6 +145,9 @@ class BoardDriver(PythonDriver):
     def stop(self) -> None:
         """Do nothing: the board stays."""
 
+    def outputs_v(self) -> list[float]:
+        return [*self._board.volts]
+
     def read(self) -> Sequence[float]:
         self.sample_age_us = self._board.age_us
         return self._board.read()
@@ -417,14 +420,17 @@ class World:
 
     def _write_file(self, fd: int, data: Any, offset: int) -> int:
         """Write to the recorder's file: as a disk that is full, that fails, that writes less, or at death."""
+        if fd in self.fds:
+            return self._pwrite(fd, data, offset)
         if self.disk_error is not None:
             raise OSError(self.disk_error, os.strerror(self.disk_error))
-        if self.cut_write is None:
+        child = next((child for child in self.recorders if child.thread is threading.current_thread()), None)
+        if self.cut_write is None or child is None:
             return self._pwrite(fd, data, offset)
         (share, kills), self.cut_write = self.cut_write, None
         written = self._pwrite(fd, data[: max(1, round(share * len(data)))], offset)
         if kills:
-            self.child_of_thread().kill()
+            child.kill()
         return written
 
     # Loops
