@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import traceback
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -49,7 +50,7 @@ def play(seed: int, actions: Sequence[Action] | None = None) -> Outcome:
     except Violation as violation:
         failure = str(violation)
     except Exception as error:
-        failure = f"{type(error).__name__}: {error}"
+        failure = "".join(traceback.format_exception(error, limit=-3)).strip()
     finally:
         world.close()
         logging.disable(logging.NOTSET)

@@ -157,6 +157,7 @@ def _draw_requests(draw: random.Random, axes: tuple[str, ...], seconds: float) -
         single = draw.choices([*REQUESTS], [*REQUESTS.values()])
         kinds, begin_s = draw.choice(RECIPES) if draw.random() < 0.5 else single, at_s
         for kind in kinds:
+            begin_s += 0.6 * (kind in ("response", "learn"))
             actor = f"{client}/{draw.choice((1, 1, 2, 3))}"
             actions.append(Action(round(begin_s, 4), actor, kind, _values(draw, kind, draw.choice(axes))))
             begin_s += draw.choice(PAUSES_S)

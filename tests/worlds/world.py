@@ -82,6 +82,8 @@ class Request:
 class Run:
     """A loop from its begin to its end: its records, events and, at each tick, the outputs that the board received."""
 
+    fd: int
+    """Descriptor of its shared block."""
     began_s: float
     rows: list[np.ndarray[Any, Any]] = field(default_factory=list)
     events: list[np.ndarray[Any, Any]] = field(default_factory=list)
@@ -413,7 +415,7 @@ class World:
         position = send(block, command, **options)
         number = request_number.get()
         if number >= 0:
-            self.requests[number].run = self.runs[-1] if self.runs else None
+            self.requests[number].run = next((run for run in self.runs if run.fd == block.fd), None)
             self.requests[number].commands.append((int(command["kind"][0]), int(command["identity"][0])))
         self.turns.preempt()
         return position
@@ -440,11 +442,11 @@ class World:
             self.on_begin()
         except Exception as error:
             self.error = self.error or error
-        self.running = child
         self._rings = {name: block.ring(name) for name in ("ticks", "events")}
         self._cursors = {"ticks": 0, "events": 0}
-        self.runs.append(Run(self.turns.now_s))
+        self.runs.append(Run(block.fd, self.turns.now_s))
         self._undone_ticks = 0.0
+        self.running = child
 
     def end_run(self, outcome: str) -> None:
         self.runs[-1].outcome, self.runs[-1].ended_s, self.running = outcome, self.turns.now_s, None
