@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 
 from rtloop.engine.messages import Kind, Origin
-from rtloop.signals import COMMON_COUNT, DRIVE, FLAGS, MODE, PER_AXIS_COUNT, TICK, TRIP_MASK, Flag, Mode
+from rtloop.recording.file.topics.recovery_steps import Note, RecoveryStep
+from rtloop.signals import COMMON_COUNT, DRIVE, FLAGS, MODE, PER_AXIS_COUNT, REFERENCE, TICK, TRIP_MASK, Flag, Mode
 from tests.worlds.world import Request, Run, World
 
 PERIOD_S, ROUNDING_V, BATCH_TICKS, STATE_TICKS = 1e-3, 1e-9, 200, 25
@@ -29,7 +30,6 @@ TICK_KINDS = {
 """Requests that are answered by a tick, and the event of their effect at it."""
 MAY_HALF_SUCCEED = ("/response", "/learn", "/reload", "/start", "/mode")
 """Requests that send several commands, of which some may take effect before a refusal."""
-FREE = ("/status", "/stop", "/lock")
 TRANSITIONS = {
     "starting": ("stopped", "armed", "running", "tripped"),
     "stopped": ("armed", "tripped", "starting", "running", "ramping"),
@@ -70,6 +70,9 @@ class Invariants:
         self._last_v = np.zeros(len(limits))
         self._state = "starting"
         self.ticks = self.answers = 0
+        self._stop: int | None = None
+        """Number of the stop that is in force until a client's next start."""
+        self._trips = self._recoveries = 0
         self._rows: list[np.ndarray[Any, Any]] = []
         self._row_count = 0
 
@@ -145,12 +148,19 @@ class Invariants:
     def _follow(self, event: Any) -> bool:
         """Apply an event to mode and trip; return whether it is a trip."""
         kind = int(event["kind"])
+        if (kind == Kind.SET_MODE and event["values"][0] == Mode.OFF) or kind == Kind.REFUSED:
+            requester = self.request_of(event)
+            self._stop = requester.number if requester is not None and is_stop(requester) else self._stop
+        if kind == Note.RECOVERY and event["values"][0] == RecoveryStep.BEGUN:
+            self._recoveries += 1
+            require(self._recoveries <= self._trips + len(self._world.loops), "more recoveries than trips")
         if kind == Kind.SET_MODE:
             require(not self._is_tripped, "a mode was set in a tripped loop")
             self._mode = Mode(int(event["values"][0]))
             if self._mode != Mode.OFF:
                 self._check_cause(event)
         elif kind == Kind.TRIPPED:
+            self._trips += not self._is_tripped
             is_new, self._is_tripped, self._mode = not self._is_tripped, True, Mode.OFF
             return is_new
         elif kind == Kind.RESET_TRIP:
@@ -164,19 +174,14 @@ class Invariants:
         requests, now_s = self._world.requests, self._world.turns.now_s
         requester = self.request_of(event)
         if requester is None:
-            done = [other for other in requests if is_stop(other) and has_sent_or_refused(other)]
+            require(self._stop is None, f"the service drove by itself after the stop of request {self._stop}")
             if event["origin"] == Origin.SUPERVISOR:
                 require(self.recovers, "the service returned without a policy")
-                trip_s = self._newest_s(Kind.TRIPPED)
-                late = [other for other in done if trip_s < other.sent_s and other.answered_s < now_s - 0.01]
-                starts = [other for other in requests if is_drive(other) and other.answered_s > trip_s]
-                require(not late or starts, "the service returned after a client's stop")
             else:
                 require(not self._arm, "a loop that needs arming started by itself")
                 require(len(self._world.runs) == 1, "a later loop started by itself")
-                late = [other for other in done if other.answered_s < now_s - 0.01]
-                require(not late, "the preparation drove after a client's stop")
             return
+        self._stop = None
         require(is_drive(requester), f"{requester.path} set mode {event['values'][0]:g}")
         if self._arm:
             stops = [other for other in requests if other.path in ("/stop", "/reset") and other.code == 200]
@@ -187,20 +192,11 @@ class Invariants:
             )  # fmt: skip
             require(is_armed, f"request {requester.number} drove outputs that were not armed")
 
-    def _newest_s(self, kind: Kind) -> float:
-        """Return the time of the newest event of a kind in any loop."""
-        for run in reversed(self._world.runs):
-            events = [event for part in run.events for event in part]
-            for event, time_s in zip(reversed(events), reversed(run.event_times_s), strict=False):
-                if event["kind"] == kind:
-                    return time_s
-        return 0.0
-
     def request_of(self, event: Any) -> Request | None:
         """Return the request for which the command of an event was sent, None for none."""
-        key, begin_s = (int(event["kind"]), int(event["identity"])), self._world.runs[-1].began_s
+        run, identity = self._world.runs[-1], int(event["identity"])
         for request in reversed(self._world.requests):
-            if key in request.commands[-64:] and request.answered_s >= begin_s and request.run is self._world.runs[-1]:
+            if request.run is run and any(command.identity == identity for command in request.commands):
                 return request
         return None
 
@@ -227,48 +223,56 @@ class Invariants:
 
     def _check_effect(self, request: Request) -> None:
         """Require that an answer tells what the loop did."""
-        effects = self._effects(request)
-        text = f"request {request.number} {request.method} {request.path} {request.body}: {request.code} {request.answer}"
         if request.code == 200 and request.path in TICK_KINDS:
-            tick, kind = request.answer["tick"], TICK_KINDS[request.path]
-            kinds = [int(event["kind"]) for event in effects if event["tick"] == tick]
+            tick, kind, run = request.answer["tick"], TICK_KINDS[request.path], request.run
+            kinds = [int(event["kind"]) for event in self._effects(request) if event["tick"] == tick]
             is_refused_stop = is_stop(request) and int(Kind.REFUSED) in kinds
-            require(int(kind) in kinds or is_refused_stop, f"{text}: at this tick {kinds}")
+            require(int(kind) in kinds or is_refused_stop, f"{request}: at this tick {kinds}")
+            require(run is not None and run.ticks > tick, f"{request}: answered before the record of its tick")
+            if request.path == "/reset" and run is self._world.runs[-1] and not self._has_tripped_since(run, tick):
+                state = self._world.service.state.value
+                require(state != "tripped" or run.ended_s is not None, f"{request}: the service is tripped")
         elif request.code == 422:
-            require(not request.commands or request.path in MAY_HALF_SUCCEED, f"{text}: sent {request.commands}")
-        elif request.code in (409, 503) and request.path not in MAY_HALF_SUCCEED:
-            kinds = [int(event["kind"]) for event in effects if event["kind"] != Kind.REFUSED]
-            require(not kinds, f"{text}: took effect by {kinds}")
+            require(not request.commands or request.path in MAY_HALF_SUCCEED, f"{request}: sent {request.commands}")
+        elif request.commands and "did not answer" in str(request.answer) and request.run is not None:
+            since_s = request.commands[-1].sent_s
+            count = request.run.ticks - request.commands[-1].tick
+            require(count < 0.9 * (request.answered_s - since_s) / PERIOD_S, f"{request}: and {count} ticks since")
+
+    def _has_tripped_since(self, run: Run, tick: int) -> bool:
+        return any(event["kind"] in (Kind.TRIPPED, Kind.DRIVER_FAILED) and event["tick"] >= tick
+                   for part in run.events for event in part)  # fmt: skip
 
     def _effects(self, request: Request) -> list[Any]:
         """Return the events of the commands that were sent for a request."""
-        identities = {identity for _, identity in request.commands}
+        identities = {command.identity for command in request.commands}
         if not identities or request.run is None:
             return []
         events = (event for part in request.run.events for event in part)
         return [event for event in events if int(event["identity"]) in identities and event["kind"] != Kind.TRIPPED]
 
     def _check_lock(self, request: Request) -> None:
-        """Require that a command of another client was refused while its holder's lock was in force."""
-        if is_stop(request) or request.path in FREE or not (request.code == 200 or request.commands):
+        """Require that no command was accepted while another client's lock was in force."""
+        if request.path == "/status" or is_stop(request):
             return
-        for held in self._world.requests:
-            if held.client == request.client or is_stop(held) or held.code != 200 or held.path in ("/status", "/lock"):
-                if not (held.path == "/lock" and held.method == "POST" and held.code == 200
-                        and held.client != request.client):  # fmt: skip
-                    continue
-            in_force = held.answered_s <= request.sent_s and request.answered_s < held.answered_s + self._lock_timeout_s
-            if in_force and not self._may_have_left(held, request):
-                raise Violation(
-                    f"request {request.number} {request.path} of {request.client!r} was accepted while {held.client!r} "
-                    f"held the lock by request {held.number} {held.path}"
-                )
+        times_s = [command.sent_s for command in request.commands if not command.is_urgent]
+        if request.code == 200 and request.path == "/arm":
+            times_s.append(request.answered_s)
+        for time_s in times_s:
+            for held in self._world.requests:
+                begin_s = held.commands[0].sent_s if held.commands and held.path != "/lock" else held.answered_s
+                if (
+                    held.client != request.client and held.code == 200 and takes_lock(held)
+                    and begin_s < time_s < held.answered_s + self._lock_timeout_s
+                    and not self._may_have_left(held, begin_s, time_s)
+                ):  # fmt: skip
+                    raise Violation(f"{request}: sent at {time_s:.4f} s, while the lock was held by {held}")
 
-    def _may_have_left(self, held: Request, request: Request) -> bool:
-        """Return whether the lock that `held` took may have changed its holder before `request` was answered."""
+    def _may_have_left(self, held: Request, begin_s: float, time_s: float) -> bool:
+        """Return whether the lock may have changed its holder since `held` had it: by its release, or a key."""
         return any(
-            other.answered_s >= held.sent_s and other.sent_s <= request.answered_s and other.path == "/lock"
-            and (other.method == "DELETE" and other.client == held.client or other.body)
+            other is not held and other.path == "/lock" and other.answered_s >= begin_s and other.sent_s <= time_s
+            and (other.method == "DELETE" or other.body)
             for other in self._world.requests
         )  # fmt: skip
 
@@ -277,12 +281,38 @@ class Invariants:
     def at_end(self) -> None:
         """Check the recordings of all loops, and that the outputs are safe."""
         self.flush()
-        require(not np.any(self._world.board.volts), f"the outputs end at {self._world.board.volts} V")
-        runs = [run for run in self._world.runs]
-        results = [result for result in self._world.service.results if result.recordings or result.recorder]
-        require(len(results) == len(runs), f"{len(runs)} loops and {len(results)} results")
-        for run, result in zip(runs, results, strict=True):
+        world = self._world
+        require(not np.any(world.board.volts), f"the outputs end at {world.board.volts} V")
+        for request in world.requests:
+            if request.code in (409, 503) and request.path not in MAY_HALF_SUCCEED:
+                kinds = [int(event["kind"]) for event in self._effects(request) if event["kind"] != Kind.REFUSED]
+                require(not kinds, f"{request}: took effect by {kinds}")
+            if request.code == 200 and request.path in ("/setpoint", "/waveform"):
+                self._check_reference(request)
+        results = [result for result in world.service.results if result.recordings or result.recorder]
+        require(len(results) == len(world.runs), f"{len(world.runs)} loops and {len(results)} results")
+        for run, result in zip(world.runs, results, strict=True):
             check_recording(run, result)
+
+    def _check_reference(self, request: Request) -> None:
+        """Require that the axis had the reference of an answered request until the next event of a reference."""
+        run, tick, body = request.run, request.answer["tick"], request.body
+        assert run is not None
+        axis = "xy".index(body["axis"])
+        events = [event for part in run.events for event in part if event["tick"] >= tick]
+        own = next(k for k, event in enumerate(events) if self._is_of(event, request))
+        later = [int(event["tick"]) for event in events[own + 1 :]
+                 if event["kind"] in (Kind.SET_MODE, Kind.SET_REFERENCE) and event["axis"] in (-1, axis)]  # fmt: skip
+        values = body.get("samples") or [body["value"]] * 20
+        count = len(values) * (4 if body.get("repeat") else 1)
+        end = min([tick + count, run.ticks, *later])
+        played = np.concatenate(run.rows)[tick:end, COMMON_COUNT + PER_AXIS_COUNT * axis + REFERENCE]
+        require(np.array_equal(played, np.resize(values, len(played))), f"{request}: another reference was played")
+
+    def _is_of(self, event: Any, request: Request) -> bool:
+        return event["kind"] == Kind.SET_REFERENCE and any(
+            command.identity == int(event["identity"]) for command in request.commands
+        )
 
 
 def check_recording(run: Run, result: Any) -> None:
@@ -315,6 +345,6 @@ def is_drive(request: Request) -> bool:
     return request.path in ("/start", "/mode") and not is_stop(request)
 
 
-def has_sent_or_refused(request: Request) -> bool:
-    """Return whether a stop counts: it was answered, or holds for the next loop."""
-    return request.code in (200, 409, 504)
+def takes_lock(request: Request) -> bool:
+    """Return whether an accepted request takes or renews the lock of its client."""
+    return not is_stop(request) and request.path != "/status" and request.method == "POST"

@@ -86,7 +86,7 @@ def _request(world: World, draw: Draw, action: Action) -> Request:
             reference = {"kind": "sine", "amplitude": amplitude, "offset": 2.0, "frequency_hz": hertz}
             return send("POST", "/reference", {"axis": axis, "reference": reference})
         case "waveform", (axis, count, height, repeat):
-            samples = [height * (k % 7) / 7 for k in range(count)]
+            samples = [height + 0.01 * (len(world.requests) % 50) + 0.001 * (k % 7) for k in range(count)]
             return send("POST", "/waveform", {"axis": axis, "samples": samples, "repeat": repeat})
         case "mode", (mode,):
             return send("POST", "/mode", {"mode": mode})

@@ -55,7 +55,7 @@ SINE = "amplitude = 1.0\noffset = 3.0\nfrequency_hz = 5.0\n"
 SERVICE = """
 [service]
 arm = {arm}
-stall_ms = 500.0
+stall_ms = {stall}
 restarts = 100
 emergency_key_sha256 = "{key}"
 {tare}
@@ -124,7 +124,7 @@ def _draw_text(draw: random.Random, axes: tuple[str, ...]) -> str:
     is_armed_first = draw.random() < 0.5
     return text + SERVICE.format(
         arm=str(is_armed_first).lower(), key=hashlib.sha256(KEY.encode()).hexdigest(),
-        tare=draw.choice(("", "tare_s = 0.1")),
+        stall=draw.choice((500.0, 500.0, 5000.0)), tare=draw.choice(("", "tare_s = 0.1")),
         recover=RECOVER.format(count=draw.choice((1, 3, 20))) if draw.random() < 0.6 else "",
         rotate=draw.choice(("", "", "rotate_s = 2.0")),
     )  # fmt: skip

@@ -19,7 +19,7 @@ from contextvars import ContextVar
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
@@ -59,6 +59,16 @@ class Killed(BaseException):
     """The process that this thread stands for was killed."""
 
 
+class Command(NamedTuple):
+    """A command that was sent to the loop, and the number of ticks until then."""
+
+    kind: int
+    identity: int
+    sent_s: float
+    tick: int
+    is_urgent: bool
+
+
 @dataclass
 class Request:
     """A request, its answer, and the numbers of the commands that were sent for it."""
@@ -72,10 +82,12 @@ class Request:
     code: int | None = None
     answer: Any = None
     answered_s: float = float("inf")
-    commands: list[tuple[int, int]] = field(default_factory=list)
-    """(kind, identity) of each command."""
+    commands: list[Command] = field(default_factory=list)
     run: Run | None = None
     """The loop to which its last command was sent."""
+
+    def __str__(self) -> str:
+        return f"request {self.number} of {self.client!r}: {self.method} {self.path} {self.body}, {self.code} {self.answer}"
 
 
 @dataclass
@@ -411,12 +423,15 @@ class World:
         return cached_prepare(*arguments) if function is building.prepare else function(*arguments)
 
     def _send(self, send: Callable[..., int], block: SharedBlock, command: Any, **options: Any) -> int:
-        self.turns.preempt()
-        position = send(block, command, **options)
         number = request_number.get()
+        run = next((run for run in self.runs if run.fd == block.fd), None)
         if number >= 0:
-            self.requests[number].run = next((run for run in self.runs if run.fd == block.fd), None)
-            self.requests[number].commands.append((int(command["kind"][0]), int(command["identity"][0])))
+            self.requests[number].run = run
+            is_urgent = options.get("urgent", False)
+            sent = Command(int(command["kind"][0]), int(command["identity"][0]), self.turns.now_s,
+                           0 if run is None else run.ticks, is_urgent)  # fmt: skip
+            self.requests[number].commands.append(sent)
+        position = send(block, command, **options)
         self.turns.preempt()
         return position
 
