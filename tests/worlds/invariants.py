@@ -142,7 +142,10 @@ class Invariants:
         self._last_v = levels_v[-1]
         most_v = np.maximum(self._step_v, self._ramp_v) + ROUNDING_V
         require(np.all(np.abs(levels_v) <= self._highest_v + ROUNDING_V), f"{place}: a drive beyond the limits")
-        require(np.all(np.abs(np.diff(levels_v, axis=0)) <= most_v), f"{place}: a drive faster than allowed: {levels_v[:6].tolist()}")
+        require(
+            np.all(np.abs(np.diff(levels_v, axis=0)) <= most_v),
+            f"{place}: a drive faster than allowed: {levels_v[:6].tolist()}",
+        )
         return levels_v[:-1]
 
     def _follow(self, event: Any) -> bool:
@@ -213,7 +216,7 @@ class Invariants:
         """Check an answer."""
         self.answers += 1
         self._check_state()
-        require(request.code is not None and request.code < 500 or request.code in (503, 504),
+        require((request.code is not None and request.code < 500) or request.code in (503, 504),
                 f"request {request.number} {request.path}: {request.code} {request.answer}")  # fmt: skip
         wait_s = request.answered_s - request.sent_s
         limit_s = ANSWER_S.get(request.path, OTHER_S) + UNHURRIED_S

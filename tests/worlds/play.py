@@ -41,9 +41,7 @@ def play(seed: int, actions: Sequence[Action] | None = None) -> Outcome:
     world = World(draw.text, seed, Board(UM_PER_V[: len(draw.axes)], LAG), draw.lock_timeout_s, draw.preemption)
     invariants, failure, begin_s = Invariants(world, draw.text, draw.lock_timeout_s), None, world.turns.now_s
     world.on_stretch, world.on_begin = invariants.on_stretch, invariants.flush
-    actors = [
-        partial(_act, world, draw, name, actions, invariants) for name in (*ACTORS, "fault")
-    ]
+    actors = [partial(_act, world, draw, name, actions, invariants) for name in (*ACTORS, "fault")]
     try:
         world.live(actors, draw.seconds)
         invariants.at_end()

@@ -108,7 +108,7 @@ def draw_world(seed: int) -> Draw:
     seconds = draw.choice((4.0, 8.0, 16.0))
     actions = [*_draw_requests(draw, axes, seconds), *_draw_faults(draw, seconds)]
     actions.sort(key=lambda action: action.at_s)
-    return Draw(text, axes, seconds, tuple(actions), draw.choice((1.0, 3.0, 60.0)), draw.choice((0.0, 0.002, 0.02)))
+    return Draw(text, axes, seconds, tuple(actions), draw.choice((1.0, 3.0, 60.0)), draw.choice((0.0, 0.005, 0.03)))
 
 
 def _draw_text(draw: random.Random, axes: tuple[str, ...]) -> str:
@@ -124,7 +124,7 @@ def _draw_text(draw: random.Random, axes: tuple[str, ...]) -> str:
     is_armed_first = draw.random() < 0.5
     return text + SERVICE.format(
         arm=str(is_armed_first).lower(), key=hashlib.sha256(KEY.encode()).hexdigest(),
-        stall=draw.choice((500.0, 500.0, 5000.0)), tare=draw.choice(("", "tare_s = 0.1")),
+        stall=draw.choice((500.0, 5000.0)), tare=draw.choice(("", "tare_s = 0.1")),
         recover=RECOVER.format(count=draw.choice((1, 3, 20))) if draw.random() < 0.6 else "",
         rotate=draw.choice(("", "", "rotate_s = 2.0")),
     )  # fmt: skip
@@ -140,7 +140,7 @@ REQUESTS = {
 
 RECIPES = (
     ("arm", "start"), ("arm", "start"), ("reset", "arm", "start"), ("arm", "closed", "hold", "response"),
-    ("arm", "closed", "hold", "learn"), ("start", "stop"), ("stop", "start"), ("tune", "undo"), ("tune", "tune", "undo"),
+    ("arm", "closed", "hold", "learn"), ("start", "stop"), ("stop", "start"), ("tune", "undo"), ("tune", "tune"),
     ("setpoint", "waveform", "waveform"), ("reload", "tune"), ("closed", "raw", "closed"), ("unlock", "key"),
     ("hold", "setpoint", "reference"), ("stop", "stop"), ("arm", "start", "trip", "reset"),
 )  # fmt: skip
@@ -196,7 +196,7 @@ def _values(draw: random.Random, kind: str, axis: str) -> tuple[Any, ...]:
     return ()
 
 
-FAULTS = ("old sample", "nan", "jump", "read error", "write error", "short hang", "hang", "long hang", "loop death",
+FAULTS = ("old sample", "nan", "jump", "read error", "write error", "short hang", "hang", "long hang", "long hang", "loop death",
           "recorder death", "death in write", "disk full", "disk error", "short write", "card gone")  # fmt: skip
 
 
@@ -205,7 +205,7 @@ def _draw_faults(draw: random.Random, seconds: float) -> list[Action]:
     actions = []
     for _ in range(count):
         kind = draw.choice(FAULTS)
-        duration_s = {"short hang": (0.02, 0.3), "hang": (0.45, 0.55), "long hang": (0.7, 3.0)}.get(kind, (0.002, 0.6))
+        duration_s = {"short hang": (0.02, 0.3), "hang": (0.45, 0.55), "long hang": (0.7, 4.0)}.get(kind, (0.002, 0.6))
         values: tuple[Any, ...] = (round(draw.uniform(*duration_s), 4),)
         if kind in ("short write", "death in write"):
             values = (round(draw.random(), 3),)
