@@ -1,4 +1,4 @@
-"""Play worlds: `python -m tests.worlds SEED` one, with its shrunk schedule if it fails; `make soak NAME=worlds` many."""
+"""Play worlds: `python -m tests.worlds SEED` one, `make soak NAME=worlds` many; a failing schedule is shrunk."""
 
 from __future__ import annotations
 

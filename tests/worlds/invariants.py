@@ -1,4 +1,4 @@
-"""Facts that hold in every world, computed from records, outputs, events, answers and the configuration's text alone."""
+"""Facts that hold in every world, computed from records, outputs, events, answers and the configuration's text."""
 
 from __future__ import annotations
 
@@ -173,7 +173,7 @@ class Invariants:
         return False
 
     def _check_cause(self, event: Any) -> None:
-        """Require that a mode that drives was requested, by a client that may, or comes from recovery or preparation."""
+        """Require that a driving mode was requested by a client that may, or comes from recovery or preparation."""
         requests, now_s = self._world.requests, self._world.turns.now_s
         requester = self.request_of(event)
         if requester is None:

@@ -196,7 +196,8 @@ def _values(draw: random.Random, kind: str, axis: str) -> tuple[Any, ...]:
     return ()
 
 
-FAULTS = ("old sample", "nan", "jump", "read error", "write error", "short hang", "hang", "long hang", "long hang", "loop death",
+FAULTS = ("old sample", "nan", "jump", "read error", "write error", "short hang", "hang", "long hang", "long hang",
+          "loop death",
           "recorder death", "death in write", "disk full", "disk error", "short write", "card gone")  # fmt: skip
 
 

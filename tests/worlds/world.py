@@ -87,7 +87,8 @@ class Request:
     """The loop to which its last command was sent."""
 
     def __str__(self) -> str:
-        return f"request {self.number} of {self.client!r}: {self.method} {self.path} {self.body}, {self.code} {self.answer}"
+        text = f"request {self.number} of {self.client!r}: {self.method} {self.path} {self.body}"
+        return f"{text}, {self.code} {self.answer}"
 
 
 @dataclass
