@@ -39,6 +39,7 @@ LONG_TESTS = {
     "syscalls": ("tests.syscalls", "every system call fails, or is the last before SIGKILL; 90 minutes, needs strace"),
     "surroundings": ("tests.surroundings", "every command in odd folders, environments, streams; 2 hours, --short 1"),
     "wheel": ("tests.soak.wheel", "README's commands from the wheel in a fresh environment; 5 minutes, needs an index"),
+    "worlds": ("tests.worlds.__main__", "services in virtual time, faults and requests drawn; 10 minutes, --minutes"),
 }  # fmt: skip
 """Module of each long test, and the description in the list: subject, duration, needs."""
 

@@ -35,18 +35,34 @@ class EndOfTest(BaseException):
 class Turns:
     """Turns of threads in virtual time; `advance` is called for each stretch of it."""
 
-    def __init__(self, advance: Callable[[float], None]) -> None:
-        self.now_s, self._advance = 1000.0, advance
-        self._changed = threading.Condition()
+    def __init__(
+        self,
+        advance: Callable[[float], None],
+        choose: Callable[[list[threading.Thread]], threading.Thread] = lambda ready: ready[0],
+        delay: Callable[[], float] = lambda: 0.0,
+    ) -> None:
+        """`choose` picks among threads that may go on at once; `delay` draws the time (s) by which a thread that has
+        its turn goes on later, as on a busy host.
+        """
+        self.now_s, self._advance, self._choose, self._delay = 1000.0, advance, choose, delay
+        self._is_passing = False
         self._waits: dict[threading.Thread, tuple[float, Callable[[], object]]] = {}
+        self._gates: dict[threading.Thread, threading.Lock] = {}
+        """A lock for each thread, which it takes to wait and the thread before it releases."""
         self._turn: threading.Thread | None = threading.current_thread()
-        self._waits[threading.current_thread()] = self.now_s, never
+        self._enter(threading.current_thread())
+
+    def _enter(self, thread: threading.Thread) -> None:
+        self._gates[thread] = threading.Lock()
+        self._gates[thread].acquire()
+        self._waits[thread] = self.now_s, never
 
     def end(self) -> None:
         """End all other threads, where they sleep."""
-        with self._changed:
-            threads, self._turn = [*self._waits], None
-            self._changed.notify_all()
+        threads, self._turn = [*self._waits], None
+        for thread in threads:
+            if thread is not threading.current_thread():
+                self._gates[thread].release()
         for thread in threads:
             if thread is not threading.current_thread():
                 threading.Thread.join(thread)
@@ -57,54 +73,65 @@ class Turns:
 
     def wait(self, condition: Callable[[], object], seconds: float = math.inf) -> None:
         """Give up the turn until a condition holds, and for `seconds` at most."""
+        self._give_up_turn(self.now_s + seconds, condition)
+        if (delay_s := self._delay()) > 0:
+            self._give_up_turn(self.now_s + delay_s, never)
+
+    def preempt(self) -> None:
+        """Give up the turn for a drawn delay, mostly for none."""
+        has_turn = self._turn is threading.current_thread() and not self._is_passing
+        if has_turn and (delay_s := self._delay()) > 0:
+            self._give_up_turn(self.now_s + delay_s, never)
+
+    def _give_up_turn(self, until_s: float, condition: Callable[[], object]) -> None:
+        if self._turn is None:
+            raise EndOfTest
         me = threading.current_thread()
-        with self._changed:
-            self._waits[me] = self.now_s + seconds, condition
-            self._pass_on()
-            self._await_turn(me)
+        self._waits[me] = until_s, condition
+        self._pass_on()
+        self._await_turn(me)
 
     def start(self, work: Callable[[], object]) -> threading.Thread:
         """Start a thread whose first turn comes at once; its turns end with `work`."""
 
         def run() -> None:
             try:
-                with self._changed:
-                    self._await_turn(thread)
+                self._await_turn(thread)
                 work()
             except EndOfTest:
                 pass
             finally:
-                with self._changed:
-                    thread.has_ended = True
-                    del self._waits[thread]
-                    if self._turn is thread:
-                        self._pass_on()
+                thread.has_ended = True
+                del self._waits[thread]
+                if self._turn is thread:
+                    self._pass_on()
 
         thread = VirtualThread(self, run)
-        self._waits[thread] = self.now_s, never
+        self._enter(thread)
         thread.start()
         return thread
 
     def _pass_on(self) -> None:
         """Give the turn to the thread that may go on first, after the time until then."""
-        last_s = self.now_s + LONGEST_S
+        last_s, self._is_passing = self.now_s + LONGEST_S, True
         while True:
             assert self.now_s < last_s, "each thread waits for another one"
             wakes_s = {thread: self._wake_s(*wait) for thread, wait in self._waits.items()}
-            turn = min(wakes_s, key=lambda thread: wakes_s[thread])
+            first_s = min(wakes_s.values())
+            turn = self._choose([thread for thread, wake_s in wakes_s.items() if wake_s == first_s])
             end_s = max(min(wakes_s[turn], self.now_s + POLL_S), self.now_s)
             self._advance(end_s - self.now_s)
             self.now_s = end_s
             if end_s >= wakes_s[turn]:
                 break
-        self._turn = turn
-        self._changed.notify_all()
+        self._turn, self._is_passing = turn, False
+        self._gates[turn].release()
 
     def _wake_s(self, end_s: float, condition: Callable[[], object]) -> float:
         return self.now_s if condition() else end_s
 
     def _await_turn(self, me: threading.Thread) -> None:
-        has_turn = self._changed.wait_for(lambda: self._turn in (me, None), REAL_LIMIT_S)
+        has_turn = self._gates[me].acquire(timeout=REAL_LIMIT_S)
         assert has_turn, "no turn: a thread waits for a real lock"
         if self._turn is None:
             raise EndOfTest
