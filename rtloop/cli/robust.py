@@ -194,10 +194,12 @@ def print_taps(tap_design: TapDesign, subject: Subject, *, to_stderr: bool = Tru
     for line in (
         f"settling time ({subject.options.band_percent:g} %) {tap_design.settling_ms:.4g} ms; with overshoot ≤ "
         f"{100 * subject.overshoot:g} %, the least possible is {tap_design.fastest_ms:.4g} ms. "
-        f"A longer shape.settling_ms gives less overshoot. Total variation of the command v: {tap_design.variation:.3g} per unit step",
+        "A longer shape.settling_ms gives less overshoot. "
+        f"Total variation of the command v: {tap_design.variation:.3g} per unit step",
         f"worst figures of {tap_design.proved_count} plants, between ticks too: settling (5 %) "
         f"{proof.settling_ms:.4g} ms, overshoot {100 * proof.overshoot:.3g} %, "
-        f"undershoot {100 * proof.undershoot:.3g} %, v {proof.lowest_command:.4g} … {proof.highest_command:.4g} per unit step",
+        f"undershoot {100 * proof.undershoot:.3g} %, "
+        f"v {proof.lowest_command:.4g} … {proof.highest_command:.4g} per unit step",
         f"steps of up to {subject.bounds.step_um:g} µm between {subject.bounds.lowest_um:.4g} and "
         f"{subject.bounds.highest_um:.4g} µm keep the command v within "
         f"{subject.bounds.low_um:.4g} … {subject.bounds.high_um:.4g} µm",
