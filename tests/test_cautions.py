@@ -268,6 +268,9 @@ def test_a_run_that_ends_before_its_first_step_says_so(duration_s: float | None,
 STEPS = 'kind = "steps"\nlevels = [20.0, -20.0]\ndwell_s = 0.05\n'
 TEN_STEPS = f"{STEPS}repeat = false\n".replace("[20.0, -20.0]", str([20.0, -20.0] * 5))
 SINE = 'kind = "sine"\namplitude = 15.0\nfrequency_hz = 20.0\n'
+REST = 'kind = "hold"\nvalue = 0.0\n[[schedule]]\nat_tick = 500\n'
+LATER_SINE = 'reference = { kind = "sine", amplitude = 15.0, frequency_hz = 20.0 }\n'
+LATER_HOLD = 'reference = { kind = "hold", value = 10.0 }\n'
 OSCILLATION, TRACKING = ("swing_ticks", "oscillation"), ("tracking_error_um", "tracking")
 
 
@@ -289,6 +292,8 @@ OSCILLATION, TRACKING = ("swing_ticks", "oscillation"), ("tracking_error_um", "t
         (STEPS, {"tracking_error_um": 2.0, "tracking_ticks": 499}, None),
         ('kind = "hold"\nvalue = 10.0\n', {"tracking_error_um": 2.0, "tracking_ticks": 300}, TRACKING),
         ('kind = "hold"\nvalue = 10.0\n', {"tracking_error_um": 2.0, "tracking_ticks": 400}, None),
+        (f"{REST}{LATER_SINE}", {"swing_ticks": 260}, OSCILLATION),
+        (f"{REST}{LATER_HOLD}", {"tracking_error_um": 2.0, "tracking_ticks": 300}, None),
     ],
 )
 def test_a_trip_that_is_certain_is_named_before_the_run(
