@@ -26,6 +26,7 @@ from rtloop.service import service, status
 from rtloop.service.api.application import application
 from rtloop.service.api.lanes import Lane, Lanes, TooManyRequests
 from tests.virtual.loop import WATCH_S, VirtualLoop
+from tests.virtual.turns import Turns
 
 T = TypeVar("T")
 LOOP_PASSES = 10
@@ -85,8 +86,7 @@ class VirtualBench(VirtualLoop):
     poll_s = 0.005
 
     def __init__(self, folder: Path, monkeypatch: pytest.MonkeyPatch, text: str) -> None:
-        run_in_lane = self._run_in_lane
-        monkeypatch.setattr(Lanes, "run", lambda *arguments: run_in_lane(*arguments))
+        monkeypatch.setattr(Lanes, "run", lambda *arguments: run_in_lane(self.turns, *arguments))
         monkeypatch.setattr(status, "timing", lambda _: {})  # an unpaced loop has no lateness
         monkeypatch.setattr(service, "prepare", lambda configuration: prepare(configuration, paced=False))
         super().__init__(folder, monkeypatch, text.replace("FOLDER", str(folder)))
@@ -184,26 +184,27 @@ class VirtualBench(VirtualLoop):
         if self.loop is not None:
             self._messages.extend(self.loop.drain("events"))
 
-    async def _run_in_lane(self, lanes: Lanes, lane: Any, action: Callable[..., T], *arguments: Any) -> T:
-        """Run an action of a request in a thread in virtual time, as many at a time as in the real lanes."""
-        most_at_a_time, most_pending = lane.value
-        if lanes._pending_counts[lane] >= most_pending:
-            raise TooManyRequests("too many requests")
-        running = lanes.__dict__.setdefault("running", dict.fromkeys(Lane, 0))
-        lanes._pending_counts[lane] += 1
-        try:
-            self.turns.wait(lambda: running[lane] < most_at_a_time)
-            running[lane] += 1
-            future, context, is_gone = Future[T](), copy_context(), client_is_gone.get()
-            self.start(lambda: fulfil(future, lambda: context.run(action, *arguments)))
-            self.turns.wait(lambda: future.done() or is_gone())
-            for _ in range(LOOP_PASSES):
-                await asyncio.sleep(0)
-            self.turns.wait(future.done)
-            running[lane] -= 1
-            return future.result()
-        finally:
-            lanes._pending_counts[lane] -= 1
+
+async def run_in_lane(turns: Turns, lanes: Lanes, lane: Any, action: Callable[..., T], *arguments: Any) -> T:
+    """Run an action of a request in a thread in virtual time, as many at a time as in the real lanes."""
+    most_at_a_time, most_pending = lane.value
+    if lanes._pending_counts[lane] >= most_pending:
+        raise TooManyRequests("too many requests")
+    running = lanes.__dict__.setdefault("running", dict.fromkeys(Lane, 0))
+    lanes._pending_counts[lane] += 1
+    try:
+        turns.wait(lambda: running[lane] < most_at_a_time)
+        running[lane] += 1
+        future, context, is_gone = Future[T](), copy_context(), client_is_gone.get()
+        turns.start(lambda: fulfil(future, lambda: context.run(action, *arguments)))
+        turns.wait(lambda: future.done() or is_gone())
+        for _ in range(LOOP_PASSES):
+            await asyncio.sleep(0)
+        turns.wait(future.done)
+        running[lane] -= 1
+        return future.result()
+    finally:
+        lanes._pending_counts[lane] -= 1
 
 
 def fulfil(future: Future[T], action: Callable[[], T]) -> None:

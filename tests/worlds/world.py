@@ -44,7 +44,7 @@ from rtloop.service.changing import building
 from rtloop.service.recovering.worker import run_recovery
 from rtloop.service.service import Service
 from rtloop.supervision import recorder_keeper, supervisor
-from tests.virtual.bench import VirtualBench, answer_in_process
+from tests.virtual.bench import answer_in_process, run_in_lane
 from tests.virtual.turns import Turns, virtual_time
 
 STRETCH_S = 0.005
@@ -357,7 +357,7 @@ class World:
     # The replacements
 
     def _replace_processes(self, lock_timeout_s: float) -> None:
-        patch, run_in_lane = self._patch, VirtualBench._run_in_lane
+        patch = self._patch
         patch.setattr(timing, "source", replace(virtual_time(self.turns), start_thread=self.start))
         patch.setenv("RUNTIME_DIRECTORY", str(self.folder / "run"))
         for module in (supervisor, recorder_keeper):
@@ -378,7 +378,7 @@ class World:
         patch.setattr(service.SecondOpinion, "compute", lambda *_: None)
         patch.setattr(status, "timing", lambda _: {})
         patch.setattr(lock, "LOCK_TIMEOUT_S", lock_timeout_s)
-        patch.setattr(Lanes, "run", lambda *arguments: run_in_lane(self, *arguments))  # type: ignore[arg-type]
+        patch.setattr(Lanes, "run", lambda *arguments: run_in_lane(self.turns, *arguments))
         for name, method in (("__getitem__", SharedBlock.__getitem__), ("load", SharedBlock.load)):
             patch.setattr(SharedBlock, name, self._preempting(method))
         patch.setattr(lock.Lock, "_current_holder", self._preempting(lock.Lock._current_holder))
