@@ -310,7 +310,7 @@ def _find_taps(subject: Subject, design: DesignOptions, progress: Progress) -> t
         except NoDesign as error:
             cause = str(error)
         progress(
-            f"no taps were found for resonances within ±{scenarios.resonance_percent:g} % and gains within "
+            f"no usable taps for resonances within ±{scenarios.resonance_percent:g} % and gains within "
             f"±{scenarios.gain_percent:g} % of the model's: {cause}"
         )
     return last, design_taps(last, progress=progress)
