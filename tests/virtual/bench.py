@@ -195,16 +195,24 @@ async def run_in_lane(turns: Turns, lanes: Lanes, lane: Any, action: Callable[..
     try:
         turns.wait(lambda: running[lane] < most_at_a_time)
         running[lane] += 1
-        future, context, is_gone = Future[T](), copy_context(), client_is_gone.get()
+        future, context = Future[T](), copy_context()
         turns.start(lambda: fulfil(future, lambda: context.run(action, *arguments)))
-        turns.wait(lambda: future.done() or is_gone())
-        for _ in range(LOOP_PASSES):
-            await asyncio.sleep(0)
-        turns.wait(future.done)
-        running[lane] -= 1
-        return future.result()
+        try:
+            return await result_of(turns, future)
+        finally:
+            running[lane] -= 1
     finally:
         lanes._pending_counts[lane] -= 1
+
+
+async def result_of(turns: Turns, future: Future[T]) -> T:
+    """Wait for a thread's result; the request notices in between that its client is gone."""
+    is_gone = client_is_gone.get()
+    turns.wait(lambda: future.done() or is_gone())
+    for _ in range(LOOP_PASSES):
+        await asyncio.sleep(0)
+    turns.wait(future.done)
+    return future.result()
 
 
 def fulfil(future: Future[T], action: Callable[[], T]) -> None:

@@ -18,7 +18,7 @@ from rtloop.panel.service.service import Service
 from rtloop.panel.web.application import application
 from rtloop.panel.web.security import Session
 from tests.panel.route_server import Response
-from tests.virtual.bench import LOOP_PASSES, VirtualBench, answer_in_process, client_is_gone, fulfil
+from tests.virtual.bench import VirtualBench, answer_in_process, fulfil, result_of
 
 TOKEN = "token"
 
@@ -50,21 +50,17 @@ class VirtualPage:
 
     async def _run_command(self, command: list[str], stdin: bytes, _: float) -> dict[str, object]:
         """Run `rtloop ...`; the end of this call ends its requests, as if its process had been killed."""
-        result, is_gone = Future[Any](), client_is_gone.get()
+        result = Future[Any]()
         arguments = command[command.index("rtloop") + 1 :]
         client = self._bench.start(
             lambda: fulfil(result, lambda: CliRunner().invoke(main, arguments, input=stdin.decode()))
         )
         try:
-            self._bench.turns.wait(lambda: result.done() or is_gone())
-            for _ in range(LOOP_PASSES):
-                await asyncio.sleep(0)
+            response = json.loads((await result_of(self._bench.turns, result)).stdout)
         except asyncio.CancelledError:
             self._bench.gone.add(client)
-            raise
-        finally:
             self._bench.turns.wait(result.done)
-        response = json.loads(result.result().stdout)
+            raise
         if "error" in response:
             raise ProcessFailed(response["error"], response.get("exit_code"))
         return response
