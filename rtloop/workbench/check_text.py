@@ -64,7 +64,7 @@ def print_axis(out: Console, judgement: AxisJudgement, sensor: Channel) -> None:
     if judgement.spent is not None:
         out.print(judgement.spent.text)
     if judgement.verification is not None:
-        sentence = answer(judgement.verification, "by its linear figures")
+        sentence = answer(judgement.verification)
         out.print(f"{escape(axis.specification)}: {sentence}; `rtloop design verify` simulates steps as well")
 
 

@@ -257,14 +257,16 @@ def format_range(tolerated: PercentRange | None) -> str:
     return f"{down} … {up}"
 
 
-def answer(verification: Verification, place: str = "as it will run") -> str:
-    """Return the concluding sentence on the loop, without full stop; `place` says where the loop was judged.
+def answer(verification: Verification, place: str = "") -> str:
+    """Return the concluding sentence on the loop, without full stop.
 
     A loop on the simulated rig that misses its specification comes first, then instability, the host's delay, missed
-    requirements and contradictions.
+    requirements and contradictions. `place` says where the loop was judged; without it the sentence says whether
+    simulated steps were judged, or linear figures alone.
     """
     if verification.on_rig is not None and not verification.on_rig.meets_specification:
         return answer(verification.on_rig, "on the simulated rig")
+    place = place or ("by its linear figures" if verification.simulated is None else "as it will run")
     if not verification.running.is_stable:
         return f"{place}, the loop is UNSTABLE"
     if verification.host is not None and verification.host.is_spent:
