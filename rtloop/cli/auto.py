@@ -93,8 +93,7 @@ def auto(
     if code and synthesised_norm > 1:
         click.echo(
             f"‖F_l(P, C)‖∞ is {synthesised_norm:.4g}, above 1: the loop may miss each requirement by up to this "
-            "factor. Demand more in [weights.tracking] than the requirement does, so that the loop may miss it by the "
-            "factor, as in deploy/own-stage-spec.toml, or use --robust",
+            "factor. Demand more in [weights.tracking] than the requirement does, or use --robust",
             err=True,
         )
     return code

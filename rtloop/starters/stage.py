@@ -110,7 +110,7 @@ def _loop_numbers(figures: StageFigures, actuator: Actuator) -> dict[str, float]
         "disturbance_hz": figures.resonance_hz / 160,
         "tracking_gain": 1 / 1.1,
         "tracking_zero": 1.1 * pole,
-        "tracking_pole": 0.001 * pole,
+        "tracking_pole": 1e-4 * pole,
     }
 
 
