@@ -6,6 +6,7 @@ Figures are computed from the true position, without the sensor's noise, at POIN
 from __future__ import annotations
 
 import math
+from itertools import pairwise
 from typing import Annotated, Literal, NamedTuple, Self
 
 import numpy as np
@@ -103,8 +104,8 @@ class StepsExperiment(ExperimentOptions):
     cycles: int = Field(default=1, ge=1, le=1000)
     """Number of times that the levels are played."""
     first_step: bool | None = None
-    """Whether the step from rest to the first level counts; by default not for a drive of one sign, at whose end it
-    begins. The only step counts always."""
+    """Whether the loop steps from rest to the first level; with false it enters there, as a run does, and that is no
+    step. By default false for a drive of one sign, at whose end it rests. A single level is always a step."""
 
     @model_validator(mode="after")
     def _check(self) -> Self:
@@ -122,7 +123,7 @@ class StepsExperiment(ExperimentOptions):
 
     @property
     def duration_s(self) -> float:
-        """Duration of one dwell at 0 µm, and of one at each level in every cycle."""
+        """Duration of one dwell before the first level, and of one at each level in every cycle."""
         return self.dwell_s * (1 + self.cycles * len(self.levels_um))
 
     def ticks(self, rate_hz: float) -> int:
@@ -131,9 +132,14 @@ class StepsExperiment(ExperimentOptions):
 
     @property
     def reference(self) -> ReferenceOptions:
-        """The levels one after the other, after a dwell at 0."""
-        levels = (0.0, *self.cycles * self.levels_um)
-        return StepsOptions(kind="steps", levels=levels, dwell_s=self.dwell_s, repeat=False)
+        """The levels one after the other, after a dwell at 0 or, without a first step, at the first of them."""
+        return StepsOptions(kind="steps", levels=self._all_levels_um, dwell_s=self.dwell_s, repeat=False)
+
+    @property
+    def _all_levels_um(self) -> tuple[float, ...]:
+        """Levels of the reference, the one at which the loop begins included."""
+        enters = self.first_step is False and len(set(self.levels_um)) > 1
+        return (self.levels_um[0] if enters else 0.0, *self.cycles * self.levels_um)
 
     @property
     def figures(self) -> tuple[str, ...]:
@@ -145,14 +151,15 @@ class StepsExperiment(ExperimentOptions):
 
         Overshoot and settling time are infinite if a step misses its level, all three if a position is not finite.
         """
-        position_um, level_um, steps = motion.position_um.ravel(), 0.0, []
+        position_um = motion.position_um.ravel()
         dwell = POINTS * round(self.dwell_s * motion.rate_hz)
-        for number, next_um in enumerate(self.cycles * self.levels_um, start=1):
-            during_um = position_um[number * dwell - 1 : (number + 1) * dwell]
-            steps.append(measure_step(during_um, next_um, next_um - level_um, POINTS * motion.rate_hz))
-            level_um = next_um
-        if self.first_step is False and len(steps) > 1:
-            del steps[0]
+        steps = [
+            measure_step(
+                position_um[number * dwell - 1 : (number + 1) * dwell], after, after - before, POINTS * motion.rate_hz
+            )
+            for number, (before, after) in enumerate(pairwise(self._all_levels_um), start=1)
+            if after != before
+        ]
         return tuple(np.max(np.where(np.isnan(steps), np.inf, steps), axis=0).tolist())
 
 

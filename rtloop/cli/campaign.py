@@ -224,9 +224,12 @@ def _print_summary(summary: CampaignSummary, folder: Path) -> None:
         f"{escape(summary.name)}: {estimate.passed:,} of {count_text(estimate.rigs, 'rig')} pass, yield "
         f"{100 * estimate.share:.2f} % (95 % interval {100 * estimate.low:.2f} … {100 * estimate.high:.2f} %)"
     )
+    has_limits = any(figure.limit is not None for figure in summary.figures.values())
+    if summary.figures and not has_limits:
+        out.print("the campaign has no limits: a rig fails by a trip alone")
     rows = [
         (escape(name), *(f"{value:.4g}" for value in figure.quantiles), f"{figure.largest:.4g}",
-         "–" if figure.limit is None else f"{figure.limit:g}", str(figure.exceeding) if figure.exceeding else "")
+         *(("–", "–") if figure.limit is None else (f"{figure.limit:g}", str(figure.exceeding))))
         for name, figure in summary.figures.items()
     ]  # fmt: skip
     out.print(table("figure", "5 %", "median", "95 %", "worst", "limit", "rigs beyond", rows=rows))
@@ -243,7 +246,7 @@ def _print_summary(summary: CampaignSummary, folder: Path) -> None:
     if summary.worst_rigs:
         keys = list(summary.worst_rigs[0].values)
         rows = [
-            (str(rig.rig), f"{rig.ratio:.3g}", *(value_text(rig.values[key]) for key in keys))
+            (str(rig.rig), f"{rig.ratio:.3g}" if has_limits else "–", *(value_text(rig.values[key]) for key in keys))
             for rig in summary.worst_rigs
         ]
         out.print(table("worst rig", "figure / limit", *(key.rpartition(".")[2] for key in keys), rows=rows))

@@ -9,6 +9,7 @@ Then run pytest on it. No hardware is involved: the functions are called on reco
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Iterator
 from functools import cache
@@ -38,6 +39,8 @@ SETTLING_TICKS = 2_000
 REACH_UM = 60.0
 BUMP = 1e-6
 """Allowed deviation of the first command after `enter`, as a fraction of 1 µm + |command| + |error|."""
+ROUNDING = 1e-14
+"""Error of the applied command, as a fraction of the command."""
 EXTRA_SHARE, EXTRA_TICKS, EXTRA_OVERSHOOT = 0.15, 5, 0.2
 """Allowance for the return from a limit against the return without one: extra time as a fraction and in ticks, and
 extra overshoot as a fraction of the way."""
@@ -68,8 +71,8 @@ class LawConformance:
 
     @pytest.fixture
     def bench(self) -> Bench:
-        """Return a Bench of the law: its compiled functions with their own coefficients and state."""
-        return Bench(self.law)
+        """Return a Bench of the law: its functions, compiled except with NUMBA_DISABLE_JIT=1, and their own records."""
+        return Bench(self.law, compiled=not UNCOMPILED)
 
     def test_build_gives_finite_numbers(self) -> None:
         """Every coefficient is finite, and the same options give the same bytes."""
@@ -96,7 +99,8 @@ class LawConformance:
 
     def test_compiled_and_uncompiled_give_the_same_bits(self, bench: Bench) -> None:
         """Compiled and uncompiled functions give the same bits of results, state and extra outputs, over ticks with
-        extreme errors and limited commands."""
+        extreme errors and limited commands. Skipped with NUMBA_DISABLE_JIT=1."""
+        _require_compiler()
         uncompiled = Bench(self.law, compiled=False)
         for number, (tick_compiled, tick_uncompiled) in enumerate(
             zip(bench.run(TICKS), uncompiled.run(TICKS), strict=True)
@@ -173,6 +177,26 @@ class LawConformance:
             )
         assert "" in faults, faults[0]
 
+    def test_a_rounding_error_of_the_applied_command_stops_nothing(self, bench: Bench) -> None:
+        """The loop returns as fast where the applied command differs from the command by a rounding error.
+
+        A loop's applied command comes back through the feedforward, and so has such an error without any limit. The
+        plant and the skipped laws are those of the test for windup."""
+        if not isinstance(self.law, Controller):
+            pytest.skip("a feedforward has no loop")
+        exact = bench.limited_loop(False, at_rest=True).unlimited_return()
+        if exact is None:
+            pytest.skip("the loop of the law and a lag does not return to its reference even without a rounding error")
+        bench.rounding = ROUNDING
+        rounded = bench.limited_loop(False, at_rest=True).unlimited_return()
+        most_ticks = int((1 + EXTRA_SHARE) * exact.ticks) + EXTRA_TICKS
+        ticks = math.inf if rounded is None else rounded.ticks
+        assert ticks <= most_ticks, (
+            "the law takes a rounding error of the applied command for a limit: with applied_um = command_um "
+            f"(1 ± {ROUNDING:g}) the loop did not return to its reference in {most_ticks} ticks; with applied_um = "
+            f"command_um it returns in {exact.ticks} ticks; compare them with a tolerance, such as 1e-9 µm"
+        )
+
     def _windup(self, bench: Bench, by_load: bool) -> str | None:
         """Return a text if the law winds up, "" if it does not, None if its loop does not return without a limit."""
         free = bench.limited_loop(by_load, at_rest=True).unlimited_return()
@@ -194,7 +218,10 @@ class LawConformance:
         return ""
 
     def test_it_calls_nothing_that_waits_or_differs(self, bench: Bench) -> None:
-        """No function allocates, prints, calls the interpreter, or uses mathematics that differs between processors."""
+        """No function allocates, prints, calls the interpreter, or uses mathematics that differs between processors.
+
+        Skipped with NUMBA_DISABLE_JIT=1."""
+        _require_compiler()
         for name, calls in bench.calls_by_function():
             assert not calls, f"{name}: " + "; ".join(f"{called} {reason}" for called, reason in calls.items())
 
@@ -205,6 +232,12 @@ class LawConformance:
         deque = [value for value, _ in bench.run(COST_TICKS)]
         record_property("ns_per_tick", (time.perf_counter_ns() - began_ns) / COST_TICKS)
         assert len(deque) == COST_TICKS
+
+
+def _require_compiler() -> None:
+    """Skip the test where the functions run uncompiled."""
+    if UNCOMPILED:
+        pytest.skip("NUMBA_DISABLE_JIT is set: nothing is compiled")
 
 
 @cache
@@ -221,6 +254,8 @@ class Bench:
     def __init__(self, law: Law, compiled: bool = True) -> None:
         """Build the law's coefficients, a state of zeros, and its functions, which are compiled if `compiled`."""
         law_records, self._law = law.records(law.count), law
+        self.rounding = 0.0
+        """Error of the applied command in `limited_loop`, relative to the command, with another sign in each tick."""
         self.coefficients = new_records(law_records.coefficients, 1)
         self.coefficients[:] = build_record(law)
         self.state = new_records(law_records.state, 1)
@@ -346,7 +381,8 @@ class Bench:
         )
         control.inputs, control.outputs = 0.0, 0.0
         value = self._commands(control)
-        control.command_um, control.applied_um = value, np.clip(value, -limit_um, limit_um)
+        control.command_um, control.applied_um = value, (1 + self.rounding) * np.clip(value, -limit_um, limit_um)
+        self.rounding = -self.rounding
         self._call("update", control)
         return np.atleast_1d(np.array(control.applied_um))
 

@@ -12,7 +12,7 @@ from rtloop.campaigns.campaign_file import load_campaign
 from rtloop.campaigns.case import CaseRunner
 from rtloop.campaigns.recorded_case import has_ticks, record_rig
 from rtloop.campaigns.rig_experiments import POINTS, Motion
-from rtloop.configuration.reference_options import HoldOptions, WaveOptions
+from rtloop.configuration.reference_options import HoldOptions, StepsOptions, WaveOptions
 from rtloop.errors import ConfigError
 from rtloop.starters.stage import stage_files
 from rtloop.starters.stage_figures import StageFigures
@@ -81,6 +81,9 @@ def test_the_step_from_the_end_of_a_drive_counts_on_request_alone(
     """The first step, of 10 µm, swings over by 2 µm; the second, of 4 µm, by 0.2 µm."""
     steps = f'[[experiment]]\nkind = "steps"\nlevels_um = [10.0, 6.0]\ndwell_s = 0.01\n{line}'
     (experiment,) = campaign(tmp_path, steps, configuration).options.experiment
+    reference = experiment.reference
+    assert isinstance(reference, StepsOptions)
+    assert reference.levels == ((0.0 if overshoot_percent == 20.0 else 10.0), 10.0, 6.0)
     position_um = np.repeat([0.0, 12.0, 10.0, 5.8, 6.0], [100, 20, 80, 20, 80])
     motion = Motion(np.repeat([0.0, 10.0, 6.0], 100), np.tile(position_um[:, None], POINTS), 10_000.0)
     assert experiment.measure(motion)[0] == pytest.approx(overshoot_percent)

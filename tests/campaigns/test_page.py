@@ -223,9 +223,11 @@ def test_a_campaign_without_failures_has_a_page(blank_pictures, robust, tmp_path
 
 def test_a_campaign_without_limits_has_a_page(blank_pictures, tmp_path):
     runner = make_runner(tmp_path, experiments=SCAN, without_limits=True, uncertain=ONE_KEY)
-    page = make_page(store_cases(runner, tmp_path / "results"), tmp_path / "page.html")
+    results = store_cases(runner, tmp_path / "results")
+    page = make_page(results, tmp_path / "page.html")
     require_complete(page)
     assert "The campaign has no limits: a rig fails by a trip alone." in page.text
+    assert "the campaign has no limits: a rig fails by a trip alone" in run("campaign", "report", results).stdout
     assert "nominal, residual" in page.text
     assert len(page.pictures) == 1
 

@@ -58,7 +58,8 @@ class WithWeightedReference(CorrectIntegrator):
 
     @staticmethod
     def update(c: Any, s: Any, told: Any) -> None:
-        if (told.applied_um - told.command_um) * told.error_um >= 0.0:
+        missing_um = told.applied_um - told.command_um
+        if abs(missing_um) < 1e-9 or missing_um * told.error_um >= 0.0:
             s.integral_um += c.ki * told.error_um
 
     @staticmethod
@@ -136,6 +137,13 @@ class NoAntiWindup(CorrectIntegrator):
     @staticmethod
     def update(c: Any, s: Any, told: Any) -> None:
         s.integral_um += 1e8 * told.error_um
+
+
+class StopsAtARoundingError(CorrectIntegrator):
+    @staticmethod
+    def update(c: Any, s: Any, told: Any) -> None:
+        if (told.applied_um - told.command_um) * told.error_um >= 0.0:
+            s.integral_um += c.ki * told.error_um
 
 
 class WindsUp(CorrectIntegrator):
@@ -228,6 +236,7 @@ BITS, RECORD = "test_compiled_and_uncompiled_give_the_same_bits", "test_its_stat
 READ_ONLY, STAYS = "test_its_coefficients_are_read_only", "test_it_stays_finite"
 POISON, ENTERS = "test_no_number_that_is_none_outlives_an_entry", "test_enter_continues_from_the_command"
 WINDUP = "test_a_limited_command_does_not_wind_it_up"
+ROUNDING = "test_a_rounding_error_of_the_applied_command_stops_nothing"
 FOREIGN = "test_it_calls_nothing_that_waits_or_differs"
 BROKEN = {
     InfiniteCoefficient: FINITE,
@@ -241,6 +250,7 @@ BROKEN = {
     GrowsWithoutBound: STAYS,
     InfiniteFromACommandBelowZero: STAYS,
     NoAntiWindup: STAYS,
+    StopsAtARoundingError: ROUNDING,
     WindsUp: WINDUP,
     WindsUpALittle: WINDUP,
     WindsUpBehindAReferencePath: WINDUP,

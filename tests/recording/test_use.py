@@ -5,6 +5,8 @@ from __future__ import annotations
 import csv
 import sys
 from pathlib import Path
+from types import SimpleNamespace
+from typing import cast
 
 import numpy as np
 import pyarrow.parquet
@@ -15,8 +17,8 @@ from rtloop.errors import MissingExtra, OutputError
 from rtloop.interchange.export import export
 from rtloop.recording.columns import signal_unit
 from rtloop.recording.errors import RecordingError
-from rtloop.recording.load import load
-from rtloop.recording.views.bands import read_bands
+from rtloop.recording.load import Recording, load
+from rtloop.recording.views.bands import event_marks, read_bands
 from rtloop.recording.views.histogram import TimeHistogram
 from rtloop.recording.views.plot import draw_recording, plot
 from rtloop.recording.views.summary import AxisSummary, SignalExtremes, summarise
@@ -259,6 +261,13 @@ def test_a_peak_of_the_error_hides_no_ripple_in_a_picture(tmp_path: Path, peak_u
     low, middle, high = panel.transData.transform([(0, -0.01), (0, 0.0), (0, 0.01)])[:, 1]
     assert (high - middle) / panel.bbox.height > 0.05
     assert middle - low == pytest.approx(high - middle, rel=1e-6)
+
+
+def test_an_episode_of_late_ticks_is_marked_with_its_number_of_missed_periods() -> None:
+    kinds = ({"kind": "periods_missed", "what": {"periods": 3}}, {"kind": "lateness_over", "what": {"periods": 10}})
+    recording = SimpleNamespace(events=[{"time_ns": 10**9, **kind} for kind in kinds])
+    marks = event_marks(cast("Recording", recording), 0.0, 2.0)
+    assert [mark.label for mark in marks] == ["periods missed", "lateness over: 10 periods missed"]
 
 
 def test_labels_of_close_events_do_not_overlap_and_no_legend_covers_a_panel(tmp_path: Path) -> None:

@@ -116,7 +116,7 @@ QUANTITIES = {
     "settling_ms": ("settling (5 %)", "ms"),
     "overshoot_percent": ("overshoot", "%"),
     "peak_command": ("peak of v per unit step", ""),
-    "resonance_decay_ms": ("longest decay time near the resonance", "ms"),
+    "resonance_decay_ms": ("longest decay at 0.55 … 1.85 × resonance", "ms"),
     "resonance_shift_percent": ("resonance may move by ±", "%"),
     "bandwidth_hz": ("bandwidth, |S| < 0.71", "Hz"),
     "disturbance_hz": ("disturbance held up to", "Hz"),

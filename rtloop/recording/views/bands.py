@@ -206,13 +206,17 @@ def full_rate_spans(recording: Recording) -> list[tuple[float, float]]:
 def event_marks(recording: Recording, start_s: float, end_s: float) -> list[Mark]:
     """Marks of the events between two times, both included, in s since the start, without events that end a file.
 
-    The label of a change of mode is the mode; any other event has its kind as label, a trip with its causes.
+    The label of a change of mode is the mode; any other event has its kind as label, a trip with its causes, and the
+    end of an episode of late ticks with the number of periods missed in it.
     """
     events = []
     for event in recording.events:
         time_s, kind, details = event["time_ns"] * 1e-9, event["kind"], event["what"]
         if kind not in FINAL and start_s <= time_s <= end_s:
-            label = details.get("mode") or ": ".join(filter(None, [kind, ", ".join(details.get("causes", []))]))
+            more = ", ".join(details.get("causes", []))
+            if kind == "lateness_over":
+                more = f"{details['periods']} periods missed"
+            label = details.get("mode") or ": ".join(filter(None, [kind, more]))
             events.append(Mark(time_s, label.replace("_", " "), kind in FAULT_KINDS))
     return events
 
