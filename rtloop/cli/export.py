@@ -35,7 +35,9 @@ UNTIL = click.option(
 
 @click.command()
 @FILES
-@click.option("--to", type=FORMAT, required=True, help="Format of the file; parquet and hdf5 need rtloop[data].")
+@click.option(
+    "--to", type=FORMAT, help="Format of the file; parquet and hdf5 need rtloop[data].  [default: by the ending of --out]"
+)
 @click.option("--out", type=TARGET, help="File to write.  [default: FILE with another ending]")
 @FROM
 @UNTIL
@@ -52,7 +54,7 @@ UNTIL = click.option(
 @report_errors
 def export(
     files: tuple[Path, ...],
-    to: str,
+    to: str | None,
     out: Path | None,
     start_s: float,
     end_s: float | None,
@@ -66,9 +68,14 @@ def export(
     ControlDesk: scripts that read NAME.X.Data and NAME.Y(k).Data work unchanged; NAME is the name of the file. The
     format of MAT files is version 5, which holds up to 2 GiB.
     """
+    from rtloop.interchange.export import EXPORT_SUFFIXES
     from rtloop.interchange.export import export as export_recording
     from rtloop.recording.views.selection import Selection
 
+    formats = {suffix: name for name, suffix in EXPORT_SUFFIXES.items()}
+    to = to or (None if out is None else formats.get(out.suffix.lower()))
+    if to is None:
+        raise click.UsageError(f"the format is open; give --to, or --out with one of the endings {', '.join(formats)}")
     with Counter("ticks exported", sys.stderr) as counter:
         names = tuple(filter(None, (name.strip() for name in signals.split(","))))
         selection = Selection(names, start_s, math.inf if end_s is None else end_s, every)

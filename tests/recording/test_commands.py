@@ -177,8 +177,12 @@ def test_export_writes_a_file_once(to: str, copy: Path, tmp_path: Path):
     report = answer("export", copy, "--to", to)
     assert (report["output"], report["ticks"]) == (str(tmp_path / f"run.{to}"), EVENTFUL_TICKS)
     assert run("export", copy, "--to", to).exit_code == 73
-    assert run("export", copy, "--to", to, "--out", tmp_path / f"other.{to}").exit_code == 0
+    assert run("export", copy, "--out", tmp_path / f"other.{to}").exit_code == 0
+    assert (tmp_path / f"other.{to}").read_bytes() == (tmp_path / f"run.{to}").read_bytes()
     assert run("export", copy, "--to", "xlsx").exit_code == 2
+    for more in ((), ("--out", tmp_path / "other.xlsx")):
+        refused = run("export", copy, *more)
+        assert (refused.exit_code, "one of the endings .csv, .parquet, .npz, .mat, .h5" in refused.output) == (2, True)
 
 
 def test_plot_writes_a_picture_or_a_page(copy: Path, tmp_path: Path):
