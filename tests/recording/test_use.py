@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import sys
+from itertools import combinations
 from pathlib import Path
 from types import SimpleNamespace
 from typing import cast
@@ -253,11 +254,14 @@ def test_every_nth_tick_is_a_number_from_one_on(path: Path, every: int):
 def test_a_peak_of_the_error_hides_no_ripple_in_a_picture(tmp_path: Path, peak_um: float, scale: str) -> None:
     rows = make_rows(COUNT)
     error = COLUMNS.index("x_error_um")
-    rows[:, error] = 0.01 * np.sin(np.arange(COUNT))
+    rows[:, error] = 0.0098 * np.sin(np.arange(COUNT))
     rows[3000, error] = peak_um
     figure = draw_recording(load(write_recording(tmp_path / "ripple.mcap", rows)))
     (panel,) = (panel for panel in figure.axes if panel.get_ylabel().startswith("x error / µm"))
     assert panel.get_yscale() == scale
+    figure.draw_without_rendering()
+    boxes = [label.get_window_extent() for label in panel.get_yticklabels() if label.get_text()]
+    assert not any(one.overlaps(other) for one, other in combinations(boxes, 2))
     low, middle, high = panel.transData.transform([(0, -0.01), (0, 0.0), (0, 0.01)])[:, 1]
     assert (high - middle) / panel.bbox.height > 0.05
     assert middle - low == pytest.approx(high - middle, rel=1e-6)

@@ -112,12 +112,15 @@ def _draw(figure: Figure, drawing: DrawnRecording) -> None:
 def _linear_part(errors: list[Band]) -> float:
     """Return the end of the linear part of an axis on which peaks do not hide the ripple between them.
 
-    It is the USUAL quantile of the sizes of errors with larger peaks than HIDING times this; 0 without such peaks.
+    It is the power of ten next to the USUAL quantile of the sizes of errors with larger peaks than HIDING times this; 0
+    without such peaks.
     """
     sizes = np.abs([*(error.low for error in errors), *(error.high for error in errors)]).ravel()
     sizes = sizes[np.isfinite(sizes)]
     usual = float(np.quantile(sizes, USUAL)) if sizes.size else 0.0
-    return usual if sizes.size and sizes.max() > HIDING * usual else 0.0
+    if usual == 0.0 or sizes.max() <= HIDING * usual:
+        return 0.0
+    return float(10.0 ** np.round(np.log10(usual)))  # so that no tick lies within the linear part
 
 
 def _draw_trace(subplot: Axes, band: Band, kind: str) -> None:
