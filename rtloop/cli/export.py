@@ -36,7 +36,7 @@ UNTIL = click.option(
 @click.command()
 @FILES
 @click.option(
-    "--to", type=FORMAT, help="Format of the file; parquet and hdf5 need rtloop[data].  [default: by the ending of --out]"
+    "--to", type=FORMAT, help="Format of the file; parquet and hdf5 need rtloop[data].  [default: by --out's ending]"
 )
 @click.option("--out", type=TARGET, help="File to write.  [default: FILE with another ending]")
 @FROM

@@ -97,7 +97,7 @@ def test_sweeps_spectra_and_other_frames_agree_with_the_loop(browser: Browser):
         assert timing["p50_us"] <= timing["p99_us"] <= timing["worst_us"] * 1.1
 
         def is_of_the_sine() -> bool:
-            """Whether the next spectrum reaches below 1 Hz and is of a sine of 8 µm alone, not of the rest before it."""
+            """Whether the next spectrum reaches below 1 Hz and is of a sine of 8 µm, without the rest before it."""
             spectrum, bands = browser.next_message(live, "spectrum")
             reaches = len(bands["hz"]) > 0 and bands["hz"].min() < 1.0
             return reaches and spectrum["rms"] == pytest.approx(8000 / np.sqrt(2), rel=0.1)
