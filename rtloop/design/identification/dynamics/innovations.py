@@ -14,7 +14,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.signal import lfilter, sosfilt, zpk2sos
+from scipy.signal import lfilter, sosfilt
 
 from rtloop.foundation.arrays import Complex, Real
 from rtloop.foundation.modal import ModalSystem
@@ -90,8 +90,10 @@ class Innovations:
         """
         if not self.order or not np.any(self.noise_gains):
             return signals
-        zeros = np.concatenate([self.z_poles, self.z_poles[self.rates.imag != 0].conj()])
-        return np.asarray(sosfilt(zpk2sos(zeros, poles, 1.0), signals), dtype=float)
+        pairs = self.rates.imag != 0
+        zeros = np.concatenate([self.z_poles, self.z_poles[pairs].conj()])
+        sections = np.concatenate([_factors(zeros), _factors(poles)], axis=1)
+        return np.asarray(sosfilt(sections, signals), dtype=float)
 
     def errors(self, u: Real, y: Real) -> Real | None:
         """Return the one-step-ahead prediction errors ε (samples,) for input `u` and output `y`, from rest.
@@ -151,6 +153,21 @@ class Innovations:
         columns = np.array(unknowns, dtype=complex).reshape(len(unknowns), 3 if noise else 2).T
         gains = columns[2] if noise else self.noise_gains
         return Innovations(self.period_s, columns[0], columns[1], gains, float(values[-1]))
+
+
+def _factors(roots: Complex) -> Real:
+    """Return factors 1 + a z⁻¹ + b z⁻² (sections, 3) with these `roots` (n,), pairs first by rising angle, then real
+    ones from the smallest on; the last factor of an odd number of real roots has b = 0.
+
+    `scipy.signal.zpk2sos` gives the same product, with neighbours beside each other, in a hundred times the time.
+    """
+    upper = roots[roots.imag > 0]
+    upper = upper[np.argsort(np.angle(upper))]
+    real = np.sort(roots[roots.imag == 0].real)
+    real = np.append(real, [0.0] * (real.size % 2)).reshape(-1, 2)
+    sums, products = -2 * upper.real, upper.real**2 + upper.imag**2
+    second = np.concatenate([sums, -real.sum(axis=1)])
+    return np.column_stack([np.ones(second.size), second, np.concatenate([products, real.prod(axis=1)])])
 
 
 def _pair_weights(model: Innovations) -> Real:
