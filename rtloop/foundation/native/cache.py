@@ -12,6 +12,7 @@ import hashlib
 import os
 import platform
 import tempfile
+from collections.abc import Iterator
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -20,30 +21,42 @@ import llvmlite.binding
 from rtloop.foundation.trusted import HAS_OWNERS, close_descriptor, open_folder
 
 PACKAGE = Path(__file__).parents[2]
-KERNELS = (
-    *("foundation", "hil", "drivers", "kernel", "laws", "engine"),
-    *("hysteresis/play_model.py", "recording/replay/kernels.py", "recording/file/topics/tick_kernels.py", "signals.py"),
+ROOMS = ("foundation", "hil", "drivers", "engine", "laws")
+"""Rooms in which a file counts if it contains MARK: it imports what compiles, and so has kernels."""
+MARK = b"foundation.native"
+WHOLE = (
+    *("kernel", "laws/shipped", "foundation/native"),
+    *("drivers/node/card.py", "drivers/node/failures.py", "drivers/node/frames.py", "engine/messages.py"),
+    *("hysteresis/play_model.py", "recording/file/topics/tick_kernels.py", "recording/replay/kernels.py", "signals.py"),
 )
-"""Rooms and files that may contain kernels, or functions and constants that kernels use."""
+"""Folders and files that count whole: kernels use functions and constants of them."""
 OPTIONS = "options.py"
-"""Name of files with models of options, which the digest leaves out: no kernel uses them, and their help texts are
-edited often."""
+"""Name of files with models of options, which do not count: no kernel uses them, and their help texts are edited often.
+"""
 
 
 def source_digest() -> str:
-    """Return 24 hexadecimal digits of a digest of all sources in KERNELS, without modules of options, and of the
-    versions of compiler and Python and the processor.
+    """Return 24 hexadecimal digits of a digest of all `kernel_sources`, and of the versions of compiler and Python and
+    the processor.
     """
     digest = hashlib.sha256()
-    for place in KERNELS:
-        source = PACKAGE / place
-        for path in sorted(source.rglob("*.py")) if source.is_dir() else [source]:
-            if path.name == OPTIONS:
-                continue
-            digest.update(path.relative_to(PACKAGE).as_posix().encode() + b"\0" + path.read_bytes() + b"\0")
+    for name, text in kernel_sources():
+        digest.update(name.encode() + b"\0" + text + b"\0")
     for fact in (installed_version("numba"), installed_version("llvmlite"), platform.python_version(), cpu_identity()):
         digest.update(fact.encode() + b"\0")
     return digest.hexdigest()[:24]
+
+
+def kernel_sources() -> Iterator[tuple[str, bytes]]:
+    """Yield path within the package and text of each file of which kernels, or what they use, may come."""
+    whole = {PACKAGE / place for place in WHOLE}
+    paths = {path for room in ROOMS for path in (PACKAGE / room).rglob("*.py")}
+    for place in whole:
+        paths.update(place.rglob("*.py") if place.is_dir() else [place])
+    for path in sorted(paths):
+        text = path.read_bytes()
+        if path.name != OPTIONS and (MARK in text or not whole.isdisjoint((path, *path.parents))):
+            yield path.relative_to(PACKAGE).as_posix(), text
 
 
 def installed_version(package: str) -> str:
