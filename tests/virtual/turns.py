@@ -8,8 +8,11 @@ whatever the host does.
 from __future__ import annotations
 
 import math
+import sys
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from types import FrameType
 from typing import Any
 
 from rtloop.foundation import timing
@@ -40,11 +43,15 @@ class Turns:
         advance: Callable[[float], None],
         choose: Callable[[list[threading.Thread]], threading.Thread] = lambda ready: ready[0],
         delay: Callable[[], float] = lambda: 0.0,
+        line_delay: Callable[[], float] | None = None,
+        traced: Sequence[str] = (),
     ) -> None:
         """`choose` picks among threads that may go on at once; `delay` draws the time (s) by which a thread that has
-        its turn goes on later, as on a busy host.
+        its turn goes on later, as on a busy host; `line_delay` draws it before each line of the files below the
+        folders `traced`, where a real thread may lose its turn too.
         """
         self.now_s, self._advance, self._choose, self._delay = 1000.0, advance, choose, delay
+        self._line_delay, self._traced, self._is_traced = line_delay, tuple(traced), dict[str, bool]()
         self._is_passing = False
         self._waits: dict[threading.Thread, tuple[float, Callable[[], object]]] = {}
         self._gates: dict[threading.Thread, threading.Lock] = {}
@@ -77,11 +84,31 @@ class Turns:
         if (delay_s := self._delay()) > 0:
             self._give_up_turn(self.now_s + delay_s, never)
 
-    def preempt(self) -> None:
+    def preempt(self, delay: Callable[[], float] | None = None) -> None:
         """Give up the turn for a drawn delay, mostly for none."""
         has_turn = self._turn is threading.current_thread() and not self._is_passing
-        if has_turn and (delay_s := self._delay()) > 0:
+        if has_turn and (delay_s := (delay or self._delay)()) > 0:
             self._give_up_turn(self.now_s + delay_s, never)
+
+    @contextmanager
+    def undivided(self) -> Iterator[None]:
+        """Keep the turn: within, no thread loses it by `preempt`."""
+        before, self._is_passing = self._is_passing, True
+        try:
+            yield
+        finally:
+            self._is_passing = before
+
+    def trace(self, frame: FrameType, event: str, _: object) -> Callable[..., Any] | None:
+        """Give up the turn before lines of the traced files: a trace function, as of `sys.settrace`."""
+        if event == "call":
+            name = frame.f_code.co_filename
+            if name not in self._is_traced:
+                self._is_traced[name] = name.startswith(self._traced)
+            return self.trace if self._is_traced[name] and frame.f_code.co_name != "<module>" else None
+        if event == "line":
+            self.preempt(self._line_delay)
+        return self.trace
 
     def _give_up_turn(self, until_s: float, condition: Callable[[], object]) -> None:
         if self._turn is None:
@@ -97,10 +124,13 @@ class Turns:
         def run() -> None:
             try:
                 self._await_turn(thread)
+                if self._line_delay is not None:
+                    sys.settrace(self.trace)
                 work()
             except EndOfTest:
                 pass
             finally:
+                sys.settrace(None)
                 thread.has_ended = True
                 del self._waits[thread]
                 if self._turn is thread:

@@ -10,9 +10,10 @@ from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
 
+from tests.worlds.board import Board
 from tests.worlds.invariants import Invariants, Violation
 from tests.worlds.schedule import ACTORS, DISK_ERRORS, UM_PER_V, Action, Draw, draw_world
-from tests.worlds.world import Board, Request, World
+from tests.worlds.world import Request, World
 
 LAG = 0.18
 """Share of the way to its rest that a board's axis covers in a tick."""
@@ -38,7 +39,7 @@ def play(seed: int, actions: Sequence[Action] | None = None) -> Outcome:
     logging.disable(logging.CRITICAL)
     draw = draw_world(seed)
     actions = draw.actions if actions is None else actions
-    world = World(draw.text, seed, Board(UM_PER_V[: len(draw.axes)], LAG), draw.lock_timeout_s, draw.preemption)
+    world = World(draw, seed, Board(UM_PER_V[: len(draw.axes)], LAG))
     invariants, failure, begin_s = Invariants(world, draw.text, draw.lock_timeout_s), None, world.turns.now_s
     world.on_stretch, world.on_begin = invariants.on_stretch, invariants.flush
     actors = [partial(_act, world, draw, name, actions, invariants) for name in (*ACTORS, "fault")]
@@ -67,7 +68,9 @@ def _act(world: World, draw: Draw, name: str, actions: Sequence[Action], invaria
             if name == "fault":
                 _fail(world, action)
             else:
-                invariants.on_answer(_request(world, draw, action))
+                request = _request(world, draw, action)
+                with world.turns.undivided():
+                    invariants.on_answer(request)
 
 
 def _request(world: World, draw: Draw, action: Action) -> Request:

@@ -98,6 +98,7 @@ class Draw:
     actions: tuple[Action, ...]
     lock_timeout_s: float
     preemption: float
+    fine: float
 
 
 def draw_world(seed: int) -> Draw:
@@ -108,7 +109,8 @@ def draw_world(seed: int) -> Draw:
     seconds = draw.choice((4.0, 8.0, 16.0))
     actions = [*_draw_requests(draw, axes, seconds), *_draw_faults(draw, seconds)]
     actions.sort(key=lambda action: action.at_s)
-    return Draw(text, axes, seconds, tuple(actions), draw.choice((1.0, 3.0, 60.0)), draw.choice((0.0, 0.005, 0.03)))
+    return Draw(text, axes, seconds, tuple(actions), draw.choice((1.0, 3.0, 60.0)), draw.choice((0.0, 0.005, 0.03)),
+                draw.choice((0.0, 0.001, 0.005, 0.02)))  # fmt: skip
 
 
 def _draw_text(draw: random.Random, axes: tuple[str, ...]) -> str:

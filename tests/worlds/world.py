@@ -10,7 +10,6 @@ import contextlib
 import hashlib
 import json
 import os
-import pickle
 import random
 import tempfile
 import threading
@@ -24,19 +23,15 @@ from typing import Any, NamedTuple
 import numpy as np
 import pytest
 
+import rtloop
 from rtloop.configuration.file import Configuration
 from rtloop.configuration.prepare import prepare
-from rtloop.drivers.base import Channel, Facts, Wiring
-from rtloop.drivers.python import PythonDriver
 from rtloop.engine import ramp
-from rtloop.engine.assembly import Assembly, law_at_rest
-from rtloop.engine.clock import clock_context, unpaced_clock
 from rtloop.engine.loop import Outcome
-from rtloop.engine.memory import ProcessState, SharedBlock, Word
+from rtloop.engine.memory import SharedBlock
 from rtloop.engine.plan import Plan
-from rtloop.engine.process import EXIT_CODES, _fault_text
 from rtloop.foundation import timing
-from rtloop.recording.capture import progress, recorder, session
+from rtloop.recording.capture import recorder, session
 from rtloop.service import desk, lock, service, status
 from rtloop.service.api.application import application
 from rtloop.service.api.lanes import Lanes
@@ -46,17 +41,16 @@ from rtloop.service.service import Service
 from rtloop.supervision import recorder_keeper, supervisor
 from tests.virtual.bench import answer_in_process, run_in_lane
 from tests.virtual.turns import Turns, virtual_time
+from tests.worlds.board import Board, BoardDriver
+from tests.worlds.child import ChildOrders, VirtualChild
+from tests.worlds.schedule import Draw
 
 STRETCH_S = 0.005
-FOR_EVER = 1 << 62
-KILLED = -9
-ANNOUNCED = [int(word) for word in (*progress.ANNOUNCED, Word.ANNOUNCED_BYTE)]
+PACKAGE = Path(rtloop.__file__).parent
+TRACED = [f"{PACKAGE / room}/" for room in ("service", "supervision", "recording/capture")]
+"""Folders in whose lines a thread may lose its turn."""
 request_number = ContextVar[int]("request_number", default=-1)
 """Number of the request for which a thread works; -1 for the service's own work."""
-
-
-class Killed(BaseException):
-    """The process that this thread stands for was killed."""
 
 
 class Command(NamedTuple):
@@ -109,232 +103,21 @@ class Run:
         return sum(map(len, self.rows))
 
 
-class Board:
-    """Card with two axes, each with a lag; `volts` are its outputs. Faults are set from outside."""
-
-    def __init__(self, um_per_v: Sequence[float], lag: float) -> None:
-        self.um_per_v, self._lag = um_per_v, lag
-        self.volts, self.position_um = [0.0] * len(um_per_v), [0.0] * len(um_per_v)
-        self.age_us = 0.0
-        self.jump_um, self.replacement_v = 0.0, None
-        self.refuses_read = self.refuses_write = self.is_gone = False
-        self.written: list[tuple[float, ...]] = []
-
-    def read(self) -> list[float]:
-        if self.refuses_read:
-            raise OSError("the card does not answer")
-        for axis, gain in enumerate(self.um_per_v):
-            self.position_um[axis] += self._lag * (gain * self.volts[axis] - self.position_um[axis])
-        values = [(position + self.jump_um) / 10.0 for position in self.position_um]
-        if self.replacement_v is not None:
-            values[-1] = self.replacement_v
-        return values
-
-    def write(self, volts: Sequence[float]) -> None:
-        if self.refuses_write:
-            raise OSError("the card refuses the write")
-        self.volts = [*volts]
-        self.written.append(tuple(volts))
-
-
-class BoardDriver(PythonDriver):
-    """Driver of a board."""
-
-    kind = "board"
-
-    def __init__(self, board: Board) -> None:
-        axes = "xy"[: len(board.volts)]
-        wiring = {axis: Wiring(f"adc{i}", f"dac{i}") for i, axis in enumerate(axes)}
-        super().__init__(self.options_model(), wiring, 1000.0)
-        self._board = board
-
-    @property
-    def facts(self) -> Facts:
-        count = range(len(self._board.volts))
-        return Facts(tuple(Channel(f"adc{i}") for i in count), tuple(Channel(f"dac{i}") for i in count), (), real=False)
-
-    def start(self) -> None:
-        if self._board.is_gone:
-            raise OSError("the card is not there")
-
-    def stop(self) -> None:
-        """Do nothing: the board stays."""
-
-    def outputs_v(self) -> list[float]:
-        return [*self._board.volts]
-
-    def read(self) -> Sequence[float]:
-        self.sample_age_us = self._board.age_us
-        return self._board.read()
-
-    def write(self, volts: Sequence[float]) -> None:
-        self._board.write(volts)
-
-
-class VirtualChild:
-    """A child of the supervisor in a virtual thread, in place of `rtloop.supervision.child.Child`."""
-
-    processor_s, is_ready_to_run = 0.0, False
-
-    def __init__(self, world: World, module: str, fd: int, **_: int) -> None:
-        self.world, self.fd = world, fd
-        self.exit_code: int | None = None
-        self.input: list[bytes] = []
-        self.is_closed = False
-        self.is_doomed = False
-        self._reports: list[dict[str, Any]] = []
-        self.session: session.Session | None = None
-        world.fds.add(fd)
-        if module == recorder_keeper.MODULE:
-            self._work: Callable[[], int] = self._record
-            world.recorders.append(self)
-        else:
-            self._work = self._drive
-            world.loops.append(self)
-        self.thread = world.start(self._run)
-
-    def _run(self) -> None:
-        try:
-            code = self._work()
-        except Killed:
-            code = KILLED
-            if self.session is not None:
-                self.session._block["words"][ANNOUNCED] = self._announced  # The stack's end has withdrawn them.
-                if self.session._files.writer is not None:
-                    self.session._files.writer.close()
-        if self.exit_code is None:
-            self.exit_code = code
-
-    def report(self, report: dict[str, Any]) -> None:
-        self._reports.append(report)
-
-    def reports(self) -> list[dict[str, Any]]:
-        reports, self._reports = self._reports, []
-        return reports
-
-    def send(self, data: bytes) -> None:
-        self.input.append(data)
-
-    def close_stdin(self) -> None:
-        self.is_closed = True
-
-    def wait(self, timeout_s: float) -> int | None:
-        self.world.turns.wait(lambda: self.exit_code is not None, timeout_s)
-        return self.exit_code
-
-    def kill(self) -> None:
-        """Kill the child: its thread ends at its next turn, and what it has not done is not done."""
-        if self.exit_code is None and not self.is_doomed:
-            self.is_doomed = True
-            if self.session is not None:
-                self._announced = self.session._block["words"][ANNOUNCED].copy()
-            if self.world.running is self:
-                self.world.end_run("killed")
-            if threading.current_thread() is self.thread:
-                raise Killed
-            self.world.turns.wait(lambda: self.exit_code is not None, 1.0)
-
-    def end(self) -> bool:
-        self.kill()
-        return True
-
-    def pause(self) -> None:
-        """Wait until this child is to go on; raises Killed."""
-        if self.is_doomed:
-            raise Killed
-
-    def _wait(self, condition: Callable[[], object]) -> None:
-        self.world.turns.wait(lambda: self.is_doomed or self.is_closed or condition())
-        self.pause()
-
-    def _drive(self) -> int:
-        """Run the plan that arrives, as `rtloop.engine.process` does."""
-        world, board = self.world, self.world.board
-        self._wait(lambda: self.input)
-        if not self.input:
-            return 0
-        plan: Plan = pickle.loads(self.input.pop())
-        block = SharedBlock(self.fd)
-        world.turns.sleep(world.start_delay_s())
-        self.pause()
-        driver = BoardDriver(board)
-        try:
-            pointers = driver.open()
-        except OSError as error:
-            self.report({"report": "failed", "message": str(error), "exit_code": EXIT_CODES[Outcome.DRIVER_FAILED]})
-            block.store(Word.LOOP_STATE, ProcessState.FAILED)
-            return EXIT_CODES[Outcome.DRIVER_FAILED]
-        context = clock_context(plan.pacing.rate_hz)
-        clock = unpaced_clock(context, block.ring("ticks").head, block["words"], Word.RECORDER_CURSOR, FOR_EVER)
-        self.assembly = Assembly(plan, block, driver.facts, pointers, clock, law_at_rest(plan))
-        block.store(Word.LOOP_STATE, ProcessState.READY)
-        self.report({"report": "ready", "realtime": {}})
-        world.turns.wait(lambda: self.is_doomed or block.load(Word.GO) or block.load(Word.STOP))
-        self.pause()
-        self.outcome = Outcome.STOPPED
-        if block.load(Word.GO):
-            block.store(Word.START_UNIX_NS, round(1e9 * timing.unix_s()))
-            block.store(Word.LOOP_STATE, ProcessState.RUNNING)
-            self.outcome = Outcome.DONE
-            world.begin_run(self, block)
-            world.turns.wait(lambda: self.is_doomed or self.outcome is not Outcome.DONE)
-            self.pause()
-            block.store(Word.FINISHED_TICKS, self.assembly.loop.tick)
-            world.end_run(self.outcome.name.lower())
-        if self.assembly.loop.failed:
-            block.fault = _fault_text(driver, self.assembly.loop)
-        state, code = ProcessState.FINISHED, EXIT_CODES[self.outcome]
-        try:
-            ramp.ramp_to_safe(driver, pointers, self.assembly.outputs_v, plan.trip_slew_v_per_s)
-            self.pause()
-            self.report({"report": "finished", "outcome": self.outcome.name.lower(), "driver_error": block.fault})
-            driver.close()
-        except Exception as error:
-            state, code = ProcessState.FAILED, EXIT_CODES[Outcome.DRIVER_FAILED]
-            self.report({"report": "failed", "message": str(error), "exit_code": code})
-        block.store(Word.LOOP_STATE, state)
-        return code
-
-    def _record(self) -> int:
-        """Run the recorder on orders that arrive by `send`."""
-        self._wait(lambda: os.pread(self.fd, 1, 0) == b"{")
-        if self.is_closed:
-            return 0
-        return recorder.record_run(self.fd, None)
-
-
-class ChildOrders:
-    """Orders of the recorder whose thread reads them, in place of lines on stdin."""
-
-    def __init__(self) -> None:
-        self._child = World.present.child_of_thread()
-
-    @property
-    def is_closed(self) -> bool:
-        return self._child.is_closed
-
-    def next(self, wait_s: float | None = 0.0) -> Any:
-        if wait_s is None:
-            self._child._wait(lambda: self._child.input)
-        self._child.pause()
-        return json.loads(self._child.input.pop(0)) if self._child.input else None
-
-
 class World:
-    """One world: `text` is the service's configuration, `seed` the seed of interleavings and delays."""
+    """One world of a `draw`; `seed` is that of interleavings and delays."""
 
-    present: World
-
-    def __init__(self, text: str, seed: int, board: Board, lock_timeout_s: float, preemption: float) -> None:
-        World.present = self
+    def __init__(self, draw: Draw, seed: int, board: Board) -> None:
         self._patch = pytest.MonkeyPatch()
         base = "/dev/shm" if os.path.isdir("/dev/shm") else None
         self._folder = tempfile.TemporaryDirectory(prefix="world-", dir=base)
         self.folder = Path(self._folder.name)
         self.config = self.folder / "lab.toml"
-        self.config.write_text(text.replace("FOLDER", self._folder.name))
-        self.random, self.preemption = random.Random(f"{seed} interleaving"), preemption
-        self.turns = Turns(self._advance, choose=self.random.choice, delay=self._draw_delay)
+        self.config.write_text(draw.text.replace("FOLDER", self._folder.name))
+        self.random, self.preemption = random.Random(f"{seed} interleaving"), draw.preemption
+        self._fine = draw.fine
+        """Share of the lines of TRACED before which a thread loses its turn."""
+        line_delay = self._draw_line_delay if draw.fine > 0 else None
+        self.turns = Turns(self._advance, self.random.choice, self._draw_delay, line_delay, TRACED)
         self.board, self.fds = board, set[int]()
         self.error: Exception | None = None
         self.loops: list[VirtualChild] = []
@@ -349,7 +132,7 @@ class World:
         self.disk_error: int | None = None
         self.cut_write: tuple[float, bool] | None = None
         """Share of its bytes that the next write writes, and whether the recorder dies then."""
-        self._replace_processes(lock_timeout_s)
+        self._replace_processes(draw.lock_timeout_s)
         self.service = Service(self.config)
         self._web = application(self.service)
         self.exit_code: int | None = None
@@ -366,7 +149,7 @@ class World:
         patch.setattr(Plan, "driver", lambda _: BoardDriver(self.board))
         patch.setattr(ramp, "_wait_until", lambda until_s: self.turns.sleep(max(until_s - self.turns.now_s, 0.0)))
         patch.setattr(ramp, "time", SimpleNamespace(monotonic=lambda: self.turns.now_s))
-        patch.setattr(recorder, "SupervisorOrders", ChildOrders)
+        patch.setattr(recorder, "SupervisorOrders", lambda: ChildOrders(self.child_of_thread()))
         patch.setattr(recorder, "_is_supervisor_gone", lambda: False)
         patch.setattr(recorder, "Session", self._make_session)
         patch.setattr(recorder, "print", lambda text, **_: self.child_of_thread().report(json.loads(text)), False)
@@ -404,6 +187,9 @@ class World:
         if self.random.random() >= self.preemption:
             return 0.0
         return self.random.choice((1e-6, 1e-6, 0.0005, 0.002, 0.01, 0.05))
+
+    def _draw_line_delay(self) -> float:
+        return self.random.choice((1e-6, 1e-6, 1e-6, 0.0005, 0.003, 0.02)) if self.random.random() < self._fine else 0.0
 
     def start_delay_s(self) -> float:
         return self.random.choice((0.0, 0.02, 0.1))
