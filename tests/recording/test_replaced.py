@@ -27,7 +27,7 @@ from rtloop.signals import Mode
 from tests.recording.hand_made_loop import HandMadeLoop, make_header, make_rows
 from tests.recording.real_loop import RecordedRun
 
-TICKS, STEP, SNAPSHOT_TICKS, COMMAND_TICKS = 1_200, 400, 250, 100
+TICKS, STEP, SNAPSHOT_TICKS, COMMAND_TICKS = 800, 400, 250, 100
 ROTATE_S = 0.05
 MIN_INSTANTS = 50
 KILLED, END, SNAPSHOT = 15_722, 22_000, 10_000
