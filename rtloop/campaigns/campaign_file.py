@@ -18,7 +18,7 @@ from rtloop.campaigns.uncertain import UncertainOptions
 from rtloop.configuration.file import Configuration, describe, load
 from rtloop.configuration.simulated import middle_um, sensor_ends_um
 from rtloop.configuration.text_files import parse_toml, read_text
-from rtloop.design.synthesis.specification_file import load_specification
+from rtloop.design.synthesis.specification_file import load_axis_specification, load_specification
 from rtloop.design.verification.judgement import required_limits
 from rtloop.errors import ConfigError
 from rtloop.foundation.options import Options
@@ -161,12 +161,12 @@ def _limits(options: CampaignOptions, path: Path, configuration: Configuration) 
     ConfigError for an unreadable or invalid specification.
     """
     axis = next(axis for axis in configuration.axes if options.axis in ("", axis.name))
-    specification = path.parent / options.specification if options.specification else None
+    specification = load_specification(path.parent / options.specification) if options.specification else None
     if specification is None and axis.specification is not None:
-        specification = configuration.folder / axis.specification
+        specification = load_axis_specification(configuration, axis)
     limits: dict[str, float] = {}
     if specification is not None:
-        required = required_limits(load_specification(specification).design.specification)
+        required = required_limits(specification.design.specification)
         limits = {
             f"{experiment.label}{SEPARATOR}{name}": required[name].value
             for experiment in options.experiment

@@ -71,6 +71,7 @@ def run_campaign(
     """
     runner = CaseRunner(campaign)
     with open_store(folder, campaign, runner.sample_values(NOMINAL)) as store:
+        store.require_no_further_rigs()
         units = split_into_units(campaign, runner.rate_hz)
         is_complete = Coordinator(campaign, runner, store, workers).run(units, on_progress, is_stop_requested)
         if is_complete and campaign.options.keep_worst:

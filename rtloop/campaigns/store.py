@@ -133,6 +133,13 @@ class Store:
                 ],
             )
 
+    def require_no_further_rigs(self) -> None:
+        """Raise ConfigError if the folder has results of rigs beyond the campaign's number of rigs."""
+        rigs, last = self._campaign.options.rigs, max((_last_rig(path) for path in self._paths.values()), default=0)
+        if last > rigs:
+            allowed = f"{last} or more, or another folder with --out"
+            raise ConfigError(str(self.folder), [f"rigs: {rigs}; the folder has results of {last}; allowed: {allowed}"])
+
     def close(self) -> None:
         """Release the lock, so that other processes may write to the folder."""
         close_descriptor(self._lock)
@@ -365,6 +372,12 @@ def _first_rig(path: Path) -> int:
     """Return the number of the first rig of a file of results, from its name; 0 for another name."""
     match = FILE_NAME.fullmatch(path.name)
     return int(match[1]) if match else 0
+
+
+def _last_rig(path: Path) -> int:
+    """Return the number of the last rig of a file of results, from its name; 0 for another name."""
+    match = FILE_NAME.fullmatch(path.name)
+    return int(match[2]) if match else 0
 
 
 @contextmanager

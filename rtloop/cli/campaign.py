@@ -80,7 +80,9 @@ def run(
     with Interruption() as interruption:
         from rtloop.campaigns.campaign_file import load_campaign
         from rtloop.campaigns.run import default_folder, run_campaign
+        from rtloop.campaigns.store import arrow
 
+        arrow()  # before anything is said of a campaign that cannot run
         loaded = load_campaign(campaign, rigs, config)
         folder = out or default_folder(loaded)
         with choose_workers(jobs, scheduler) as workers, CampaignView("starting", sys.stderr) as view:
@@ -243,10 +245,10 @@ def _print_summary(summary: CampaignSummary, folder: Path) -> None:
         ]
         if rows:
             out.print(table(f"variance of {name}", "alone", "from", "to", "with others", "from", "to", rows=rows))
-    if summary.worst_rigs:
+    if summary.worst_rigs and has_limits:
         keys = list(summary.worst_rigs[0].values)
         rows = [
-            (str(rig.rig), f"{rig.ratio:.3g}" if has_limits else "–", *(value_text(rig.values[key]) for key in keys))
+            (str(rig.rig), f"{rig.ratio:.3g}", *(value_text(rig.values[key]) for key in keys))
             for rig in summary.worst_rigs
         ]
         out.print(table("worst rig", "figure / limit", *(key.rpartition(".")[2] for key in keys), rows=rows))

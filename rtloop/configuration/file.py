@@ -329,13 +329,12 @@ def _fault(detail: Any, prefix: str, raw: object, known_keys: set[str], missing_
     if detail["type"] == "missing":
         return f"{key}: missing; this key is required"
     if detail["type"] == "extra_forbidden":
-        from difflib import get_close_matches
-
-        suggestions = get_close_matches(path[-1], missing_beside, n=1)
-        if path[-1] in known_keys and not suggestions:
+        beside = [*missing_beside, *detail.get("ctx", {}).get("keys", ())]
+        suggestion = _resembling(path[-1], beside)
+        if path[-1] in known_keys and not suggestion:
             return f"{key}: unknown key in this table; {path[-1]} belongs in another table"
-        suggestions = suggestions or get_close_matches(path[-1], known_keys, n=1)
-        return f"{key}: unknown key" + (f"; did you mean {suggestions[0]}?" if suggestions else "")
+        suggestion = suggestion or _resembling(path[-1], sorted(known_keys))
+        return f"{key}: unknown key" + (f"; did you mean {suggestion}?" if suggestion else "")
     if detail["type"] == "union_tag_invalid":
         tag = detail["ctx"]["tag"]
         return f"{key}.kind: {repr(tag) if tag else 'missing'}; allowed: {detail['ctx']['expected_tags']}"
@@ -347,6 +346,14 @@ def _fault(detail: Any, prefix: str, raw: object, known_keys: set[str], missing_
     value = detail["input"]
     value_text = f" {_format_value(value)}:" if isinstance(value, str | int | float | bool) else ""
     return f"{key}:{value_text} {message if value_text else message[0].lower() + message[1:]}"
+
+
+def _resembling(key: str, known_keys: Sequence[str]) -> str:
+    """Return the known key that a wrong one resembles, first one that only adds a unit to it; "" for none."""
+    from difflib import get_close_matches
+
+    with_unit = [known for known in known_keys if known.startswith(f"{key}_")]
+    return next(iter(with_unit or get_close_matches(key, known_keys, n=1)), "")
 
 
 def _format_value(value: object) -> str:

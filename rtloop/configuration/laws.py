@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 from pydantic import BeforeValidator, SerializeAsAny, ValidationError, ValidationInfo
+from pydantic_core import PydanticCustomError
 
 from rtloop.configuration.text_files import InputFileError, read_text
 from rtloop.kernel.layout import MAX_COUPLED
@@ -110,12 +111,15 @@ def select_options(value: object, info: ValidationInfo, base: type[Law], default
     try:
         options = law_type.options_model.model_validate(dict(value), context=info.context)
     except ValidationError as error:
-        faults: list[Any] = list(error.errors())
-        is_of_another_law = not value or any(fault["type"] == "extra_forbidden" for fault in faults)
-        if value.get("kind") or value.get("file") or not is_of_another_law:
-            raise
-        message = f"kind: missing, which means {default!r}; allowed: {_shipped_kinds(base)}"
-        faults.append({"type": "value_error", "ctx": {"error": message}, "input": value})
+        keys = sorted(law_type.options_model.model_fields)
+        unknown = PydanticCustomError("extra_forbidden", "unknown key", {"keys": keys})
+        faults: list[Any] = [
+            fault | {"type": unknown} if fault["type"] == "extra_forbidden" else fault for fault in error.errors()
+        ]
+        is_of_another_law = not value or any(fault["type"] is unknown for fault in faults)
+        if is_of_another_law and not (value.get("kind") or value.get("file")):
+            message = f"kind: missing, which means {default!r}; allowed: {_shipped_kinds(base)}"
+            faults.append({"type": "value_error", "ctx": {"error": message}, "input": value})
         raise ValidationError.from_exception_data(error.title, faults) from None
     law = replace(law, axes=_axes(law, law_type, options))
     if library.loaded is not None and law not in library.loaded:

@@ -12,7 +12,7 @@ from rtloop.configuration.prepare import Prepared, prepare
 from rtloop.configuration.rig import driver_delay_ticks, rig_options
 from rtloop.configuration.simulated import sensor_ends_um, sensor_reach_um
 from rtloop.design.synthesis.specification import SpecificationOptions
-from rtloop.design.synthesis.specification_file import load_specification
+from rtloop.design.synthesis.specification_file import load_axis_specification
 from rtloop.errors import ConfigError
 from rtloop.experiments.derive import derive_configuration, store_tables
 from rtloop.experiments.procedure import Experiment, UnsuitableLoop
@@ -61,7 +61,7 @@ def load_stage(config: Path, axis: str | None) -> Stage:
     selected = _select_axis(base, axis)
     specification = SpecificationOptions()
     if selected.specification is not None:
-        specification = load_specification(base.folder / selected.specification).design.specification
+        specification = load_axis_specification(base, selected).design.specification
     setting = Setting(
         base.loop.rate_hz, selected, not prepared.facts.real, specification, sensor_reach_um(base, selected),
         sensor_ends_um(base, selected), driver_delay_ticks(base),

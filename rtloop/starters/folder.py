@@ -53,7 +53,7 @@ def stage(figures: StageFigures) -> Starter:
         "rtloop design auto sine/*.mcap step/*.mcap --specs stage-spec.toml --robust --out robust.toml"
         "  # with integral action",
         "rtloop run designed.toml --duration 2",
-        "rtloop campaign run stage-campaign.toml --config robust.toml",
+        "rtloop campaign run stage-campaign.toml --config robust.toml  # needs pip install 'rtloop[campaign]'",
     )
     return Starter(texts, commands)
 

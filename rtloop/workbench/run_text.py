@@ -17,9 +17,10 @@ if TYPE_CHECKING:
     from rtloop.recording.views.summary import Summary
 
 SPECIFIED_STEP = (
-    "MISSED: the worst recorded step is beyond the limit. Unlike the step of the linear loop that `rtloop check` "
-    "judges, a recorded one has the sensor's noise, hysteresis that the inverse leaves, limits of command and drive, "
-    "and the end of its level: what has not settled by then counts. `rtloop design verify` simulates such steps."
+    "MISSED: the worst recorded step is beyond the limit. `rtloop check` judges a step of the linear loop: where it "
+    "misses the limit too, the loop is the reason. A recorded step also has the sensor's noise, hysteresis that the "
+    "inverse leaves, limits of command and drive, and the end of its level: what has not settled by then counts. "
+    "`rtloop design verify` simulates such steps."
 )
 """Difference between a recorded step and the step that a specification limits."""
 
@@ -44,7 +45,7 @@ def print_steps(out: Console, steps: Mapping[str, StepMetrics], configuration: C
 
     With a configuration, limits and claims of the axis's specification follow, and an explanation if a limit is missed.
     """
-    is_missed = False
+    is_missed, notes = False, list[str]()
     rows = table("steps", "overshoot %", "settling ms (5 %)", "static error %")
     axes = {axis.name: axis for axis in configuration.axes} if configuration else {}
     for name, metrics in steps.items():
@@ -56,13 +57,17 @@ def print_steps(out: Console, steps: Mapping[str, StepMetrics], configuration: C
             figures = (format_figure(overshoot, 2), format_figure(settling, 2), format_figure(error, 3))
             rows.add_row(f"{name}: {label}", *figures)
         if metrics.unreached:
-            rows.add_row(f"  [red]{metrics.unreached} of {metrics.steps} steps hardly moved, or ended more than "
-                          f"{100 * SETTLING_BAND:g} % of their height from the reference[/]")  # fmt: skip
+            notes.append(
+                f"{name}: {metrics.unreached} of {metrics.steps} steps hardly moved, or ended more than "
+                f"{100 * SETTLING_BAND:g} % of their height from the reference"
+            )
         for row in specification_rows(configuration, axes[name], metrics) if configuration else ():
             label = escape(row.label) if row.error is None else f"[red]{escape(row.error)}[/]"
             rows.add_row(f"  {label}", *(_red(cell) if cell.endswith(MISSED) else escape(cell) for cell in row.cells))
             is_missed |= any(cell.endswith(MISSED) for cell in row.cells)
     out.print(rows)
+    for note in notes:
+        out.print(_red(note))
     if is_missed:
         out.print(SPECIFIED_STEP)
 

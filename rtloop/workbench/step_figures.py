@@ -65,11 +65,11 @@ def specification_rows(
     """
     if axis.specification is None:
         return
-    from rtloop.design.synthesis.specification_file import load_specification  # slow, and seldom needed
+    from rtloop.design.synthesis.specification_file import load_axis_specification  # slow, and seldom needed
     from rtloop.design.verification.judgement import required_limits
 
     try:
-        specification = load_specification(configuration.folder / axis.specification).design.specification
+        specification = load_axis_specification(configuration, axis).design.specification
     except RtloopError as error:
         yield SpecificationRow(axis.specification, [], str(error))
         return

@@ -18,6 +18,7 @@ from rtloop.campaigns.unit import Unit, split_into_units
 from rtloop.configuration.text_files import InputFileError
 from rtloop.errors import ConfigError, OutputError, UnavailableError
 from tests.campaigns.campaign_files import STEPS, result_files, write_campaign
+from tests.command_line import run
 
 UNIT = Unit(1, 4)
 
@@ -195,6 +196,14 @@ def test_fewer_rigs_than_before_delete_no_row(runner, folder):
     store_rigs(runner, folder, UNIT, [2, 3, 4])
     store_rigs(runner, folder, Unit(1, 2), [1])
     assert summarise_campaign(folder).yield_of_rigs.rigs == 4
+
+
+def test_a_campaign_of_fewer_rigs_than_the_folder_has_is_refused(runner, folder, tmp_path):
+    store_rigs(runner, folder, UNIT, [2, 3, 4])
+    path = write_campaign(tmp_path, keys="rigs = 3\nunit_rigs = 4")
+    result = run("campaign", "run", path, "--out", folder)
+    assert result.exit_code == 78
+    assert "rigs: 3; the folder has results of 4; allowed: 4 or more, or another folder with --out" in result.stderr
 
 
 def test_a_file_of_another_name_is_ignored_and_one_that_cannot_be_read_stays(runner, folder):

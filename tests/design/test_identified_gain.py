@@ -118,7 +118,7 @@ def test_the_identified_gain_reaches_the_controllers_file_by_itself(folder: Path
 
 def test_synthesis_prints_the_verdict_of_check_and_explains_gamma(folder: Path) -> None:
     """The default weight misses this specification by the factor γ; a lenient tracking weight meets it."""
-    strict = "the loop misses static error, settling (5 %)"
+    strict = "the loop misses static error; settling (5 %)"
     lenient = SPEC + '[weights.tracking]\nform = "zpk"\ngain = 0.99\nzeros = [[-600.0, 0.0]]\npoles = [[-0.1, 0.0]]\n'
     for name, text, expected in (("strict", SPEC, strict), ("lenient", lenient, "the loop meets its specification")):
         spec, out = folder / f"{name}.toml", folder / f"{name}-made.toml"

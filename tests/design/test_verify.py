@@ -34,6 +34,8 @@ from rtloop.design.verification.text import answer
 from rtloop.design.verification.verify import Robustness, VerifiedLoop, verify
 from rtloop.linear.discretise import discretise_controller
 from rtloop.linear.transfer import Transfer
+from rtloop.starters.stage import stage_files
+from rtloop.starters.stage_figures import StageFigures
 
 DEPLOY = Path(__file__).resolve().parents[2] / "deploy"
 PAPER_LOOP = continuous_loop(PAPER_C, PAPER_D)
@@ -382,9 +384,24 @@ def test_delay_margin_is_phase_margin_over_crossover() -> None:
     """75.54° at 94.53 Hz, eqs (5) and (20); the discretised loop is stable with 21 samples and unstable with more."""
     assert delay_margin_us(PAPER_LOOP) == pytest.approx(1e6 * 75.54 / 360 / 94.53, rel=1e-3)
     ticks = tolerated_delay_ticks(lambda ticks: discrete_loop(RUNNING, PAPER_D, ticks))
+    assert ticks is not None
     assert discrete_loop(RUNNING, PAPER_D, ticks).is_stable
     assert not discrete_loop(RUNNING, PAPER_D, ticks + 1).is_stable
     assert ticks == int(delay_margin_us(discrete_loop(RUNNING, PAPER_D)) / 100)
+
+
+def test_a_loop_that_is_stable_with_every_delay_that_is_tried_has_no_limit_of_the_search_as_its_own(
+    tmp_path: Path,
+) -> None:
+    """The slow integrator of the starter's stage bears about 1,000 samples; the search tries 64."""
+    figures = StageFigures(310.0, 0.012, 80.0, drive_min_v=0.0)
+    for name, content in stage_files(figures).items():
+        (tmp_path / name).write_text(content)
+    result = run(str(tmp_path / "stage.toml"), "--spec", str(tmp_path / "stage-spec.toml"))
+    (row,) = [line for line in result.stdout.splitlines() if line.startswith("delay ")]
+    delay_us = re.search(r"\+(\d+) µs or more than 63 samples", row)
+    assert delay_us is not None, row
+    assert 95_000 < float(delay_us[1]) < 105_000
 
 
 def test_the_gain_may_rise_by_the_gain_margin() -> None:

@@ -109,6 +109,14 @@ def test_an_entry_within_the_dead_band_finds_where_in_it_the_drive_is(drive_v: f
     assert bench.state["dead_band_direction"][0] == 0.0
 
 
+@pytest.mark.parametrize(("key", "meant"), [("ki", "ki_per_s"), ("ki_per_sec", "ki_per_s"), ("kip", "kp")])
+def test_a_misspelt_key_that_a_law_need_not_have_is_compared_with_its_keys(key: str, meant: str) -> None:
+    text = EXAMPLES["pid"].read_text()
+    (line,) = [line for line in text.splitlines() if line.startswith("ki_per_s =")]
+    with pytest.raises(ConfigError, match=rf"axis\.x\.controller\.{key}: unknown key; did you mean {meant}\?"):
+        parse(text.replace(line, f"{key} = 1.0"), "test", EXAMPLES["pid"].parent, "test")
+
+
 def test_a_misspelt_key_of_a_law_is_taken_for_the_one_that_is_missing() -> None:
     text = EXAMPLES["repetitive"].read_text().replace("ki_per_s =", "ki_per_second =")
     with pytest.raises(ConfigError) as error:

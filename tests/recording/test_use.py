@@ -267,6 +267,18 @@ def test_a_peak_of_the_error_hides_no_ripple_in_a_picture(tmp_path: Path, peak_u
     assert middle - low == pytest.approx(high - middle, rel=1e-6)
 
 
+def test_in_mode_raw_no_reference_in_volts_is_drawn_as_a_position(tmp_path: Path) -> None:
+    """The reference of the mode raw is in V: it has no place beside the position, and no error."""
+    rows = make_rows(COUNT)
+    rows[:, COLUMNS.index("mode")] = Mode.RAW
+    figure = draw_recording(load(write_recording(tmp_path / "raw.mcap", rows)))
+    assert [panel.get_ylabel() for panel in figure.axes] == ["x / µm", "x drive / V", "timing / µs"]
+    assert [text.get_text() for text in figure.axes[0].get_legend().get_texts()] == ["position"]
+    rows[: COUNT // 2, COLUMNS.index("mode")] = Mode.CLOSED_LOOP
+    band = read_bands(load(write_recording(tmp_path / "both.mcap", rows)), ["x_error_um"], 0.0, np.inf, 10_000)
+    assert np.array_equal(np.isnan(band["x_error_um"].low), np.arange(COUNT) >= COUNT // 2)
+
+
 def test_an_episode_of_late_ticks_is_marked_with_its_number_of_missed_periods() -> None:
     kinds = ({"kind": "periods_missed", "what": {"periods": 3}}, {"kind": "lateness_over", "what": {"periods": 10}})
     recording = SimpleNamespace(events=[{"time_ns": 10**9, **kind} for kind in kinds])

@@ -34,16 +34,18 @@ def test_an_end_is_told_as_a_signal_or_an_exit_code(code: int, text: str) -> Non
 
 
 def test_recordings_of_the_same_second_are_numbered_from_2(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The folder is created with its parent folders; the name of an unfinished recording is in use, too."""
-    monkeypatch.setattr("time.strftime", lambda form: "20260101T120000")
+    """The folder is created with its parent folders; the name of an unfinished recording is in use, too, and so are
+    the files that a recorder with rotation numbers, whatever the quota has left of them.
+    """
+    monkeypatch.setattr("time.strftime", lambda form, _: "20260101T120000")
     prepared, folder = prepare(load(PAPER), paced=False), tmp_path / "of" / "today"
     names = []
-    for suffix in ("", ".part", ""):
+    for end in (".mcap", ".mcap.part", "-0001.mcap.part", "-0007.mcap", ".mcap"):
         path = new_recording_path(prepared, folder)
         names.append(path.name)
-        path.with_name(path.name + suffix).touch()
+        path.with_name(path.stem + end).touch()
     stem = f"{prepared.plan.name}-20260101T120000"
-    assert names == [f"{stem}.mcap", f"{stem}-2.mcap", f"{stem}-3.mcap"]
+    assert names == [f"{stem}.mcap", *(f"{stem}-{number}.mcap" for number in (2, 3, 4, 5))]
     assert folder.is_dir()
 
 

@@ -52,6 +52,8 @@ class Turns:
         """
         self.now_s, self._advance, self._choose, self._delay = 1000.0, advance, choose, delay
         self._line_delay, self._traced, self._is_traced = line_delay, tuple(traced), dict[str, bool]()
+        self.on_resume: Callable[[], None] = lambda: None
+        """Called by a thread that had lost its turn in `preempt` and has it again; may raise."""
         self._is_passing = False
         self._waits: dict[threading.Thread, tuple[float, Callable[[], object]]] = {}
         self._gates: dict[threading.Thread, threading.Lock] = {}
@@ -89,6 +91,7 @@ class Turns:
         has_turn = self._turn is threading.current_thread() and not self._is_passing
         if has_turn and (delay_s := (delay or self._delay)()) > 0:
             self._give_up_turn(self.now_s + delay_s, never)
+            self.on_resume()
 
     @contextmanager
     def undivided(self) -> Iterator[None]:

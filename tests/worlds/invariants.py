@@ -11,6 +11,7 @@ import numpy as np
 from rtloop.engine.messages import Kind, Origin
 from rtloop.recording.file.topics.recovery_steps import Note, RecoveryStep
 from rtloop.signals import COMMON_COUNT, DRIVE, FLAGS, MODE, PER_AXIS_COUNT, REFERENCE, TICK, TRIP_MASK, Flag, Mode
+from tests.worlds.law_changes import LawChanges
 from tests.worlds.world import Request, Run, World
 
 PERIOD_S, ROUNDING_V, BATCH_TICKS, STATE_TICKS = 1e-3, 1e-9, 200, 25
@@ -73,6 +74,7 @@ class Invariants:
         self._stop: int | None = None
         """Number of the stop that is in force until a client's next start."""
         self._trips = self._recoveries = 0
+        self._law_changes = LawChanges(world)
         self._rows: list[np.ndarray[Any, Any]] = []
         self._row_count = 0
 
@@ -188,7 +190,7 @@ class Invariants:
         require(is_drive(requester), f"{requester.path} set mode {event['values'][0]:g}")
         if self._arm:
             stops = [other for other in requests if other.path in ("/stop", "/reset") and other.code == 200]
-            arms = [other for other in requests if other.path == "/arm" and other.code == 200]
+            arms = [other for other in requests if other.path == "/arm" and other.code in (None, 200)]
             is_armed = any(
                 not any(arm.answered_s < stop.sent_s and stop.answered_s < requester.sent_s for stop in stops)
                 for arm in arms if arm.sent_s <= now_s
@@ -223,6 +225,8 @@ class Invariants:
         require(wait_s <= limit_s, f"request {request.number} {request.path}: answered after {wait_s:.3f} s")
         self._check_effect(request)
         self._check_lock(request)
+        lost = self._law_changes.on_answer(request)
+        require(not lost, lost)
 
     def _check_effect(self, request: Request) -> None:
         """Require that an answer tells what the loop did."""
@@ -281,8 +285,10 @@ class Invariants:
 
     # At the end
 
-    def at_end(self) -> None:
-        """Check the recordings of all loops, and that the outputs are safe."""
+    def at_end(self, is_disturbed: bool) -> None:
+        """Check the recordings of all loops, and that the outputs are safe; `is_disturbed`: by a fault of the disk, or
+        the death of a process.
+        """
         self.flush()
         world = self._world
         require(not np.any(world.board.volts), f"the outputs end at {world.board.volts} V")
@@ -296,6 +302,8 @@ class Invariants:
         require(len(results) == len(world.runs), f"{len(world.runs)} loops and {len(results)} results")
         for run, result in zip(world.runs, results, strict=True):
             check_recording(run, result)
+            is_whole = is_disturbed or run.outcome == "killed" or result.recorder["complete"]
+            require(is_whole, f"a recording that nothing disturbed is incomplete: {result.recorder}")
 
     def _check_reference(self, request: Request) -> None:
         """Require that the axis had the reference of an answered request until the next event of a reference."""

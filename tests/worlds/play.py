@@ -12,7 +12,7 @@ from typing import Any
 
 from tests.worlds.board import Board
 from tests.worlds.invariants import Invariants, Violation
-from tests.worlds.schedule import ACTORS, DISK_ERRORS, UM_PER_V, Action, Draw, draw_world
+from tests.worlds.schedule import ACTORS, DISK_ERRORS, DISTURBING, UM_PER_V, Action, Draw, draw_world
 from tests.worlds.world import Request, World
 
 LAG = 0.18
@@ -45,7 +45,7 @@ def play(seed: int, actions: Sequence[Action] | None = None) -> Outcome:
     actors = [partial(_act, world, draw, name, actions, invariants) for name in (*ACTORS, "fault")]
     try:
         world.live(actors, draw.seconds)
-        invariants.at_end()
+        invariants.at_end(any(action.kind in DISTURBING for action in actions))
     except Violation as violation:
         failure = str(violation)
     except Exception as error:

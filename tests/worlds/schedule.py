@@ -216,4 +216,6 @@ def _draw_faults(draw: random.Random, seconds: float) -> list[Action]:
     return actions
 
 
+DISTURBING = ("loop death", "recorder death", "death in write", "disk full", "disk error", "short write")
+"""Faults after which a recording may be incomplete."""
 DISK_ERRORS = {"disk full": errno.ENOSPC, "disk error": errno.EIO}

@@ -16,6 +16,7 @@ import threading
 from collections.abc import Callable, Sequence
 from contextvars import ContextVar
 from dataclasses import dataclass, field, replace
+from importlib import import_module
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, NamedTuple
@@ -49,6 +50,9 @@ STRETCH_S = 0.005
 PACKAGE = Path(rtloop.__file__).parent
 TRACED = [f"{PACKAGE / room}/" for room in ("service", "supervision", "recording/capture")]
 """Folders in whose lines a thread may lose its turn."""
+for room in TRACED:  # What a module does when it is imported is not part of the first world that needs it.
+    for file in Path(room).rglob("*.py"):
+        import_module(".".join(("rtloop", *file.relative_to(PACKAGE).with_suffix("").parts)).removesuffix(".__init__"))
 request_number = ContextVar[int]("request_number", default=-1)
 """Number of the request for which a thread works; -1 for the service's own work."""
 
@@ -118,6 +122,7 @@ class World:
         """Share of the lines of TRACED before which a thread loses its turn."""
         line_delay = self._draw_line_delay if draw.fine > 0 else None
         self.turns = Turns(self._advance, self.random.choice, self._draw_delay, line_delay, TRACED)
+        self.turns.on_resume = self._end_doomed
         self.board, self.fds = board, set[int]()
         self.error: Exception | None = None
         self.loops: list[VirtualChild] = []
@@ -190,6 +195,13 @@ class World:
 
     def _draw_line_delay(self) -> float:
         return self.random.choice((1e-6, 1e-6, 1e-6, 0.0005, 0.003, 0.02)) if self.random.random() < self._fine else 0.0
+
+    def _end_doomed(self) -> None:
+        """Raise Killed in the thread of a child that was killed while it had lost its turn."""
+        me = threading.current_thread()
+        for child in self.recorders + self.loops:
+            if child.thread is me:
+                child.pause()
 
     def start_delay_s(self) -> float:
         return self.random.choice((0.0, 0.02, 0.1))

@@ -7,8 +7,9 @@ from typing import NamedTuple
 
 from pydantic import ValidationError
 
-from rtloop.configuration.file import describe
-from rtloop.configuration.text_files import parse_toml, read_text
+from rtloop.configuration.axis import AxisOptions
+from rtloop.configuration.file import Configuration, describe
+from rtloop.configuration.text_files import InputFileError, parse_toml, read_text
 from rtloop.design.synthesis.specification import DesignOptions
 from rtloop.errors import ConfigError
 
@@ -24,6 +25,16 @@ class SpecificationFile(NamedTuple):
     path: Path
     text: str
     design: DesignOptions
+
+
+def load_axis_specification(configuration: Configuration, axis: AxisOptions) -> SpecificationFile:
+    """Read and validate the specification that an axis names. Raises as `load_specification`; a file that cannot be
+    read is named with the key that names it.
+    """
+    try:
+        return load_specification(configuration.folder / (axis.specification or ""))
+    except InputFileError as error:
+        raise InputFileError(f"{configuration.source}: axis.{axis.name}.specification: {error}") from None
 
 
 def load_specification(path: Path) -> SpecificationFile:

@@ -14,7 +14,7 @@ from rtloop.configuration.file import Configuration
 from rtloop.configuration.simulated import compare_with_rig
 from rtloop.design.robust.scenarios import Family
 from rtloop.design.synthesis.specification import DesignOptions
-from rtloop.design.synthesis.specification_file import load_specification
+from rtloop.design.synthesis.specification_file import load_axis_specification, load_specification
 from rtloop.design.verification.bench import Bench, HardwareModel
 from rtloop.design.verification.robustness import Plants
 from rtloop.design.verification.simulation import simulate
@@ -45,9 +45,12 @@ def verify_axis(
     read.
     """
     axis = next(entry for entry in configuration.axes if entry.name == check.name)
-    if spec is None and axis.specification is not None:
-        spec = configuration.folder / axis.specification
-    design = DesignOptions() if spec is None else load_specification(spec).design
+    if spec is not None:
+        design = load_specification(spec).design
+    elif axis.specification is not None:
+        design = load_axis_specification(configuration, axis).design
+    else:
+        design = DesignOptions()
     model, key = axis.model or design.plant, f"axis.{axis.name}"
     if model is None:
         raise ConfigError(

@@ -14,8 +14,8 @@ def as_dict(verification: Verification) -> dict[str, object]:
 
     Robustness is computed if it was not before. Keys: meets; stable {continuous, running}; delay_ticks; rate_hz; rows
     (`_row`); resonance_shift_percent {"continuous" or the samples of delay: [−down, up]}; robustness_percent {plant
-    parameter: {"continuous", "running" or "running_missed": [−down, up]}}; delay_margin_us; more_delay_ticks; together;
-    scenarios (`_scenarios`); host_delay; simulated; warnings, as texts.
+    parameter: {"continuous", "running" or "running_missed": [−down, up]}}; delay_margin_us; more_delay_ticks, None
+    beyond the range searched; together; scenarios (`_scenarios`); host_delay; simulated; warnings, as texts.
     """
     robustness = verification.robustness
     values = {

@@ -48,6 +48,8 @@ class WorstValue(NamedTuple):
 
 Plants = Sequence[tuple[str, Transfer, int]]
 """Name, dynamics and delay in samples of each plant."""
+MOST_TRIED_TICKS = 64
+"""Largest delay in samples with which a loop is tried."""
 LARGER_IS_BETTER = ("bandwidth_hz", "disturbance_hz", "modulus_margin")
 """Quantities whose worst value is the least; of all others it is the largest."""
 
@@ -109,11 +111,11 @@ def delay_margin_us(loop: Loop) -> float:
     return 1e6 * delay_margin(loop)[0] if loop.is_stable else 0.0
 
 
-def tolerated_delay_ticks(delayed_loop: Callable[[int], Loop], most_ticks: int = 64) -> int:
-    """Return the largest delay in samples, at most `most_ticks`, for which the loop is stable with this and every
-    smaller delay; −1 if the loop is unstable without delay.
+def tolerated_delay_ticks(delayed_loop: Callable[[int], Loop]) -> int | None:
+    """Return the largest delay in samples for which the loop is stable with this and every smaller delay; −1 if the
+    loop is unstable without delay, None for one above MOST_TRIED_TICKS.
     """
-    for ticks in range(most_ticks + 1):
+    for ticks in range(MOST_TRIED_TICKS + 1):
         if not delayed_loop(ticks).is_stable:
             return ticks - 1
-    return most_ticks
+    return None

@@ -7,6 +7,7 @@ import math
 from rtloop.analysis.coupled_loop import SimultaneousMargins
 from rtloop.analysis.perturbation import PercentRange
 from rtloop.design.synthesis.specification import QUANTITIES
+from rtloop.design.verification.robustness import MOST_TRIED_TICKS
 from rtloop.design.verification.simulated_steps import JUDGED_QUANTITIES, STEP_QUANTILE, SimulatedStep
 from rtloop.design.verification.verify import Row, Verification
 
@@ -84,9 +85,10 @@ def robustness(verification: Verification) -> list[tuple[str, ...]]:
         for name, ranges in verification.robustness.ranges.items()
     ]
     loop = verification.continuous or verification.running
+    ticks = verification.robustness.delay_ticks
     delays = [
         f"+{format_number(verification.robustness.delay_us)} µs",
-        f"+{verification.robustness.delay_ticks} samples",
+        f"more than {MOST_TRIED_TICKS - verification.delay_ticks} samples" if ticks is None else f"+{ticks} samples",
     ]
     delays = delays if on_paper else [" or ".join(delays)]
     return [*rows, ("delay", *(delays if loop.is_stable else ["–"] * len(delays)), "")]
@@ -284,12 +286,12 @@ def answer(verification: Verification, place: str = "") -> str:
         else [f"simulated, {violation}" for violation in verification.simulated.violations]
     )
     if violations:
-        return f"{place}, the loop misses {', '.join(violations)}"
+        return f"{place}, the loop misses {'; '.join(violations)}"
     if verification.contradictions and verification.on_rig is None:
         return f"not judged: {'; '.join(verification.contradictions)}"
     if all(row.limit is None for row in verification.rows):
         return "stable; nothing is specified"
     missed = [] if verification.simulated is None else verification.simulated.uncounted_violations
     if missed:
-        return f"{place}, the loop meets its specification; simulated steps that do not count miss {', '.join(missed)}"
+        return f"{place}, the loop meets its specification; simulated steps that do not count miss {'; '.join(missed)}"
     return f"{place}, the loop meets its specification"

@@ -84,13 +84,14 @@ class Robustness(NamedTuple):
     `ranges` maps a plant parameter to "continuous", "running" and "running_missed" (None if no limit is met); `shifts`
     is the tolerated shift of the resonance, by "continuous" or samples of delay. "continuous" exists with C(s) only.
     `delay_us` is the additional delay that the loop of C(s) tolerates, or without C(s) the running loop; `delay_ticks`
-    the additional samples that the running loop tolerates, below 0 for an unstable one.
+    the additional samples that the running loop tolerates, below 0 for an unstable one, None where the search found no
+    end.
     """
 
     ranges: dict[str, dict[str, PercentRange | None]]
     shifts: dict[str, PercentRange]
     delay_us: float
-    delay_ticks: int
+    delay_ticks: int | None
 
 
 @dataclass(frozen=True)
@@ -284,6 +285,7 @@ def _robustness(
                 for ticks in SHOWN_DELAYS
             }
             shifts = {**continuous_range, **delayed_ranges}
-    extra_ticks = tolerated_delay_ticks(lambda ticks: subject.running(sensed_plant, ticks)) - delay_ticks
+    most_ticks = tolerated_delay_ticks(lambda ticks: subject.running(sensed_plant, ticks))
+    extra_ticks = None if most_ticks is None else most_ticks - delay_ticks
     loop = runs(sensed_plant) if make_continuous is None else make_continuous(plant)
     return Robustness(ranges, shifts, delay_margin_us(loop), extra_ticks)

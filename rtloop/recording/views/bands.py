@@ -16,13 +16,15 @@ from rtloop.recording.errors import RecordingError
 from rtloop.recording.file.run_readers import RecordingPaths, ReportTicks
 from rtloop.recording.file.topics.events import FINAL
 from rtloop.recording.load import Recording, load
-from rtloop.signals import DEADLINE
+from rtloop.signals import DEADLINE, Mode
 
 MAX_DRAWN_VALUE = 1e30
 """Values of this magnitude or more, and NaN, are not drawn; smaller ones fit the single precision of a page."""
 FAULT_KINDS = ("tripped", "driver_failed", "gap")
 AXIS_PANELS = (("reference_um", "position_um"), ("error_um",), ("drive_v",))
 """Signals of an axis by panel."""
+REFERRED = ("_reference_um", "_error_um")
+"""Ends of the names of signals that are the reference, or relate to it."""
 TIMING = ("exec_us", "lateness_us")
 MAX_OTHER_SIGNALS = 8
 """Maximum number of additional panels for other signals of an imported recording."""
@@ -38,6 +40,11 @@ class Band(NamedTuple):
     time_s: Real
     low: Real
     high: Real
+
+    @property
+    def has_values(self) -> bool:
+        """Whether a value can be drawn."""
+        return not np.all(np.isnan(self.low))
 
     @property
     def is_line(self) -> bool:
@@ -85,7 +92,9 @@ def read_drawing(
     recording = files if isinstance(files, Recording) else load(files)
     panels = make_panels(recording)
     bands = read_bands(recording, [name for panel in panels for name in panel.names], start_s, end_s, points, progress)
-    return DrawnRecording(recording, panels, bands, next(iter(bands.values())).time_s)
+    time_s = next(iter(bands.values())).time_s
+    drawn = [panel._replace(names=[name for name in panel.names if bands[name].has_values]) for panel in panels]
+    return DrawnRecording(recording, [panel for panel in drawn if panel.names] or panels, bands, time_s)
 
 
 def read_bands(
@@ -99,7 +108,8 @@ def read_bands(
     """Read the signals between two times, both included, in s since the start.
 
     Returns bands of about `points` values, by name. Every tick is a value if there are at most `points`. Omitted ticks
-    add up to about 2 `points` values of their overview. Values whose magnitude is MAX_DRAWN_VALUE or more count as NaN.
+    add up to about 2 `points` values of their overview. Values whose magnitude is MAX_DRAWN_VALUE or more count as NaN,
+    and in mode raw, whose reference is in V, the REFERRED signals.
     `progress` receives the number of ticks read. Raises RecordingError if neither a tick nor an overview lies between
     the times.
     """
@@ -111,10 +121,15 @@ def read_bands(
     ticks_per_point = max(-(-count // points), 1)
     times, lows, highs = [overview_band[0]], [overview_band[1]], [overview_band[2]]
     tick_count = 0
-    for rows in recording.between(["deadline_ns", *names], start_s, end_s):
+    has_mode = "mode" in recording
+    referred = [name.endswith(REFERRED) for name in names]
+    for rows in recording.between(["deadline_ns", *names, *(["mode"] if has_mode else [])], start_s, end_s):
         edges = np.arange(0, len(rows), ticks_per_point)
         times.append(rows[edges, 0] * 1e-9)
-        values = np.where(np.abs(rows[:, 1:]) < MAX_DRAWN_VALUE, rows[:, 1:], np.nan)
+        values = rows[:, 1 : 1 + len(names)]
+        values = np.where(np.abs(values) < MAX_DRAWN_VALUE, values, np.nan)
+        if has_mode:
+            values[np.ix_(rows[:, -1] == Mode.RAW, referred)] = np.nan
         lows.append(np.fmin.reduceat(values, edges))
         highs.append(np.fmax.reduceat(values, edges))
         tick_count += len(rows)
