@@ -101,6 +101,7 @@ class Service:
         self.notifier = Notifier()
         self.lock = Lock()
         self.faults: list[str] = []
+        self._has_ended_by_itself = False
         self.armed = not self.configuration.service.arm
         self.results: list[RunResult] = []
         self.supervisor: Supervisor | None = None
@@ -140,11 +141,12 @@ class Service:
     def state(self) -> State:
         """The present state, derived from the newest record, faults, the death of the loop's process and `armed`.
 
-        Without a loop, and before its first tick, it is TRIPPED if there are faults, else STARTING.
+        Without a loop, and before its first tick, it is TRIPPED if there are faults, or the last loop ended by itself
+        and its fault is not latched yet, else STARTING.
         """
         row = self._latest_row()
         if row is None:
-            return State.TRIPPED if self.faults else State.STARTING
+            return State.TRIPPED if self.faults or self._has_ended_by_itself else State.STARTING
         if self.faults or self._has_died or int(row[signals.FLAGS]) & signals.TRIP_MASK:
             return State.TRIPPED
         if row[signals.MODE] != Mode.OFF:
@@ -431,6 +433,7 @@ class Service:
                     timing.start_thread(self._prepare_and_start)
                 return self._watch(supervisor)
             finally:
+                self._has_ended_by_itself = not self._end_requested.is_set()
                 self.supervisor = self._desk = self.live = self._requested_mode = None
                 self._is_preparing = False
                 supervisor.close()
@@ -524,8 +527,7 @@ class Service:
         Returns True if the loop may be started again; False, without the pause, after more than service.restarts
         failures in service.restart_window_s.
         """
-        if reason not in self.faults:
-            self.faults.append(reason)
+        self._latch(reason)
         log.error("%s", reason)
         options, now_s = self.configuration.service, timing.monotonic_s()
         self._deaths_s = [moment for moment in self._deaths_s if now_s - moment < options.restart_window_s] + [now_s]
@@ -536,14 +538,21 @@ class Service:
         timing.sleep(RESTART_PAUSE_S)
         return True
 
+    def _latch(self, reason: str) -> bool:
+        """Latch a loop's failure as a fault; return whether it is a new one."""
+        is_new = reason not in self.faults
+        if is_new:
+            self.faults.append(reason)
+        self._has_ended_by_itself = False
+        return is_new
+
     def _latch_and_wait(self, reason: str) -> None:
         """Latch a failure that a recovery covers as a fault, and wait for the recovery's pause or for `end`.
 
         Such failures do not count for service.restarts: a service that systemd starts anew would drive the outputs
         without the recovery's confirmations.
         """
-        if reason not in self.faults:
-            self.faults.append(reason)
+        if self._latch(reason):
             log.error("%s", reason)
         self._reported_ticks = 0
         self.notifier.limit_watchdog(START_TIMEOUT_S)

@@ -60,10 +60,11 @@ class VirtualChild:
             code = self._work()
         except Killed:
             code = KILLED
-            if self.session is not None:
-                self.session._block["words"][ANNOUNCED] = self._announced  # The stack's end has withdrawn them.
-                if self.session._files.writer is not None:
-                    self.session._files.writer.close()
+            with self.world.turns.undivided():
+                if self.session is not None:
+                    self.session._block["words"][ANNOUNCED] = self._announced  # The stack's end has withdrawn them.
+                    if self.session._files.writer is not None:
+                        self.session._files.writer.close()
         if self.exit_code is None:
             self.exit_code = code
 
@@ -87,9 +88,10 @@ class VirtualChild:
     def kill(self) -> None:
         """Kill the child: its thread ends at its next turn, and what it has not done is not done."""
         if self.exit_code is None and not self.is_doomed:
-            self.is_doomed = True
-            if self.session is not None:
-                self._announced = self.session._block["words"][ANNOUNCED].copy()
+            with self.world.turns.undivided():
+                self.is_doomed = True
+                if self.session is not None:
+                    self._announced = self.session._block["words"][ANNOUNCED].copy()
             if self.world.running is self:
                 self.world.end_run("killed")
             if threading.current_thread() is self.thread:

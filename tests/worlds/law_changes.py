@@ -25,7 +25,7 @@ class LawChanges:
 
     def on_answer(self, request: Request) -> str:
         """Take in an answer; return what is lost, "" if nothing is or a change is under way."""
-        if request.path not in CHANGES or request.run is None and request.path != "/reload":
+        if request.path not in CHANGES or (request.run is None and request.path != "/reload"):
             return ""
         self._follow(request)
         live, runs = self._world.service.live, self._world.runs
@@ -53,7 +53,9 @@ class LawChanges:
         if request.path == "/tune":
             for key, value in body["values"].items():
                 name = (body["axis"], body["section"], key)
-                if self._set.get(name, (-1, None))[0] <= tick:
+                if self._overlaps_another(request):  # It may have been taken back before its answer.
+                    self._set.pop(name, None)
+                elif self._set.get(name, (-1, None))[0] <= tick:
                     self._set[name] = tick, value
             return
         is_undone = request.path == "/undo"
@@ -62,3 +64,11 @@ class LawChanges:
             is_meant = name[0] == body["axis"] and name[1] == section and (not keys or name[2] in keys.split(", "))
             if is_meant and self._set[name][0] <= tick:
                 del self._set[name]
+
+    def _overlaps_another(self, request: Request) -> bool:
+        """Return whether a change of another kind was under way while `request` was."""
+        return any(
+            other.path in CHANGES and other.path != "/tune" and other.code not in (409, 422)
+            and other.sent_s <= request.answered_s and other.answered_s >= request.sent_s
+            for other in self._world.requests
+        )  # fmt: skip
