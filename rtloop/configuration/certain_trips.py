@@ -32,6 +32,8 @@ def certain_trips(
         loop = None
     if interlocks.oscillation_swings > 0:
         yield from _oscillation(interlocks, loop, values, samples, rate_hz)
+        if loop is not None and values[0] == Generator.TABLE:
+            yield from _ringing(interlocks, loop, values, samples, rate_hz)
     if interlocks.tracking_ticks > 0 and loop is not None and loop.reference.settling_ticks == 1:
         bump_ticks = axis.limits.bump_s * rate_hz if is_first else 0.0
         error_um, ticks = _largest_error(interlocks, loop, values, samples, rate_hz, bump_ticks)
@@ -60,6 +62,33 @@ def _oscillation(
             f"interlocks.oscillation_swings = {interlocks.oscillation_swings} times; the loop would trip. Use an "
             f"oscillation_um above {largest_um:.4g}, or swing_ticks below {most_ticks}"
         )
+
+
+def _ringing(
+    interlocks: InterlockOptions, loop: Loop, values: Sequence[float], samples: Real, rate_hz: float
+) -> Iterator[str]:
+    """Yield a line if the loop rings after the largest step of a table so long that the interlock trips."""
+    step_um = _largest_step_um(values, samples)
+    most_ticks = min(int(values[3]), interlocks.oscillation_swings * interlocks.swing_ticks)
+    if step_um <= interlocks.oscillation_um or most_ticks < 3:
+        return
+    response = step_response(loop, most_ticks / rate_hz)
+    moves = np.sign(np.diff(response.position))
+    turns = np.flatnonzero(moves[1:] * moves[:-1] < 0) + 1
+    ways_um, ticks = step_um * np.abs(np.diff(response.position[turns])), rate_hz * np.diff(response.time_s[turns])
+    is_swing = (ways_um > interlocks.oscillation_um) & (ticks <= interlocks.swing_ticks)
+    if is_swing[: interlocks.oscillation_swings].sum() == interlocks.oscillation_swings:
+        yield (
+            f"a step of {step_um:.4g} µm rings: the position turns back by more than interlocks.oscillation_um = "
+            f"{interlocks.oscillation_um:g} for interlocks.oscillation_swings = {interlocks.oscillation_swings} times; "
+            "the loop would trip. Damp the loop, or use smaller steps"
+        )
+
+
+def _largest_step_um(values: Sequence[float], samples: Real) -> float:
+    """Return the largest step of a table, of one that repeats also from its end to its begin."""
+    played_um = np.append(samples, samples[:1])[: None if values[4] else -1]
+    return float(np.max(np.abs(np.diff(played_um)), initial=0.0))
 
 
 def _reversals(values: Sequence[float], samples: Real, rate_hz: float) -> tuple[Real, Real, bool]:
@@ -97,8 +126,7 @@ def _largest_error(
     levels_um = samples if values[0] == Generator.TABLE else np.array(values[1:2])
     if bump_ticks and abs(levels_um[0]) * math.exp(-most_ticks / bump_ticks) > limit_um:
         return abs(levels_um[0]), most_ticks
-    played_um = np.append(levels_um, levels_um[:1])[: None if values[4] else -1]
-    step_um = float(np.max(np.abs(np.diff(played_um)), initial=0.0))
+    step_um = _largest_step_um(values, levels_um)
     if step_um <= limit_um:
         return 0.0, 0
     errors_um = step_um * np.abs(1 - step_response(loop, (most_ticks - 1) / rate_hz).position)
