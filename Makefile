@@ -36,6 +36,7 @@ quick: $(TESTED) ## checks of names, types of imports, and the tests that finish
 	$(BIN)/lint-imports
 	$(BIN)/pytest -n 2 --dist loadfile $(QUICK)
 
+# Collecting once beforehand, beside pyright, writes the compiled tests, which the two workers would each do for themselves.
 # Large arrays come and go by the thousand: asking the system for the memory of each costs a quarter of some tests' time.
 test: export MALLOC_MMAP_THRESHOLD_ := 268435456
 test: export MALLOC_TRIM_THRESHOLD_ := 536870912
@@ -43,8 +44,8 @@ test: $(TESTED) ## all checks, and the tests that start no service, worker or br
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/pyright --pythonpath $(BIN)/python & types=$$!; \
-		$(BIN)/lint-imports && $(BIN)/python -m rtloop.cli.warm && wait $$types
-	$(BIN)/pytest -n 3 --dist loadfile --no-loadscope-reorder -m '$(SHORT) and not system'
+		$(BIN)/lint-imports && $(BIN)/python -m rtloop.cli.warm && mkdir -p build && $(BIN)/pytest --collect-only > build/collected && wait $$types
+	$(BIN)/pytest -n 2 --dist loadfile --no-loadscope-reorder -m '$(SHORT) and not system'
 
 # They keep real time and wait for processes, so that a third worker has work while two wait.
 test-system: $(TESTED) ## the tests of real processes: services, boards, nodes, workers, builds, and the panel in a browser

@@ -49,6 +49,7 @@ def run_command(folder: Path, command: str) -> str:
     return result.stdout
 
 
+@pytest.mark.system
 def test_a_new_law_runs_replays_and_is_tuned_and_swapped_live(folder: Path):
     offline, live = [line for line in COMMANDS if " ctl " not in line and "serve" not in line], COMMANDS[-3:]
     assert [line.split()[1] for line in offline] == ["laws", "law", "check", "run", "replay"]

@@ -86,6 +86,7 @@ def test_it_is_refused_before_anything_runs(name, tmp_path):
         user_law_plan(tmp_path, law)
 
 
+@pytest.mark.system
 def test_one_that_never_ends_is_killed_and_its_outputs_parked(tmp_path):
     """The recording before the failure is complete. `make faults` has the same on a board that outlives the run."""
     (tmp_path / "mine.py").write_text(ENDLESS)

@@ -19,6 +19,8 @@ from tests.recording.hand_made_loop import COLUMNS
 from tests.recording.killing import kill_run, open_shared_block, recovered_ticks
 from tests.service.test_run import PAPER, finish, process_ids, run, start, wait_for_ticks
 
+pytestmark = pytest.mark.system
+
 
 @pytest.mark.parametrize("after_s", [0.05, 0.5])
 def test_a_killed_unpaced_run_lacks_no_more_than_the_chunks_that_wait_for_each_other(after_s: float, tmp_path: Path):

@@ -7,6 +7,8 @@ import pytest
 from tests.faults import hardware, processes
 from tests.faults.fault import Fault, measure
 
+pytestmark = pytest.mark.system
+
 CHOSEN = ("loop SIGSTOP", "driver raises in write")
 FAULTS = {fault.name: fault for fault in (*processes.FAULTS, *hardware.FAULTS)}
 
