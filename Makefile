@@ -43,9 +43,11 @@ test: export MALLOC_TRIM_THRESHOLD_ := 536870912
 test: $(TESTED) ## all checks, and the tests that start no service, worker or browser
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
-	$(BIN)/pyright --pythonpath $(BIN)/python & types=$$!; \
-		$(BIN)/lint-imports && $(BIN)/python -m rtloop.cli.warm && mkdir -p build && $(BIN)/pytest --collect-only > build/collected && wait $$types
-	$(BIN)/pytest -n 2 --dist loadfile --no-loadscope-reorder -m '$(SHORT) and not system'
+	mkdir -p build
+	$(BIN)/pyright --pythonpath $(BIN)/python > build/types 2>&1 & types=$$!; \
+		$(BIN)/lint-imports && $(BIN)/python -m rtloop.cli.warm && $(BIN)/pytest --collect-only > build/collected && \
+		$(BIN)/pytest -n 2 --dist loadfile --no-loadscope-reorder -m '$(SHORT) and not system'; tests=$$?; \
+		wait $$types; types=$$?; cat build/types; exit $$((tests + types))
 
 # They keep real time and wait for processes, so that a third worker has work while two wait.
 test-system: $(TESTED) ## the tests of real processes: services, boards, nodes, workers, builds, and the panel in a browser
