@@ -66,7 +66,7 @@ def _act(world: World, draw: Draw, name: str, actions: Sequence[Action], invaria
         if action.actor == name and world.error is None:
             world.turns.sleep(max(begin_s + action.at_s - world.turns.now_s, 0.0))
             if name == "fault":
-                _fail(world, action)
+                _fail(world, draw, action)
             else:
                 request = _request(world, draw, action)
                 with world.turns.undivided():
@@ -146,7 +146,7 @@ def _write_configuration(world: World, draw: Draw, change: str) -> None:
     world.config.write_text(text)
 
 
-def _fail(world: World, action: Action) -> None:
+def _fail(world: World, draw: Draw, action: Action) -> None:
     """Let a fault happen, for its duration."""
     board, (value,) = world.board, action.values
     attributes: dict[str, tuple[str, Any, Any]] = {
@@ -171,5 +171,9 @@ def _fail(world: World, action: Action) -> None:
         world.disk_error = DISK_ERRORS[action.kind]
         world.turns.sleep(value)
         world.disk_error = None
+    elif action.kind == "reload by signal":
+        _write_configuration(world, draw, "gain" if value > 0.3 else "same")
+        world.signals_s.append(world.turns.now_s)
+        world.service.request_reload()
     else:
         world.cut_write = value, action.kind == "death in write"

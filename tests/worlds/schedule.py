@@ -200,7 +200,8 @@ def _values(draw: random.Random, kind: str, axis: str) -> tuple[Any, ...]:
 
 FAULTS = ("old sample", "nan", "jump", "read error", "write error", "short hang", "hang", "long hang", "long hang",
           "loop death",
-          "recorder death", "death in write", "disk full", "disk error", "short write", "card gone")  # fmt: skip
+          "recorder death", "death in write", "disk full", "disk error", "short write", "card gone",
+          "reload by signal", "reload by signal")  # fmt: skip
 
 
 def _draw_faults(draw: random.Random, seconds: float) -> list[Action]:

@@ -131,6 +131,8 @@ class World:
         self.runs: list[Run] = []
         self.requests: list[Request] = []
         self.hangs_until_s = 0.0
+        self.signals_s: list[float] = []
+        """Times at which a signal requested a reload."""
         self.on_stretch: Callable[[Run, np.ndarray[Any, Any], np.ndarray[Any, Any]], None] = lambda *_: None
         self.on_begin: Callable[[], None] = lambda: None
         self._undone_ticks = 0.0
