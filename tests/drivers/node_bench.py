@@ -83,8 +83,8 @@ class NodeProcess:
         command = [sys.executable, "-c", PROGRAM, self.kind, json.dumps(self.options), str(path)]
         self.process = subprocess.Popen(command, env=ENVIRONMENT)
 
-    def driver(self, rate_hz: float = 500.0, **more: Any) -> NodeDriver:
-        """Return a driver of this node, not yet open."""
+    def driver(self, rate_hz: float = 100.0, **more: Any) -> NodeDriver:
+        """Return a driver of this node, not yet open; a busy host answers at the rate, too."""
         options = make_options(self.kind, self.options | {"wait_s": 60.0} | more)
         return (UdpDriver if self.kind == "udp" else SerialDriver)(options, ONE_AXIS, rate_hz)
 

@@ -172,7 +172,7 @@ def test_a_missing_terminal_is_named(tmp_path):
 
 @pytest.mark.parametrize("answer", ["next tick", "same tick"])
 def test_exchanges_are_measured_with_the_outputs_at_their_safe_values(node, answer):
-    driver = node.driver(rate_hz=1000.0, answer=answer)
+    driver = node.driver(answer=answer)
     exchanges = driver.measure_exchanges(50)
     assert len(exchanges.durations_us) + exchanges.lost == 50
     assert 0 < min(exchanges.durations_us) < 100_000
