@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import tomllib
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -331,7 +332,7 @@ def check_recording(run: Run, result: Any) -> None:
     from rtloop.recording.load import load
 
     rows = np.concatenate([*run.rows, np.zeros((0, 1))]) if not run.rows else np.concatenate(run.rows)
-    recorded = [block for block in load(result.recordings).blocks()] if result.recordings else []
+    recorded = [block for block in load(files_of_run(result)).blocks()] if result.recordings else []
     ticks = np.concatenate([block[:, TICK] for block in recorded]).astype(int) if recorded else np.zeros(0, int)
     require(np.all(np.diff(ticks) > 0), "a tick is twice in the recording")
     if len(ticks):
@@ -344,6 +345,15 @@ def check_recording(run: Run, result: Any) -> None:
         require(totals["complete"] <= (lost == 0), "the recording counts as complete, and lacks ticks")
     else:
         require(not totals["complete"], "a recording without counts is complete")
+
+
+def files_of_run(result: Any) -> list[Path]:
+    """Return the files of a run: those of its result, and one that a failing disk left unfinished, which says so."""
+    paths = list(result.recordings)
+    unfinished = {
+        part for path in paths for part in path.parent.glob("*.mcap.part") if part.name in str(result.recorder)
+    }
+    return [*paths, *sorted(unfinished)]
 
 
 def is_stop(request: Request) -> bool:
