@@ -279,6 +279,20 @@ def test_in_mode_raw_no_reference_in_volts_is_drawn_as_a_position(tmp_path: Path
     assert np.array_equal(np.isnan(band["x_error_um"].low), np.arange(COUNT) >= COUNT // 2)
 
 
+@pytest.mark.parametrize(
+    ("configuration", "label"),
+    [
+        ('[[axis]]\nname = "x"\n[axis.prefilter]\ntaps = [1.0]\n', "x error\nbehind the pre-filter / µm"),
+        ('[[axis]]\nname = "x"\n', "x error / µm"),
+        *((text, "x error / µm") for text in ("no TOML", "axis = 3", 'axis = ["x"]', "[[axis]]\nprefilter = 1")),
+    ],
+)
+def test_an_error_behind_a_pre_filter_is_called_so(tmp_path: Path, configuration: str, label: str) -> None:
+    recording = load(write_recording(tmp_path / "run.mcap", make_rows(COUNT)))
+    recording.header["configuration"] = configuration
+    assert label in [panel.get_ylabel() for panel in draw_recording(recording).axes]
+
+
 def test_an_episode_of_late_ticks_is_marked_with_its_number_of_missed_periods() -> None:
     kinds = ({"kind": "periods_missed", "what": {"periods": 3}}, {"kind": "lateness_over", "what": {"periods": 10}})
     recording = SimpleNamespace(events=[{"time_ns": 10**9, **kind} for kind in kinds])

@@ -5,6 +5,7 @@ No peak is lost at any picture size.
 
 from __future__ import annotations
 
+import tomllib
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -164,7 +165,18 @@ def _panel(recording: Recording, axis: str, names: Sequence[str]) -> Panel:
     """Panel of the recorded ones among the signals `names` of an axis, such as error_um; [] as `names` without any."""
     present = [name for signal in names if (name := f"{axis}_{signal}") in recording]
     label = axis if len(names) > 1 else f"{axis} {signal_kind(names[0])}"
+    if names == ("error_um",) and axis in _filtered_axes(recording):
+        label += "\nbehind the pre-filter"
     return Panel(label, signal_unit(names[0]), present)
+
+
+def _filtered_axes(recording: Recording) -> list[str]:
+    """Return the axes whose reference a pre-filter shapes before the error is formed; [] if this cannot be read."""
+    try:
+        tables = tomllib.loads(recording.header["configuration"]).get("axis", [])
+        return [table["name"] for table in tables if table.get("prefilter")]
+    except (tomllib.TOMLDecodeError, AttributeError, KeyError, TypeError):
+        return []
 
 
 def signal_kind(name: str) -> str:
