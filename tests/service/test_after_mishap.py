@@ -286,6 +286,34 @@ def test_each_tared_axis_keeps_its_offset_in_the_next_loop(monkeypatch):
     assert offsets_v == [[0.1, 0.2]]
 
 
+@pytest.mark.parametrize(("is_ending", "state"), [(False, State.TRIPPED), (True, State.STARTING)])
+def test_a_loop_that_ended_by_itself_is_tripped_before_its_fault_is_latched(monkeypatch, is_ending, state):
+    """A client that looks in between must not take the service for one that is about to run."""
+
+    class FailingSupervisor:
+        def __init__(self, *_: object) -> None:
+            pass
+
+        def start(self) -> None:
+            raise UnavailableError("no loop starts in this test")
+
+        def close(self) -> None:
+            pass
+
+    monkeypatch.setattr(service_module, "Supervisor", FailingSupervisor)
+    monkeypatch.setattr(service_module, "Processes", lambda _: nullcontext())
+    monkeypatch.setattr(service_module, "write_note", lambda *_: None)
+    service = Service(DEPLOY / "two-axis.toml")
+    if is_ending:
+        service.end()
+    with pytest.raises(UnavailableError):
+        service._run_loop(outputs_off=True)
+    assert (service.faults, service.state) == ([], state)
+    service._latch("the loop's fault")
+    service.faults.clear()  # as a reset does
+    assert service.state is State.STARTING
+
+
 def test_a_status_without_a_tick_says_why_it_has_no_axes(monkeypatch):
     service, _ = dying_loop_service(monkeypatch, after_s=1.0)
     assert "axes" not in status(service)
