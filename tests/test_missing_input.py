@@ -140,3 +140,13 @@ def test_every_command_that_takes_a_file_is_tried() -> None:
         if isinstance(parameter, click.Argument) and isinstance(parameter.type, click.Path | click.File)
     }
     assert with_file - CREATES_FOLDER <= COMMANDS.keys()
+
+
+def test_a_missing_specification_is_named_with_the_key_that_names_it(tmp_path: Path) -> None:
+    config, text = tmp_path / "paper.toml", (DEPLOY / "paper.toml").read_text(encoding="utf-8")
+    (line,) = [line for line in text.splitlines() if line.startswith("specification = ")]
+    config.write_text(text.replace(line, 'specification = "none.toml"'))
+    for command in (["check", config], ["design", "verify", config]):
+        result = run(*command)
+        assert result.exit_code == 66, result.output
+        assert f"{config}: axis.x.specification: " in result.stderr
