@@ -106,7 +106,7 @@ class Store:
         try:
             self._check_manifest(_manifest(campaign))
             for path in _result_paths(folder):  # a longer file of the same unit, which is later, replaces a shorter one
-                first = _first_rig(path)
+                first, _ = _rigs(path)
                 if first in self._paths:
                     _remove(self._paths[first])
                 self._paths[first] = path
@@ -135,7 +135,7 @@ class Store:
 
     def require_no_further_rigs(self) -> None:
         """Raise ConfigError if the folder has results of rigs beyond the campaign's number of rigs."""
-        rigs, last = self._campaign.options.rigs, max((_last_rig(path) for path in self._paths.values()), default=0)
+        rigs, last = self._campaign.options.rigs, max((_rigs(path)[1] for path in self._paths.values()), default=0)
         if last > rigs:
             allowed = f"{last} or more, or another folder with --out"
             raise ConfigError(str(self.folder), [f"rigs: {rigs}; the folder has results of {last}; allowed: {allowed}"])
@@ -368,16 +368,10 @@ def _remove(path: Path) -> None:
         path.unlink(missing_ok=True)
 
 
-def _first_rig(path: Path) -> int:
-    """Return the number of the first rig of a file of results, from its name; 0 for another name."""
+def _rigs(path: Path) -> tuple[int, int]:
+    """Return the numbers of the first and the last rig of a file of results, from its name; zeros for another name."""
     match = FILE_NAME.fullmatch(path.name)
-    return int(match[1]) if match else 0
-
-
-def _last_rig(path: Path) -> int:
-    """Return the number of the last rig of a file of results, from its name; 0 for another name."""
-    match = FILE_NAME.fullmatch(path.name)
-    return int(match[2]) if match else 0
+    return (int(match[1]), int(match[2])) if match else (0, 0)
 
 
 @contextmanager

@@ -67,12 +67,12 @@ class LawConformance:
             raise ValueError(
                 "this law is a feedforward; only a controller has a frequency response from error to command"
             )
-        return Bench(self.law, compiled=not UNCOMPILED).frequency_response(frequencies_hz, amplitude_um)
+        return Bench(self.law).frequency_response(frequencies_hz, amplitude_um)
 
     @pytest.fixture
     def bench(self) -> Bench:
         """Return a Bench of the law: its functions, compiled except with NUMBA_DISABLE_JIT=1, and their own records."""
-        return Bench(self.law, compiled=not UNCOMPILED)
+        return Bench(self.law)
 
     def test_build_gives_finite_numbers(self) -> None:
         """Every coefficient is finite, and the same options give the same bytes."""
@@ -251,7 +251,7 @@ def _compiled(function: Callable[..., object], signature: Signature) -> Kernel:
 class Bench:
     """A law's functions with their own records, compiled as in the loop or uncompiled."""
 
-    def __init__(self, law: Law, compiled: bool = True) -> None:
+    def __init__(self, law: Law, compiled: bool = not UNCOMPILED) -> None:
         """Build the law's coefficients, a state of zeros, and its functions, which are compiled if `compiled`."""
         law_records, self._law = law.records(law.count), law
         self.rounding = 0.0
