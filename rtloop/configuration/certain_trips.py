@@ -52,7 +52,7 @@ def _oscillation(
     ways_um, ticks, is_endless = _reversals(values, samples, rate_hz)
     if loop is not None and ticks.size:
         ways_um = ways_um * np.abs(loop.response_from_reference(rate_hz / (2 * ticks))[0])
-    is_swing = (ways_um > interlocks.oscillation_um) & (ticks <= interlocks.swing_ticks)
+    is_swing = _are_swings(interlocks, ways_um, ticks)
     longest = np.diff(np.flatnonzero(np.concatenate([[True], ~is_swing, [True]]))).max() - 1
     if longest >= interlocks.oscillation_swings or (is_endless and ticks.size and is_swing.all()):
         largest_um, most_ticks = ways_um[is_swing].max(), math.ceil(ticks[is_swing].max())
@@ -76,13 +76,18 @@ def _ringing(
     moves = np.sign(np.diff(response.position))
     turns = np.flatnonzero(moves[1:] * moves[:-1] < 0) + 1
     ways_um, ticks = step_um * np.abs(np.diff(response.position[turns])), rate_hz * np.diff(response.time_s[turns])
-    is_swing = (ways_um > interlocks.oscillation_um) & (ticks <= interlocks.swing_ticks)
+    is_swing = _are_swings(interlocks, ways_um, ticks)
     if is_swing[: interlocks.oscillation_swings].sum() == interlocks.oscillation_swings:
         yield (
             f"a step of {step_um:.4g} µm rings: the position turns back by more than interlocks.oscillation_um = "
             f"{interlocks.oscillation_um:g} for interlocks.oscillation_swings = {interlocks.oscillation_swings} times; "
             "the loop would trip. Damp the loop, or use smaller steps"
         )
+
+
+def _are_swings(interlocks: InterlockOptions, ways_um: Real, ticks: Real) -> npt.NDArray[np.bool_]:
+    """Return whether ways between reversals (n,), which last some `ticks` each, count as swings of the interlock."""
+    return (ways_um > interlocks.oscillation_um) & (ticks <= interlocks.swing_ticks)
 
 
 def _largest_step_um(values: Sequence[float], samples: Real) -> float:

@@ -89,11 +89,13 @@ def test_the_step_from_the_end_of_a_drive_counts_on_request_alone(
     assert experiment.measure(motion)[0] == pytest.approx(overshoot_percent)
 
 
-def test_the_only_step_counts_always(tmp_path: Path) -> None:
-    steps = '[[experiment]]\nkind = "steps"\nlevels_um = [10.0]\ndwell_s = 0.01\nfirst_step = false\n'
+@pytest.mark.parametrize("cycles", [1, 2])
+def test_the_only_step_counts_always(tmp_path: Path, cycles: int) -> None:
+    lines = f"levels_um = [10.0]\ncycles = {cycles}\ndwell_s = 0.01\nfirst_step = false\n"
+    steps = f'[[experiment]]\nkind = "steps"\n{lines}'
     (experiment,) = campaign(tmp_path, steps, None).options.experiment
-    position_um = np.repeat([0.0, 12.0, 10.0], [100, 20, 80])
-    motion = Motion(np.repeat([0.0, 10.0], 100), np.tile(position_um[:, None], POINTS), 10_000.0)
+    position_um = np.repeat([0.0, 12.0, 10.0], [100, 20, 100 * cycles - 20])
+    motion = Motion(np.repeat([0.0, 10.0], [100, 100 * cycles]), np.tile(position_um[:, None], POINTS), 10_000.0)
     assert experiment.measure(motion)[0] == pytest.approx(20.0)
 
 

@@ -9,7 +9,9 @@ from typing import Any
 import pytest
 
 from rtloop.cli.run import TerminalObserver
+from rtloop.engine.loop import run_ticks
 from rtloop.foundation.native import cache
+from rtloop.starters.first_start import LOOP_CODE
 
 
 def watch_start(capsys: pytest.CaptureFixture[str]) -> str:
@@ -28,3 +30,7 @@ def test_a_run_with_an_empty_cache_says_that_it_compiles(
     assert watch_start(capsys).startswith("compiling the loop for this machine, once: ")
     (tmp_path / "rtloop.engine.loop.run_ticks.o").touch()
     assert watch_start(capsys) == ""
+
+
+def test_the_file_that_tells_a_first_start_is_that_of_the_loop() -> None:
+    assert f"{run_ticks._name}.o" == LOOP_CODE
